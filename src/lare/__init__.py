@@ -1,0 +1,53 @@
+"""LaRe: train reinforcement learning on episodic rewards, through latent rewards that a language model wrote.
+
+    task = lare.load_task("HalfCheetah-v4")
+    phi = lare.design(task)
+    run = lare.train(task, lare.Settings(method="lare-rrdu", steps=100_000), function=phi)
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from lare.errors import LareError as LareError
+    from lare.experiments.report import write_report as write_report
+    from lare.latent.design import design as design
+    from lare.latent.function import LatentFunction as LatentFunction
+    from lare.latent.function import load as load_function
+    from lare.tasks.episodic import EpisodicReward as EpisodicReward
+    from lare.tasks.spec import TaskSpec as TaskSpec
+    from lare.tasks.spec import load_task as load_task
+    from lare.training.settings import Settings as Settings
+    from lare.training.train import resume as resume
+    from lare.training.train import train as train
+
+HOMES = {
+    "LareError": "lare.errors",
+    "write_report": "lare.experiments.report",
+    "design": "lare.latent.design",
+    "LatentFunction": "lare.latent.function",
+    "load_function": "lare.latent.function:load",
+    "EpisodicReward": "lare.tasks.episodic",
+    "TaskSpec": "lare.tasks.spec",
+    "load_task": "lare.tasks.spec",
+    "Settings": "lare.training.settings",
+    "resume": "lare.training.train",
+    "train": "lare.training.train",
+}
+"""Where each public name lives. They are imported when first asked for, so that `lare --help`, and the process that
+verifies generated code, need not wait for JAX."""
+
+__all__ = ["__version__", *HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in HOMES:
+        raise AttributeError(f"module 'lare' has no attribute {name!r}")
+    module, _, attribute = HOMES[name].partition(":")
+    return getattr(import_module(module), attribute or name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,1 @@
+"""Reinforcement learning: knows rewards, never where they come from."""

@@ -1,0 +1,1 @@
+"""Return decomposition: pure functions on episodes."""

@@ -1,0 +1,24 @@
+"""How near proxy rewards come to the true ones. Only measured, never trained on."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+def mean_error(
+    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], counts: Bool[Array, " steps"]
+) -> Float[Array, ""]:
+    """mean |r_hat - r| over the steps that count (the paper's Table F.5)."""
+    return jnp.sum(jnp.abs(r_hat - reward) * counts) / jnp.maximum(jnp.sum(counts), 1)
+
+
+def correlation(
+    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], counts: Bool[Array, " steps"]
+) -> Float[Array, ""]:
+    """Pearson's correlation of r_hat with r over the steps that count; NaN where one of them never varies."""
+    total = jnp.maximum(jnp.sum(counts), 1)
+
+    def centred(x: Float[Array, " steps"]) -> Float[Array, " steps"]:
+        return (x - jnp.sum(x * counts) / total) * counts
+
+    a, b = centred(r_hat), centred(reward)
+    return jnp.sum(a * b) / jnp.sqrt(jnp.sum(a**2) * jnp.sum(b**2))

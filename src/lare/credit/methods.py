@@ -1,0 +1,82 @@
+"""THE table: every published way to assign credit, as encoder + fit.
+
+A *method* says what the algorithm is trained on. `encoder` is what the decoder sees of a step, `fit` how it is fitted to
+returns. The two ends of the table fit nothing: `dense` trains on the true rewards, `episodic` on the return, paid at the
+last step.
+"""
+
+import difflib
+from dataclasses import dataclass
+from enum import StrEnum
+
+from lare.errors import LareError
+
+
+class Encoder(StrEnum):
+    """What the decoder sees of a step."""
+
+    RAW = "raw"
+    """[s, a, s - s'], as published for RD and RRD."""
+    LATENT = "latent"
+    """The factors z = phi(s, a), and nothing else."""
+
+
+class Fit(StrEnum):
+    """How the decoder is fitted to returns (equations in `losses.py`)."""
+
+    ALL_STEPS = "all steps"
+    """RD: the proxy rewards of all T steps of an episode against its return."""
+    DRAWN_STEPS = "drawn steps"
+    """RRD: K steps drawn from each episode."""
+    DRAWN_STEPS_UNBIASED = "drawn steps, unbiased"
+    """RRD-unbiased: the same, less the variance that the drawing adds."""
+
+
+class Reward(StrEnum):
+    """What the algorithm is trained on."""
+
+    TRUE = "true"
+    EPISODIC = "episodic"
+    PROXY = "proxy"
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row: a published name."""
+
+    name: str
+    reward: Reward
+    encoder: Encoder | None
+    fit: Fit | None
+    summary: str
+    source: str
+
+
+LARE = "Qu et al., LaRe, AAAI 2025"
+RD = "Efroni et al., AAAI 2021; Arjona-Medina et al., RUDDER, 2019"
+RRD = "Ren et al., RRD, ICLR 2022"
+
+TABLE = (
+    Method("dense", Reward.TRUE, None, None, "the true reward of every step: the upper end", "-"),
+    Method("episodic", Reward.EPISODIC, None, None, "the return, paid at the last step: the lower end", "-"),
+    Method("rd", Reward.PROXY, Encoder.RAW, Fit.ALL_STEPS, "return decomposition on raw features", RD),
+    Method("rrd", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS, "randomized return decomposition", RRD),
+    Method("rrdu", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS_UNBIASED, "RRD without the bias of the drawing", RRD),
+    Method("lare-rd", Reward.PROXY, Encoder.LATENT, Fit.ALL_STEPS, "return decomposition on latent rewards", LARE),
+    Method("lare-rrdu", Reward.PROXY, Encoder.LATENT, Fit.DRAWN_STEPS_UNBIASED, "RRD-unbiased on latent rewards", LARE),
+)
+
+METHODS = {method.name: method for method in TABLE}
+
+
+def find_method(name: str) -> Method:
+    """The row of that name.
+
+    Raises:
+        LareError: there is none; the message lists those there are.
+    """
+    if name in METHODS:
+        return METHODS[name]
+    close = difflib.get_close_matches(name, METHODS, n=1)
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    raise LareError(f"no method {name!r}{hint}; the methods are {', '.join(METHODS)}")

@@ -1,0 +1,1 @@
+"""From replies to a function that can be trusted."""

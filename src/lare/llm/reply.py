@@ -1,0 +1,36 @@
+"""What a reply must look like, and reading it."""
+
+import json
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from lare.errors import LareError, first_problem
+
+
+class MalformedReply(LareError):
+    """A reply that cannot be read. The message goes back to the model."""
+
+
+class Reply(BaseModel):
+    """The JSON object that a request asks for."""
+
+    model_config = ConfigDict(frozen=True, populate_by_name=True)
+
+    understand: str = Field(alias="Understand")
+    analyze: str = Field(alias="Analyze")
+    functions: str = Field(alias="Functions", min_length=1)
+    """Source of `evaluation_func(observation, action)`."""
+
+
+def parse(text: str) -> Reply:
+    """Raises `MalformedReply`, with what was wrong."""
+    try:
+        values = json.loads(text)
+    except ValueError as error:
+        raise MalformedReply(f"the reply is not one JSON object: {error}") from error
+    if not isinstance(values, dict):
+        raise MalformedReply(f"the reply is JSON, but not an object: {text.strip()[:40]!r}")
+    try:
+        return Reply(**values)
+    except ValidationError as error:
+        raise MalformedReply(f"the reply's JSON object is not as asked for: {first_problem(error)}") from error

@@ -1,0 +1,46 @@
+"""The one network shape that actors, critics and decoders share."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+
+class Linear(eqx.Module):
+    """x W + b. The weight lies as (in, out), so that neither pass over a batch has to transpose it."""
+
+    weight: Float[Array, "*stack in out"]
+    bias: Float[Array, "*stack out"]
+
+    def __init__(self, in_size: int, out_size: int, *, key: PRNGKeyArray):
+        weight_key, bias_key = jax.random.split(key)
+        bound = in_size**-0.5
+        self.weight = jax.random.uniform(weight_key, (in_size, out_size), minval=-bound, maxval=bound)
+        self.bias = jax.random.uniform(bias_key, (out_size,), minval=-bound, maxval=bound)
+
+    def __call__(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
+        return x @ self.weight + self.bias
+
+
+class MLP(eqx.Module):
+    """Linear layers with ReLU between them.
+
+    `MLP(3, (256, 256), 1, key=key)` is `Linear(3, 256)`, ReLU, `Linear(256, 256)`, ReLU, `Linear(256, 1)`.
+    Weights and biases start uniform in ±1/sqrt(fan-in). Every leaf is an array, so that a whole training state can
+    be scanned, vmapped and saved without being taken apart.
+    """
+
+    layers: tuple[Linear, ...]
+
+    def __init__(self, in_size: int, hidden: tuple[int, ...], out_size: int, *, key: PRNGKeyArray):
+        sizes = (in_size, *hidden, out_size)
+        keys = jax.random.split(key, len(sizes) - 1)
+        self.layers = tuple(
+            Linear(fan_in, fan_out, key=layer_key)
+            for fan_in, fan_out, layer_key in zip(sizes[:-1], sizes[1:], keys, strict=True)
+        )
+
+    def __call__(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
+        for layer in self.layers[:-1]:
+            x = jax.nn.relu(layer(x))
+        return self.layers[-1](x)

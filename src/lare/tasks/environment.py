@@ -1,0 +1,26 @@
+"""Gymnasium environments, made so that what goes wrong is said in one line."""
+
+import logging
+import warnings
+
+import gymnasium
+
+from lare.errors import LareError
+from lare.tasks import mujoco
+
+mujoco.register()
+
+
+def make(environment: str, max_episode_steps: int | None = None, **kwargs: object) -> gymnasium.Env:
+    """`gymnasium.make`, with every failure a `LareError`.
+
+    Versions are the user's choice (v4 and v5 scores are never mixed), so Gymnasium's advice to upgrade is left out.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
+        try:
+            return gymnasium.make(environment, max_episode_steps=max_episode_steps, **kwargs)
+        except Exception as error:  # an environment is foreign code: anything may come out of its constructor
+            logging.getLogger(__name__).debug("making %s failed", environment, exc_info=True)
+            reason = str(error).strip().splitlines() or [type(error).__name__]
+            raise LareError(f"environment {environment!r} cannot be made: {reason[0]}") from error

@@ -1,0 +1,141 @@
+"""A task: an environment and the texts that describe it, read from TOML and checked against the environment."""
+
+import difflib
+import hashlib
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+from gymnasium.spaces import Box
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from lare.errors import LareError, first_problem
+from lare.tasks.environment import make
+
+Judges = Literal["before", "after", "both"]
+"""Which observation `phi` judges a step by: that before the action, that which the action led to, or both, one after
+the other with their factors put side by side."""
+
+SHIPPED = files("lare.tasks") / "specs"
+
+
+class TaskSpec(BaseModel):
+    """What is to be solved."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", str_strip_whitespace=True)
+
+    name: str = Field(min_length=1, pattern=r"^[\w.\-]+$")
+    """What the task is called, in commands and in the names of runs."""
+    environment: str = Field(min_length=1)
+    """Gymnasium id; `module:id` imports the module that registers it first."""
+    observation_size: int = Field(ge=1)
+    action_size: int = Field(ge=1)
+    judges: Judges = "after"
+    description: str = Field(min_length=1)
+    """The task and its goal, without a word about the reward."""
+    observation: str = Field(min_length=1)
+    """What each entry of the observation means."""
+    action: str = Field(min_length=1)
+    """What each entry of the action means."""
+    max_episode_steps: int | None = Field(None, ge=1)
+    """Time limit, for an environment that has none of its own."""
+    measures: tuple[str, ...] = ()
+    """Keys of the last step's `info` that are averaged and reported beside the return."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of everything that the spec says."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+
+
+def shipped_tasks() -> list[str]:
+    """Names of the tasks that come with the package."""
+    return sorted(entry.name.removesuffix(".toml") for entry in SHIPPED.iterdir() if entry.name.endswith(".toml"))
+
+
+def load_task(task: str | Path) -> TaskSpec:
+    """Read a task and check it against its environment.
+
+    Args:
+        task: a shipped name (`shipped_tasks()`), or the path of a TOML file.
+
+    Raises:
+        LareError: there is no such task, the file is not a spec, or the environment is not what the spec says.
+
+    >>> load_task("HalfCheetah-v4").action_size
+    6
+    """
+    spec = read_task(task)
+    check_against_environment(spec)
+    return spec
+
+
+def read_task(task: str | Path) -> TaskSpec:
+    """Read a task without making its environment. Raises `LareError` like `load_task`."""
+    values = read_values(str(task))
+    try:
+        return TaskSpec(**values)
+    except ValidationError as error:
+        raise LareError(f"task {str(task)!r}: {first_problem(error)}") from error
+
+
+def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The keys of a spec, those of the spec that it is `like` filled in."""
+    if task in shipped_tasks():
+        text = (SHIPPED / f"{task}.toml").read_text(encoding="utf-8")
+    elif Path(task).is_file():
+        text = read_text(Path(task))
+    else:
+        close = difflib.get_close_matches(task, shipped_tasks(), n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        raise LareError(
+            f"no task {task!r}{hint}: neither a file nor one of the shipped tasks, {', '.join(shipped_tasks())}"
+        )
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise LareError(f"task {task!r} is not valid TOML: {error}") from error
+    parent = values.pop("like", None)
+    if parent is None:
+        return values
+    if not isinstance(parent, str) or parent in seen or parent == task:
+        raise LareError(f"task {task!r}: like = {parent!r} must name another task, without a circle")
+    return read_values(parent, (*seen, task)) | values
+
+
+def read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise LareError(f"{path} cannot be read: {error}") from error
+
+
+def check_against_environment(spec: TaskSpec) -> None:
+    """Make the environment once and compare. Raises `LareError` at the first thing that does not fit."""
+    environment = make(spec.environment, spec.max_episode_steps)
+    try:
+        check_spaces(spec, environment)
+    finally:
+        environment.close()
+
+
+def check_spaces(spec: TaskSpec, environment: gymnasium.Env) -> None:
+    for key, space in (("observation", environment.observation_space), ("action", environment.action_space)):
+        if not isinstance(space, Box) or len(space.shape) != 1:
+            raise LareError(f"task {spec.name!r}: the {key} space of {spec.environment} is {space}, not a Box of one axis")
+        size = getattr(spec, f"{key}_size")
+        if size != space.shape[0]:
+            raise LareError(
+                f"task {spec.name!r}: {key}_size = {size}, but {spec.environment} has {key}s of size {space.shape[0]}"
+            )
+    action = environment.action_space
+    assert isinstance(action, Box)
+    if not action.is_bounded():
+        raise LareError(f"task {spec.name!r}: the actions of {spec.environment} have no bounds: {action}")
+    if environment.spec is None or environment.spec.max_episode_steps is None:
+        raise LareError(
+            f"task {spec.name!r}: {spec.environment} has no time limit, so an episode may never pay; "
+            "set max_episode_steps in the spec"
+        )

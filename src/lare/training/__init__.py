@@ -1,0 +1,1 @@
+"""A run: replay, the fused training step, checkpoints."""

@@ -1,0 +1,131 @@
+"""A checkpoint that a kill at any moment leaves whole, at a cost that does not grow with the replay.
+
+    checkpoint/
+      rows-0.npz, rows-1.npz, ...   the replay's rows, as they came: each is written once
+      state.npz                     everything else, and which of the row files count
+
+A row file is only ever added; `state.npz` is written beside the old one and renamed onto it. Whatever the moment, the
+`state.npz` that is there speaks of row files that are whole. No pickle anywhere.
+"""
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lare.errors import LareError
+from lare.training.off_policy import Learner
+from lare.training.replay import capacity
+
+ROWS = ("observation", "action", "factors", "reward", "terminated")
+"""Fields of the replay that are saved by row."""
+
+STATE = "state.npz"
+
+
+def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
+    """Let `write` fill a new file, and put it in the place of `path` only when it is safe on the disk."""
+    new = path.with_name(path.name + ".new")
+    try:
+        with new.open("wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+    except OSError as error:
+        new.unlink(missing_ok=True)
+        raise LareError(f"{path} cannot be written ({error.strerror or error}); what was there is as it was") from error
+
+
+def named_leaves(learner: Learner) -> dict[str, Any]:
+    """Every array of the state by its place, but for those that are saved by row."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(learner)
+    named = {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
+    return {name: leaf for name, leaf in named.items() if name not in {f".replay.{field}" for field in ROWS}}
+
+
+@jax.jit
+def take(buffer: jax.Array, index: jax.Array) -> jax.Array:
+    return jax.vmap(lambda rows, where: rows[where])(buffer, index)
+
+
+def save(directory: Path, learner: Learner, host: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    """Write a checkpoint.
+
+    Args:
+        host: what else is to be remembered, as JSON.
+        arrays: the same, as arrays.
+    """
+    directory.mkdir(exist_ok=True)
+    held, rows = learner.replay, capacity(learner.replay)
+    end = np.asarray(held.next_row)
+    start, segments = np.zeros_like(end), []
+    if (directory / STATE).exists():
+        with np.load(directory / STATE, allow_pickle=False) as saved:
+            start, segments = saved[".replay.next_row"], json.loads(str(saved["segments"]))
+    # The frontier row is saved again: it held only the newest observation when it was saved before. And where an
+    # episode was dropped on resuming, its rows have been written anew.
+    start = np.minimum(start, end)
+    count = end - start + 1
+    width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations
+    index = jnp.asarray((start[:, None] + np.arange(width)) % rows)
+    segment = {field: np.asarray(take(getattr(held, field), index))[:, : count.max()] for field in ROWS}
+    number = segments[-1]["number"] + 1 if segments else 0
+    write_atomically(directory / f"rows-{number}.npz", lambda file: np.savez(file, **segment))
+    segments.append({"number": number, "start": start.tolist(), "count": count.tolist()})
+    alive = [old for old in segments if any(np.add(old["start"], old["count"]) > end - rows)]
+    state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner).items()} | dict(arrays)
+    state |= {"host": np.array(json.dumps(host)), "segments": np.array(json.dumps(alive))}
+    write_atomically(directory / STATE, lambda file: np.savez(file, **state))
+    for old in segments[: len(segments) - len(alive)]:
+        (directory / f"rows-{old['number']}.npz").unlink(missing_ok=True)
+
+
+def load(directory: Path, template: Learner) -> tuple[Learner, dict[str, Any], dict[str, np.ndarray]]:
+    """Read a checkpoint into a learner of the same structure; returns it, and `host` and `arrays` as saved.
+
+    Raises:
+        LareError: there is none, or it is of another structure.
+    """
+    path = directory / STATE
+    if not path.is_file():
+        raise LareError(f"there is no checkpoint in {directory}")
+    try:
+        with np.load(path, allow_pickle=False) as saved:
+            state = {name: saved[name] for name in saved.files}
+        host, segments = json.loads(str(state.pop("host"))), json.loads(str(state.pop("segments")))
+        learner = with_rows(fill(template, state), directory, segments)
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise LareError(f"the checkpoint {path} cannot be read: {error}") from error
+    return learner, host, {name: array for name, array in state.items() if not name.startswith(".")}
+
+
+def fill(template: Learner, state: Mapping[str, np.ndarray]) -> Learner:
+    known = named_leaves(template)
+    leaves, structure = jax.tree_util.tree_flatten_with_path(template)
+    filled = []
+    for path, leaf in leaves:
+        name = jax.tree_util.keystr(path)
+        if name in known and state[name].shape != leaf.shape:
+            raise ValueError(f"{name} has shape {state[name].shape}, not {leaf.shape}")
+        filled.append(jnp.asarray(state[name]) if name in known else leaf)
+    return jax.tree.unflatten(structure, filled)
+
+
+def with_rows(learner: Learner, directory: Path, segments: list[dict[str, Any]]) -> Learner:
+    rows = capacity(learner.replay)
+    buffers = {field: np.zeros_like(getattr(learner.replay, field)) for field in ROWS}
+    for segment in segments:
+        with np.load(directory / f"rows-{segment['number']}.npz", allow_pickle=False) as saved:
+            for field in ROWS:
+                values = saved[field]
+                for seed, (start, count) in enumerate(zip(segment["start"], segment["count"], strict=True)):
+                    # Of a stretch longer than the buffer only the end is left, as it was when it was written.
+                    where = np.arange(start, start + count)[-rows:]
+                    buffers[field][seed, where % rows] = values[seed, :count][-rows:]
+    return learner._replace(replay=learner.replay._replace(**{f: jnp.asarray(b) for f, b in buffers.items()}))

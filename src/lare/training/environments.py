@@ -1,0 +1,185 @@
+"""Environments on the host: one for each seed, stepped by actions in [-1, 1], with everything that they give checked."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from jaxtyping import Float
+
+from lare.errors import LareError
+from lare.tasks.environment import make
+from lare.tasks.episodic import TRUE_REWARD, EpisodicReward
+from lare.tasks.spec import TaskSpec
+from lare.training.replay import Step
+
+Policy = Callable[[Float[np.ndarray, "seeds *episodes observation"]], Float[np.ndarray, "seeds *episodes action"]]
+
+
+class Stream(IntEnum):
+    """What random numbers are for. Each use has numbers of its own, whatever the others consume."""
+
+    TRAINING_EPISODES = 0
+    EXPLORATION = 1
+    EVALUATION_EPISODES = 2
+
+
+class EnvironmentFault(LareError):
+    """An environment gave something that cannot be trained on."""
+
+
+def generator(seed: int, stream: Stream, number: int) -> np.random.Generator:
+    """Random numbers that depend on nothing but these three: there is no state to save."""
+    return np.random.default_rng([seed, stream, number])
+
+
+def episode_seed(seed: int, stream: Stream, episode: int) -> int:
+    return int(generator(seed, stream, episode).integers(2**31))
+
+
+def make_episodic(task: TaskSpec, render_mode: str | None = None) -> EpisodicReward:
+    extra = {"render_mode": render_mode} if render_mode else {}
+    return EpisodicReward(make(task.environment, task.max_episode_steps, **extra))
+
+
+def to_bounds(action: Float[np.ndarray, " action"], space: gymnasium.Space) -> Float[np.ndarray, " action"]:
+    """From [-1, 1] to the environment's own units."""
+    assert isinstance(space, Box)
+    return np.asarray(space.low + (action + 1) / 2 * (space.high - space.low), np.float32)
+
+
+@dataclass
+class Lane:
+    """The training environment of one seed, and the episode that is under way in it."""
+
+    seed: int
+    environment: EpisodicReward
+    episode: int = -1
+    observation: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
+    actions: list[np.ndarray] = field(default_factory=list)
+    """Of this episode, in the environment's units: with its seed, all that it takes to be here again."""
+
+    def begin(self) -> None:
+        """Start the next episode."""
+        self.episode += 1
+        self.actions = []
+        seed = episode_seed(self.seed, Stream.TRAINING_EPISODES, self.episode)
+        observation, _ = self.environment.reset(seed=seed)
+        self.observation = self.checked(observation, "observation")
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, bool, bool]:
+        """One step; returns observation, action, true reward, next observation, terminated, ended."""
+        before, taken = self.observation, to_bounds(action, self.environment.action_space)
+        after, _, terminated, truncated, info = self.environment.step(taken)
+        self.actions.append(taken)
+        reward = float(self.checked(info[TRUE_REWARD], "reward"))
+        self.observation = self.checked(after, "observation")
+        return before, taken, reward, self.observation, bool(terminated), bool(terminated or truncated)
+
+    def checked(self, value: object, what: str) -> np.ndarray:
+        array = np.asarray(value, np.float32)
+        if not np.isfinite(array).all():
+            bad = array[~np.isfinite(array)][0]
+            raise EnvironmentFault(
+                f"the environment gave {bad} in its {what}, at step {len(self.actions)} of episode {self.episode} "
+                f"of seed {self.seed}"
+            )
+        return array
+
+    def replay(self, actions: Sequence[np.ndarray], observation: np.ndarray) -> bool:
+        """Get into the middle of the current episode again, by its seed and actions.
+
+        Returns whether that led to `observation`, bit for bit; an environment that is not deterministic does not.
+        """
+        self.episode -= 1
+        self.begin()
+        ended = False
+        for action in actions:
+            after, _, terminated, truncated, _ = self.environment.step(action)
+            self.actions.append(action)
+            self.observation = np.asarray(after, np.float32)
+            ended = terminated or truncated
+        return not ended and np.array_equal(self.observation, observation)
+
+
+@dataclass(frozen=True)
+class Collected:
+    """A chunk of steps of every seed. Actions in [-1, 1], and, for `phi`, in the environment's units."""
+
+    steps: Step
+    environment_action: Float[np.ndarray, "seeds time action"]
+
+
+def collect(lanes: Sequence[Lane], policy: Policy, noise: Float[np.ndarray, "time seeds action"]) -> Collected:
+    """Let the policy act, `noise` added to its actions, for as many steps as there is noise."""
+    rows: list[list[tuple]] = [[] for _ in lanes]
+    for disturbance in noise:
+        observation = np.stack([lane.observation for lane in lanes])
+        actions = np.clip(policy(observation) + disturbance, -1, 1)
+        for lane, action, row in zip(lanes, actions, rows, strict=True):
+            row.append((action, *lane.step(action)))
+            if row[-1][-1]:
+                lane.begin()
+    action, before, taken, reward, after, terminated, ended = (
+        np.asarray([[step[column] for step in row] for row in rows]) for column in range(7)
+    )
+    no_factors = np.zeros((*reward.shape, 0), np.float32)
+    steps = Step(before, action, no_factors, reward.astype(np.float32), after, terminated, ended)
+    return Collected(steps, taken)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What episodes of the deterministic policy gave."""
+
+    returns: Float[np.ndarray, "seeds episodes"]
+    measures: dict[str, Float[np.ndarray, "seeds episodes"]]
+    """What the task asks to be taken from the last step's `info`."""
+
+
+def evaluate(
+    environments: Sequence[Sequence[EpisodicReward]], policy: Policy, seeds: Sequence[int], measures: Sequence[str] = ()
+) -> Evaluation:
+    """One episode in each environment (seeds, episodes), all in lockstep, each from a start of its own.
+
+    The starts depend on seed and place only: every evaluation of a run begins from the same ones, and none of them is
+    a start of a training episode.
+    """
+    shape = (len(environments), len(environments[0]))
+    places = list(np.ndindex(shape))
+    observation = np.stack(
+        [
+            [
+                np.asarray(environment.reset(seed=episode_seed(seed, Stream.EVALUATION_EPISODES, place))[0], np.float32)
+                for place, environment in enumerate(row)
+            ]
+            for seed, row in zip(seeds, environments, strict=True)
+        ]
+    )
+    returns = np.full(shape, np.nan)
+    found = {name: np.full(shape, np.nan) for name in measures}
+    while np.isnan(returns).any():
+        actions = policy(observation)
+        for place in places:
+            if not np.isnan(returns[place]):
+                continue
+            environment = environments[place[0]][place[1]]
+            after, paid, terminated, truncated, info = environment.step(
+                to_bounds(actions[place], environment.action_space)
+            )
+            observation[place] = after
+            if terminated or truncated:
+                if not np.isfinite(paid):
+                    raise EnvironmentFault(f"the environment paid {paid} in an evaluation of seed {seeds[place[0]]}")
+                returns[place] = paid
+                for name in measures:
+                    found[name][place] = measured(info, name)
+    return Evaluation(returns, found)
+
+
+def measured(info: dict, name: str) -> float:
+    if name not in info:
+        raise LareError(f"the task measures {name!r}, but the last step's info has only {', '.join(sorted(info))}")
+    return float(info[name])

@@ -1,0 +1,122 @@
+"""What a run says while it goes: a live line on a terminal, plain lines elsewhere; TensorBoard events if asked for."""
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from lare.errors import LareError
+
+Metrics = Sequence[Mapping[str, Any]]
+"""One mapping a seed, as in metrics.jsonl."""
+
+
+class Listener(Protocol):
+    """Whoever wants to know how a run is going."""
+
+    def started(self, name: str, step: int, steps: int) -> None: ...
+    def stepped(self, step: int) -> None: ...
+    def evaluated(self, metrics: Metrics) -> None: ...
+    def said(self, message: str) -> None: ...
+    def stopped(self) -> None: ...
+
+
+def mean(metrics: Metrics, key: str) -> float | None:
+    values = [line[key] for line in metrics if line.get(key) is not None]
+    return sum(values) / len(values) if values else None
+
+
+def summary(metrics: Metrics) -> str:
+    """The figures that matter, means over the seeds."""
+    parts = [f"{mean(metrics, 'time/steps_per_second') or 0:.0f} steps/s"]
+    for key, label, form in (
+        ("evaluation/return", "return", ".1f"),
+        ("credit/error", "credit error", ".3g"),
+        ("credit/correlation", "correlation", ".2f"),
+    ):
+        if (value := mean(metrics, key)) is not None:
+            parts.append(f"{label} {value:{form}}")
+    return ", ".join(parts)
+
+
+class Terminal:
+    """A live line where the console is a terminal, a plain line for each evaluation where it is not."""
+
+    def __init__(self, console: Console | None = None):
+        self.console = console or Console(stderr=True)
+        self.progress: Progress | None = None
+        self.steps = 0
+
+    def started(self, name: str, step: int, steps: int) -> None:
+        self.steps = steps
+        if self.console.is_terminal:
+            columns = (TextColumn(name), BarColumn(bar_width=20), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"))
+            self.progress = Progress(*columns, TimeRemainingColumn(), console=self.console)
+            self.progress.add_task(name, total=steps, completed=step, figures="compiling")
+            self.progress.start()
+        else:
+            self.say(f"{name}: step {step} of {steps}")
+
+    def stepped(self, step: int) -> None:
+        if self.progress:
+            self.progress.update(self.progress.task_ids[0], completed=step)
+
+    def evaluated(self, metrics: Metrics) -> None:
+        if self.progress:
+            self.progress.update(self.progress.task_ids[0], figures=summary(metrics))
+        else:
+            self.say(f"step {metrics[0]['step']:>{len(str(self.steps))}} of {self.steps}: {summary(metrics)}")
+
+    def said(self, message: str) -> None:
+        self.say(message)
+
+    def say(self, message: str) -> None:
+        self.console.print(message, highlight=False, markup=False, soft_wrap=True)
+
+    def stopped(self) -> None:
+        if self.progress:
+            self.progress.stop()
+
+
+class TensorBoard:
+    """Every number of metrics.jsonl as TensorBoard events, one writer a seed."""
+
+    def __init__(self, directory: Path, step: int, seeds: Sequence[int]):
+        try:
+            from tensorboardX import SummaryWriter
+        except ImportError:
+            raise LareError("TensorBoard events need an extra: pip install 'lare-rl[tensorboard]'") from None
+        # What an earlier process wrote behind the checkpoint comes again, and is purged.
+        self.writers = {
+            seed: SummaryWriter(str(directory / f"seed-{seed}"), purge_step=step or None, flush_secs=10) for seed in seeds
+        }
+
+    def started(self, name: str, step: int, steps: int) -> None: ...
+    def stepped(self, step: int) -> None: ...
+    def said(self, message: str) -> None: ...
+
+    def evaluated(self, metrics: Metrics) -> None:
+        for line in metrics:
+            for key, value in line.items():
+                if key not in ("step", "seed") and value is not None:
+                    self.writers[line["seed"]].add_scalar(key, value, line["step"])
+
+    def stopped(self) -> None:
+        for writer in self.writers.values():
+            writer.close()
+
+
+class Clock:
+    """Steps per second since it was last asked."""
+
+    def __init__(self, step: int):
+        self.step, self.time = step, time.perf_counter()
+
+    def rate(self, step: int) -> float:
+        now = time.perf_counter()
+        rate = (step - self.step) / max(now - self.time, 1e-9)
+        self.step, self.time = step, now
+        return rate

@@ -1,0 +1,161 @@
+"""The run directory: what a run leaves on the disk, and reading it again.
+
+    config.json          every setting, the package version, the spec's and the function's hash
+    latent_function.py   the phi in use, and .json: replies, checks
+    metrics.jsonl        one JSON object a line, for each seed and evaluation
+    checkpoint/          see checkpoint.py
+"""
+
+import contextlib
+import json
+import os
+import platform
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+import lare
+from lare.errors import LareError, first_problem
+from lare.latent.function import LatentFunction, load
+from lare.tasks.spec import TaskSpec
+from lare.training.settings import Settings
+
+CONFIG, METRICS, FUNCTION, CHECKPOINT = "config.json", "metrics.jsonl", "latent_function.py", "checkpoint"
+
+
+class Config(BaseModel):
+    """config.json."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    lare: str
+    """Version of the package."""
+    settings: Settings
+    task: TaskSpec
+    task_sha256: str
+    function_sha256: str | None
+    isolation: str | None
+    """Where the latent function runs while training."""
+    versions: dict[str, str]
+    machine: str
+
+
+def describe(task: TaskSpec, settings: Settings, function: LatentFunction | None) -> Config:
+    return Config(
+        lare=lare.__version__,
+        settings=settings,
+        task=task,
+        task_sha256=task.digest,
+        function_sha256=function.digest if function else None,
+        isolation="in process, after verification in a process apart" if function else None,
+        versions={"jax": jax.__version__, "python": platform.python_version()},
+        machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}",
+    )
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run on the disk."""
+
+    directory: Path
+    config: Config
+    function: LatentFunction | None
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.directory / CHECKPOINT
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """Every complete line of metrics.jsonl, in order."""
+        path = self.directory / METRICS
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
+        return [json.loads(line) for line in lines if line.endswith("\n")]
+
+    def append(self, lines: Sequence[dict[str, Any]]) -> int:
+        """Add lines to metrics.jsonl; returns how long the file is then."""
+        path = self.directory / METRICS
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write("".join(json.dumps(line) + "\n" for line in lines))
+                file.flush()
+                os.fsync(file.fileno())
+                return file.tell()
+        except OSError as error:
+            raise LareError(f"{path} cannot be written: {error.strerror or error}; the last checkpoint is whole") from error
+
+    def truncate(self, length: int) -> None:
+        """Take back the lines that were written after a checkpoint; they come again."""
+        path = self.directory / METRICS
+        if path.exists():
+            with path.open("r+b") as file:
+                file.truncate(length)
+
+
+def create(directory: Path, task: TaskSpec, settings: Settings, function: LatentFunction | None) -> Run:
+    """A new run directory. Raises `LareError` where there is something of that name."""
+    config = describe(task, settings, function)
+    try:
+        directory.mkdir(parents=True)
+    except FileExistsError:
+        raise LareError(
+            f"{directory} exists, and a run never overwrites another: choose another --out, or go on with --resume"
+        ) from None
+    except OSError as error:
+        raise LareError(f"the run directory {directory} cannot be made: {error.strerror}") from error
+    try:
+        if function is not None:
+            function.save(directory / FUNCTION)
+        (directory / CONFIG).write_text(config.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise LareError(f"{directory} cannot be written: {error.strerror}") from error
+    return Run(directory, config, function)
+
+
+def default_directory(task: TaskSpec, settings: Settings) -> Path:
+    """runs/TASK-METHOD-ALGORITHM-sSEED, with a number behind it as long as that is taken."""
+    name = f"{task.name}-{settings.method}-{settings.algorithm}-s{settings.seed}"
+    number = 1
+    while (directory := Path("runs") / (name if number == 1 else f"{name}-{number}")).exists():
+        number += 1
+    return directory
+
+
+def open_run(directory: str | Path) -> Run:
+    """Read a run directory; its latent function is verified again before anything executes it.
+
+    Raises:
+        LareError: it is not a run, or its files are not what they should be.
+    """
+    directory = Path(directory)
+    path = directory / CONFIG
+    if not path.is_file():
+        raise LareError(f"{directory} is not a run: there is no {CONFIG} in it")
+    try:
+        config = Config.model_validate_json(path.read_text(encoding="utf-8"))
+    except (ValidationError, OSError, UnicodeDecodeError) as error:
+        reason = first_problem(error) if isinstance(error, ValidationError) else str(error)
+        raise LareError(f"{path}: {reason}") from error
+    function = load(directory / FUNCTION, config.task) if config.function_sha256 else None
+    if function is not None and function.digest != config.function_sha256:
+        raise LareError(f"{directory / FUNCTION} is not the function that this run was trained with: its hash changed")
+    return Run(directory, config, function)
+
+
+@contextlib.contextmanager
+def locked(run: Run) -> Iterator[None]:
+    """Keep a second process from training in the same directory, where the system has file locks."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    with (run.directory / "lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise LareError(f"another process is training in {run.directory}") from None
+        yield
