@@ -12,6 +12,7 @@ import os
 import platform
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,9 @@ from lare.tasks.spec import TaskSpec
 from lare.training.settings import Settings
 
 CONFIG, METRICS, FUNCTION, CHECKPOINT = "config.json", "metrics.jsonl", "latent_function.py", "checkpoint"
+
+VERSIONS = ("jax", "optax", "gymnasium", "mujoco", "numpy")
+"""Packages that figures depend on."""
 
 
 class Config(BaseModel):
@@ -52,7 +56,7 @@ def describe(task: TaskSpec, settings: Settings, function: LatentFunction | None
         task_sha256=task.digest,
         function_sha256=function.digest if function else None,
         isolation="in process, after verification in a process apart" if function else None,
-        versions={"jax": jax.__version__, "python": platform.python_version()},
+        versions={name: version(name) for name in VERSIONS} | {"python": platform.python_version()},
         machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}",
     )
 
