@@ -1,6 +1,6 @@
 """Learning curves: 3 seeds, 100 thousand steps, the methods side by side.
 
-    python benchmarks/learning.py run RUNS [TASK/LABEL ...]   train what is not there yet; go on with what was broken off
+    python benchmarks/learning.py run RUNS [TASK/LABEL ...]   train what is missing, go on with the rest
     python benchmarks/learning.py table RUNS                  write results/learning.json and print it as a table
 
 Every experiment is a run directory RUNS/TASK/LABEL. Two processes on one core each train 1.1 times as much as one on two.
@@ -81,8 +81,11 @@ def table(directory: Path) -> None:
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps(found, indent=1) + "\n")
     for name, figures in found.items():
-        parts = [f"{key.split('/')[-1]} {value[0]:.3g} ± {value[1]:.2g}" for key, value in figures.items()
-                 if isinstance(value, list) and key != "seeds"]
+        parts = [
+            f"{key.split('/')[-1]} {value[0]:.3g} ± {value[1]:.2g}"
+            for key, value in figures.items()
+            if isinstance(value, list) and key != "seeds"
+        ]
         print(f"{name:36s} {figures['steps']:>7d}  {', '.join(parts)}")
 
 

@@ -1,8 +1,8 @@
 """LaRe: train reinforcement learning on episodic rewards, through latent rewards that a language model wrote.
 
-    task = lare.load_task("HalfCheetah-v4")
-    phi = lare.design(task)
-    run = lare.train(task, lare.Settings(method="lare-rrdu", steps=100_000), function=phi)
+task = lare.load_task("HalfCheetah-v4")
+phi = lare.design(task)
+run = lare.train(task, lare.Settings(method="lare-rrdu", steps=100_000), function=phi)
 """
 
 from importlib import import_module
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from lare.experiments.report import write_report as write_report
     from lare.latent.design import design as design
     from lare.latent.function import LatentFunction as LatentFunction
-    from lare.latent.function import load as load_function
+    from lare.latent.function import load as load_function  # noqa: F401
     from lare.tasks.episodic import EpisodicReward as EpisodicReward
     from lare.tasks.spec import TaskSpec as TaskSpec
     from lare.tasks.spec import load_task as load_task
@@ -39,7 +39,7 @@ HOMES = {
 """Where each public name lives. They are imported when first asked for, so that `lare --help`, and the process that
 verifies generated code, need not wait for JAX."""
 
-__all__ = ["__version__", *HOMES]
+__all__ = ["__version__", *HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,7 +1,8 @@
 """What the user is told when something that they gave cannot be used."""
 
+from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 
 class LareError(Exception):
@@ -12,16 +13,29 @@ class LareError(Exception):
     """
 
 
+class Checked(BaseModel):
+    """Values that came from outside. Frozen; what does not fit is a `LareError` of one line."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def __init__(self, **values: Any):
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise LareError(first_problem(error)) from error
+
+
 def first_problem(error: ValidationError) -> str:
     """The first thing that pydantic found wrong, in one line, and how many more there are."""
     problems = error.errors()
     first = problems[0]
-    where = ".".join(str(part) for part in first["loc"]) or "the whole"
+    where, what = ".".join(str(part) for part in first["loc"]), first["msg"].removeprefix("Value error, ")
     if first["type"] == "missing":
-        what = f"the key {where!r} is missing"
+        said = f"the key {where!r} is missing"
     elif first["type"] == "extra_forbidden":
-        what = f"there is no key {where!r}"
+        said = f"there is no key {where!r}"
+    elif where:
+        said = f"{where} = {first['input']!r}: {what.lower()}"
     else:
-        what = f"{where} = {first['input']!r}: {first['msg'].lower()}"
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    return what + more
+        said = what
+    return said + (f" (and {len(problems) - 1} more)" if len(problems) > 1 else "")

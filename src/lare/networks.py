@@ -1,8 +1,10 @@
-"""The one network shape that actors, critics and decoders share."""
+"""The one network shape that actors, critics and decoders share, and the steps that change its parameters."""
+
+from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 
@@ -44,3 +46,24 @@ class MLP(eqx.Module):
         for layer in self.layers[:-1]:
             x = jax.nn.relu(layer(x))
         return self.layers[-1](x)
+
+
+Parameters = TypeVar("Parameters")
+
+
+def start_adam(parameters: Any, learning_rate: float) -> optax.OptState:
+    """The state of Adam before its first step."""
+    return optax.adam(learning_rate).init(parameters)
+
+
+def descend(
+    parameters: Parameters, gradient: Parameters, state: optax.OptState, learning_rate: float
+) -> tuple[Parameters, optax.OptState]:
+    """One step of Adam (Kingma and Ba, 2015) against the gradient."""
+    change, state = optax.adam(learning_rate).update(cast(Any, gradient), state)
+    return cast(Parameters, optax.apply_updates(cast(Any, parameters), change)), state
+
+
+def move_towards(target: Parameters, online: Parameters, tau: float) -> Parameters:
+    """(1 - tau) target + tau online, leaf by leaf."""
+    return jax.tree.map(lambda old, new: old + tau * (new - old), target, online)

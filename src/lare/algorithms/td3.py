@@ -10,42 +10,41 @@ The algorithm knows rewards, never where they come from. Actions lie in [-1, 1] 
 environment rescales them, so that the paper's noise "times the action bound" is plain noise here.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from lare.networks import MLP
+from lare.errors import Checked
+from lare.networks import MLP, descend, move_towards, start_adam
 
 
-class TD3Settings(BaseModel):
+class TD3Settings(Checked):
     """The figures of the TD3 paper; none of them depends on the task."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the hidden layers of actor and critics."""
-    learning_rate: float = Field(3e-4, gt=0)
+    learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Adam's step size, for actor and critics."""
-    batch_size: int = Field(256, ge=1)
+    batch_size: Annotated[int, Field(ge=1)] = 256
     """Transitions in one update."""
-    gamma: float = Field(0.99, ge=0, le=1)
+    gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
     """Discount of a step."""
-    tau: float = Field(0.005, gt=0, le=1)
+    tau: Annotated[float, Field(gt=0, le=1)] = 0.005
     """How far the targets move towards the networks at a policy update."""
-    policy_noise: float = Field(0.2, ge=0)
+    policy_noise: Annotated[float, Field(ge=0)] = 0.2
     """Standard deviation of the noise on the target action, in units of the action bound."""
-    noise_clip: float = Field(0.5, ge=0)
+    noise_clip: Annotated[float, Field(ge=0)] = 0.5
     """Bound of that noise."""
-    policy_delay: int = Field(2, ge=1)
+    policy_delay: Annotated[int, Field(ge=1)] = 2
     """Critic updates for each update of actor and targets."""
-    exploration_noise: float = Field(0.1, ge=0)
+    exploration_noise: Annotated[float, Field(ge=0)] = 0.1
     """Standard deviation of the noise on the actions that are taken, in units of the action bound."""
-    warmup: int = Field(10_000, ge=0)
+    warmup: Annotated[int, Field(ge=0)] = 10_000
     """Environment steps with uniformly random actions before the first update."""
 
 
@@ -83,9 +82,10 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, settings: T
         return MLP(observation_size + action_size, settings.hidden, 1, key=key)
 
     online = Networks(actor, eqx.filter_vmap(critic)(jax.random.split(critic_key, 2)))
-    optimizer = optax.adam(settings.learning_rate)
     # The targets are copies: two names for one buffer could not be donated to the compiled update.
-    return TD3(online, jax.tree.map(jnp.copy, online), optimizer.init(online.actor), optimizer.init(online.critics))
+    target = jax.tree.map(jnp.copy, online)
+    rate = settings.learning_rate
+    return TD3(online, target, start_adam(online.actor, rate), start_adam(online.critics, rate))
 
 
 def act(actor: MLP, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch action"]:
@@ -126,7 +126,7 @@ def update(
     `update_policy` is an argument, not a counter in the state, so that under `vmap` over seeds it stays one value for
     all of them and the delayed half is skipped rather than computed and thrown away.
     """
-    optimizer = optax.adam(settings.learning_rate)
+    rate = settings.learning_rate
     target = target_values(state.target, batch, key, settings)
 
     def critic_loss(critics: MLP) -> Float[Array, ""]:
@@ -137,13 +137,11 @@ def update(
         return -jnp.mean(value(first, batch.observation, act(actor, batch.observation)))
 
     loss, gradient = jax.value_and_grad(critic_loss)(state.online.critics)
-    change, critic_optimizer = optimizer.update(gradient, state.critic_optimizer)
-    critics = optax.apply_updates(state.online.critics, change)
+    critics, critic_optimizer = descend(state.online.critics, gradient, state.critic_optimizer, rate)
 
     def delayed(actor: MLP, target: Networks, actor_optimizer: optax.OptState):
-        change, actor_optimizer = optimizer.update(jax.grad(actor_loss)(actor, critics), actor_optimizer)
-        online = Networks(optax.apply_updates(actor, change), critics)
-        return online.actor, optax.incremental_update(online, target, settings.tau), actor_optimizer
+        actor, actor_optimizer = descend(actor, jax.grad(actor_loss)(actor, critics), actor_optimizer, rate)
+        return actor, move_towards(target, Networks(actor, critics), settings.tau), actor_optimizer
 
     actor, targets, actor_optimizer = jax.lax.cond(
         update_policy, delayed, lambda *kept: kept, state.online.actor, state.target, state.actor_optimizer

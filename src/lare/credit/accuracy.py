@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 def mean_error(
     r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], counts: Bool[Array, " steps"]
 ) -> Float[Array, ""]:
-    """mean |r_hat - r| over the steps that count (the paper's Table F.5)."""
+    """Mean |r_hat - r| over the steps that count (the paper's Table F.5)."""
     return jnp.sum(jnp.abs(r_hat - reward) * counts) / jnp.maximum(jnp.sum(counts), 1)
 
 

@@ -7,36 +7,35 @@ mean square of R/T. Since features and targets are normalised by statistics in t
 factor, changes nothing but the scale of r_hat. `normalise = false` is the published form: raw features, raw targets.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from lare.credit import losses
 from lare.credit.methods import Fit
 from lare.credit.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe, observe_scale, standardise
-from lare.networks import MLP
+from lare.errors import Checked
+from lare.networks import MLP, descend, start_adam
 
 
-class CreditSettings(BaseModel):
+class CreditSettings(Checked):
     """How the decoder is fitted."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the decoder's hidden layers."""
-    learning_rate: float = Field(3e-4, gt=0)
+    learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Adam's step size."""
     normalise: bool = True
     """Normalise features and returns by running statistics. The published form does not."""
     sum_form: bool = False
     """Fit the return R of an episode (Eq. 6 of the paper), not its mean R/T (the published code)."""
-    drawn_steps: int = Field(64, ge=2)
+    drawn_steps: Annotated[int, Field(ge=2)] = 64
     """K: steps drawn from an episode by RRD and its kin."""
-    steps: int = Field(256, ge=2)
+    steps: Annotated[int, Field(ge=2)] = 256
     """Steps in one update of the decoder: K steps of 256 // K episodes, or whole episodes that make up about 256."""
 
 
@@ -62,7 +61,7 @@ class Decomposition(NamedTuple):
 
 def init(key: PRNGKeyArray, features: int, settings: CreditSettings) -> Decomposition:
     decoder = MLP(features, settings.hidden, 1, key=key)
-    return Decomposition(decoder, optax.adam(settings.learning_rate).init(decoder), no_moments(features), no_scale())
+    return Decomposition(decoder, start_adam(decoder, settings.learning_rate), no_moments(features), no_scale())
 
 
 def observe_steps(state: Decomposition, features: Float[Array, "batch features"]) -> Decomposition:
@@ -111,6 +110,5 @@ def update(
         return losses.unbiased_squared_error(drawn, target, episodes.length, weight)
 
     loss, gradient = jax.value_and_grad(loss_of)(state.decoder)
-    change, optimizer = optax.adam(settings.learning_rate).update(gradient, state.optimizer)
-    decoder = optax.apply_updates(state.decoder, change)
+    decoder, optimizer = descend(state.decoder, gradient, state.optimizer, settings.learning_rate)
     return state._replace(decoder=decoder, optimizer=optimizer), {"credit/loss": loss}

@@ -34,7 +34,9 @@ def squared_error(
     return jnp.sum(weight * (mean - target) ** 2) / jnp.maximum(jnp.sum(weight > 0), 1)
 
 
-def subsampling_variance(r_hat: Float[Array, "episodes K"], length: Int[Array, " episodes"]) -> Float[Array, " episodes"]:
+def subsampling_variance(
+    r_hat: Float[Array, "episodes K"], length: Int[Array, " episodes"]
+) -> Float[Array, " episodes"]:
     """Var(mean of K) = Var_K(r_hat) * (1 - K/T) / K: what drawing K of T steps adds to the squared error.
 
     `Var_K` is the sample variance (divided by K - 1), and the finite-population factor (1 - K/T) holds for drawing
@@ -57,6 +59,8 @@ def unbiased_squared_error(
     return squared_error(jnp.mean(r_hat, axis=1), target, weight) - correction
 
 
-def episode_weight(length: Int[Array, " episodes"], counts: Float[Array, " episodes"], sum_form: bool) -> Float[Array, " episodes"]:
+def episode_weight(
+    length: Int[Array, " episodes"], counts: Float[Array, " episodes"], sum_form: bool
+) -> Float[Array, " episodes"]:
     """The weight of an episode: 1 when R/T is fitted, T^2 when the sum R is (`sum_form`); 0 where `counts` is 0."""
     return counts * length.astype(jnp.float32) ** 2 if sum_form else counts

@@ -12,7 +12,7 @@ CLIP = 10.0
 class Moments(NamedTuple):
     """Mean and spread of everything seen so far, one of each per feature."""
 
-    count: Float[Array, ""]
+    seen: Float[Array, ""]
     mean: Float[Array, " features"]
     squares: Float[Array, " features"]
     """Sum of the squared deviations from the mean."""
@@ -24,17 +24,17 @@ def no_moments(features: int) -> Moments:
 
 def observe(moments: Moments, rows: Float[Array, "batch features"]) -> Moments:
     """Take a batch in (the parallel update of Chan, Golub and LeVeque, 1983: no catastrophic cancellation)."""
-    count = moments.count + rows.shape[0]
+    count = moments.seen + rows.shape[0]
     mean = jnp.mean(rows, axis=0)
     gap = mean - moments.mean
     share = rows.shape[0] / count
-    squares = moments.squares + jnp.sum((rows - mean) ** 2, axis=0) + gap**2 * moments.count * share
+    squares = moments.squares + jnp.sum((rows - mean) ** 2, axis=0) + gap**2 * moments.seen * share
     return Moments(count, moments.mean + gap * share, squares)
 
 
 def standardise(moments: Moments, rows: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
     """(x - mean) / std, cut off at ±10. A feature that never varied becomes 0."""
-    deviation = jnp.sqrt(moments.squares / jnp.maximum(moments.count, 1))
+    deviation = jnp.sqrt(moments.squares / jnp.maximum(moments.seen, 1))
     # A deviation within float32's rounding of the mean is noise, whatever its absolute size.
     varies = deviation > 1e-6 * jnp.abs(moments.mean)
     scaled = (rows - moments.mean) / jnp.where(varies, deviation, 1)
@@ -44,7 +44,7 @@ def standardise(moments: Moments, rows: Float[Array, "*batch features"]) -> Floa
 class Scale(NamedTuple):
     """Root mean square of the mean reward of an episode, R/T."""
 
-    count: Float[Array, ""]
+    seen: Float[Array, ""]
     mean_square: Float[Array, ""]
 
 
@@ -54,7 +54,7 @@ def no_scale() -> Scale:
 
 def observe_scale(scale: Scale, values: Float[Array, " batch"], counts: Bool[Array, " batch"]) -> Scale:
     """Take in those of `values` where `counts` is true."""
-    count = scale.count + jnp.sum(counts)
+    count = scale.seen + jnp.sum(counts)
     excess = jnp.sum(jnp.where(counts, values**2 - scale.mean_square, 0))
     return Scale(count, scale.mean_square + excess / jnp.maximum(count, 1))
 

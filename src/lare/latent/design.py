@@ -55,7 +55,7 @@ def design(
     if candidates > 1:
         conversation = prompts.combine(task, replies, kind)
         replies = ask("combine", conversation)
-    reply = replies[0]
+    reply, errors = replies[0], ""
     for attempt in range(ATTEMPTS):
         function, errors = examine(reply, task, kind)
         if function is not None:

@@ -93,8 +93,13 @@ class LatentFunction:
     def save(self, path: str | Path) -> None:
         """Write `path` (Python, to be read) and beside it a .json with replies and checks."""
         path = Path(path).with_suffix(".py")
-        top = (f"task: {self.task}", f"kind: {self.kind}", f"model: {self.model}", f"sha256: {self.digest}",
-               f"passed: {', '.join(check.name for check in self.checks)}")
+        top = (
+            f"task: {self.task}",
+            f"kind: {self.kind}",
+            f"model: {self.model}",
+            f"sha256: {self.digest}",
+            f"passed: {', '.join(check.name for check in self.checks)}",
+        )
         path.write_text("".join(f"{HEADER}{line}\n" for line in top) + self.source + "\n", encoding="utf-8")
         path.with_suffix(".json").write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
 

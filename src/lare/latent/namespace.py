@@ -8,6 +8,7 @@ here that `verify` has not passed.
 import ast
 import builtins
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -20,8 +21,11 @@ MODULES = {"numpy": np, "math": math}
 
 BUILTINS = (
     "abs all any bool dict enumerate float int isinstance len list map max min pow range reversed round sorted sum "
-    "tuple zip True False None ValueError"
+    "tuple zip ValueError"
 ).split()
+
+
+NUMBERING = re.compile(r"^(factor\s*)?\d+\s*[.:)]\s*", re.IGNORECASE)
 
 
 def imported(name: str, *_: Any) -> Any:
@@ -37,9 +41,9 @@ def compile_function(source: str) -> Callable[[np.ndarray, np.ndarray], Any]:
         SyntaxError: `source` is not Python.
         NameError: it defines no `evaluation_func`.
     """
-    allowed = {name: getattr(builtins, name) for name in BUILTINS if hasattr(builtins, name)}
+    allowed = {name: getattr(builtins, name) for name in BUILTINS}
     namespace: dict[str, Any] = {"__builtins__": {**allowed, "__import__": imported}, "np": np, "math": math}
-    exec(compile(source, "latent_function.py", "exec"), namespace)  # noqa: S102 - what this package is for
+    exec(compile(source, "latent_function.py", "exec"), namespace)
     if not callable(namespace.get(NAME)):
         raise NameError(f"the code defines no function {NAME}(observation, action)")
     return namespace[NAME]
@@ -70,5 +74,5 @@ def factor_meanings(source: str) -> dict[str, str]:
                 comment.insert(0, lines[number].strip().lstrip("#").strip())
                 number -= 1
             if comment:
-                meanings[node.targets[0].id] = " ".join(comment)
+                meanings[node.targets[0].id] = NUMBERING.sub("", " ".join(comment))
     return meanings

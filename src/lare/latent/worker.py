@@ -57,7 +57,9 @@ def check_form(factors: Any, rows: int, kind: str) -> np.ndarray:
         raise Failed(f"{NAME} must return exactly one reward array, but returned {len(factors)}")
     for number, factor in enumerate(factors, start=1):
         if not isinstance(factor, np.ndarray) or factor.shape != (rows, 1):
-            raise Failed(f"factor {number} must be an array of shape (batch_size, 1) = ({rows}, 1), but is {described(factor)}")
+            raise Failed(
+                f"factor {number} must be an array of shape (batch_size, 1) = ({rows}, 1), but is {described(factor)}"
+            )
         if factor.dtype.kind not in "fiub":
             raise Failed(f"factor {number} must hold real numbers, but is {described(factor)}")
     return np.concatenate(factors, axis=1).astype(np.float64)
@@ -70,7 +72,9 @@ def check_finite(factors: np.ndarray) -> None:
             raise Failed(f"factor {number} is {column[bad][0]} for {bad.sum()} of {len(column)} recorded steps")
 
 
-def check_rows_alone(function: Function, observation: np.ndarray, action: np.ndarray, whole: np.ndarray, kind: str) -> None:
+def check_rows_alone(
+    function: Function, observation: np.ndarray, action: np.ndarray, whole: np.ndarray, kind: str
+) -> None:
     for row in range(0, len(observation), max(1, len(observation) // 8)):
         alone = call(function, observation[row : row + 1], action[row : row + 1])
         alone = check_form(alone, 1, kind)
@@ -80,7 +84,9 @@ def check_rows_alone(function: Function, observation: np.ndarray, action: np.nda
             raise Failed(f"row {row} has other factors when it is judged alone: a row must not depend on other rows")
 
 
-def checks(source: str, kind: str, observation: np.ndarray, action: np.ndarray) -> Iterator[tuple[str, Callable[[], Any]]]:
+def checks(
+    source: str, kind: str, observation: np.ndarray, action: np.ndarray
+) -> Iterator[tuple[str, Callable[[], Any]]]:
     """The checks by name, in order; each builds on what those before it found."""
     found: dict[str, Any] = {}
 
@@ -108,7 +114,9 @@ def where(error: BaseException) -> str:
     """The line of the generated code that an exception came from."""
     if isinstance(error, SyntaxError):
         return f" (line {error.lineno})"
-    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == "latent_function.py"]
+    lines = [
+        frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == "latent_function.py"
+    ]
     return f" (line {lines[-1]})" if lines else ""
 
 

@@ -8,9 +8,7 @@ from collections.abc import Sequence
 from importlib.resources import files
 from typing import Literal, Protocol
 
-from pydantic import BaseModel, ConfigDict, ValidationError
-
-from lare.errors import LareError, first_problem
+from lare.errors import Checked, LareError
 from lare.llm.prompts import Kind, Message, Stage
 
 SHIPPED = files("lare.llm") / "recordings"
@@ -26,20 +24,16 @@ class Model(Protocol):
         ...
 
 
-class Exchange(BaseModel):
+class Exchange(Checked):
     """A request and the replies to it, as they came."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     stage: Stage
     messages: list[Message]
     replies: list[str]
 
 
-class Recording(BaseModel):
+class Recording(Checked):
     """One complete sample of a model: its candidates and their combination (and corrections, if there were any)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     task: str
     kind: Literal["factors", "reward"]
@@ -69,8 +63,8 @@ def read_recording(text: str, name: str) -> Recording:
     """Raises `LareError` where `text` is not a recording; `name` says in the message which one."""
     try:
         return Recording(**json.loads(text))
-    except ValidationError as error:
-        raise LareError(f"recording {name}: {first_problem(error)}") from error
+    except LareError as error:
+        raise LareError(f"recording {name}: {error}") from error
     except (ValueError, TypeError) as error:
         raise LareError(f"recording {name} is not JSON: {error}") from error
 

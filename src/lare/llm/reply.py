@@ -2,19 +2,19 @@
 
 import json
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 
-from lare.errors import LareError, first_problem
+from lare.errors import Checked, LareError
 
 
 class MalformedReply(LareError):
     """A reply that cannot be read. The message goes back to the model."""
 
 
-class Reply(BaseModel):
+class Reply(Checked):
     """The JSON object that a request asks for."""
 
-    model_config = ConfigDict(frozen=True, populate_by_name=True)
+    model_config = ConfigDict(extra="ignore")
 
     understand: str = Field(alias="Understand")
     analyze: str = Field(alias="Analyze")
@@ -32,5 +32,5 @@ def parse(text: str) -> Reply:
         raise MalformedReply(f"the reply is JSON, but not an object: {text.strip()[:40]!r}")
     try:
         return Reply(**values)
-    except ValidationError as error:
-        raise MalformedReply(f"the reply's JSON object is not as asked for: {first_problem(error)}") from error
+    except LareError as error:
+        raise MalformedReply(f"the reply's JSON object is not as asked for: {error}") from error

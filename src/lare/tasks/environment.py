@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from typing import Any
 
 import gymnasium
 
@@ -11,7 +12,7 @@ from lare.tasks import mujoco
 mujoco.register()
 
 
-def make(environment: str, max_episode_steps: int | None = None, **kwargs: object) -> gymnasium.Env:
+def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) -> gymnasium.Env:
     """`gymnasium.make`, with every failure a `LareError`.
 
     Versions are the user's choice (v4 and v5 scores are never mixed), so Gymnasium's advice to upgrade is left out.

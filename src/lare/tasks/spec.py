@@ -5,13 +5,13 @@ import hashlib
 import tomllib
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import gymnasium
 from gymnasium.spaces import Box
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 
-from lare.errors import LareError, first_problem
+from lare.errors import Checked, LareError
 from lare.tasks.environment import make
 
 Judges = Literal["before", "after", "both"]
@@ -21,25 +21,25 @@ the other with their factors put side by side."""
 SHIPPED = files("lare.tasks") / "specs"
 
 
-class TaskSpec(BaseModel):
+class TaskSpec(Checked):
     """What is to be solved."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", str_strip_whitespace=True)
+    model_config = ConfigDict(str_strip_whitespace=True)
 
-    name: str = Field(min_length=1, pattern=r"^[\w.\-]+$")
+    name: Annotated[str, Field(min_length=1, pattern=r"^[\w.\-]+$")]
     """What the task is called, in commands and in the names of runs."""
-    environment: str = Field(min_length=1)
+    environment: Annotated[str, Field(min_length=1)]
     """Gymnasium id; `module:id` imports the module that registers it first."""
-    observation_size: int = Field(ge=1)
-    action_size: int = Field(ge=1)
+    observation_size: Annotated[int, Field(ge=1)]
+    action_size: Annotated[int, Field(ge=1)]
     judges: Judges = "after"
-    description: str = Field(min_length=1)
+    description: Annotated[str, Field(min_length=1)]
     """The task and its goal, without a word about the reward."""
-    observation: str = Field(min_length=1)
+    observation: Annotated[str, Field(min_length=1)]
     """What each entry of the observation means."""
-    action: str = Field(min_length=1)
+    action: Annotated[str, Field(min_length=1)]
     """What each entry of the action means."""
-    max_episode_steps: int | None = Field(None, ge=1)
+    max_episode_steps: Annotated[int | None, Field(ge=1)] = None
     """Time limit, for an environment that has none of its own."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` that are averaged and reported beside the return."""
@@ -77,8 +77,8 @@ def read_task(task: str | Path) -> TaskSpec:
     values = read_values(str(task))
     try:
         return TaskSpec(**values)
-    except ValidationError as error:
-        raise LareError(f"task {str(task)!r}: {first_problem(error)}") from error
+    except LareError as error:
+        raise LareError(f"task {str(task)!r}: {error}") from error
 
 
 def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -119,12 +119,15 @@ def check_against_environment(spec: TaskSpec) -> None:
         check_spaces(spec, environment)
     finally:
         environment.close()
+    time_limit(spec)
 
 
 def check_spaces(spec: TaskSpec, environment: gymnasium.Env) -> None:
     for key, space in (("observation", environment.observation_space), ("action", environment.action_space)):
         if not isinstance(space, Box) or len(space.shape) != 1:
-            raise LareError(f"task {spec.name!r}: the {key} space of {spec.environment} is {space}, not a Box of one axis")
+            raise LareError(
+                f"task {spec.name!r}: the {key} space of {spec.environment} is {space}, not a Box of one axis"
+            )
         size = getattr(spec, f"{key}_size")
         if size != space.shape[0]:
             raise LareError(
@@ -134,8 +137,14 @@ def check_spaces(spec: TaskSpec, environment: gymnasium.Env) -> None:
     assert isinstance(action, Box)
     if not action.is_bounded():
         raise LareError(f"task {spec.name!r}: the actions of {spec.environment} have no bounds: {action}")
-    if environment.spec is None or environment.spec.max_episode_steps is None:
+
+
+def time_limit(spec: TaskSpec) -> int:
+    """The most steps that an episode can have. Raises `LareError` where neither spec nor environment sets a limit."""
+    limit = spec.max_episode_steps or gymnasium.spec(spec.environment).max_episode_steps
+    if limit is None:
         raise LareError(
             f"task {spec.name!r}: {spec.environment} has no time limit, so an episode may never pay; "
             "set max_episode_steps in the spec"
         )
+    return limit

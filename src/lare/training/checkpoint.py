@@ -11,6 +11,7 @@ A row file is only ever added; `state.npz` is written beside the old one and ren
 import json
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,18 +77,20 @@ def save(directory: Path, learner: Learner, host: Mapping[str, Any], arrays: Map
     index = jnp.asarray((start[:, None] + np.arange(width)) % rows)
     segment = {field: np.asarray(take(getattr(held, field), index))[:, : count.max()] for field in ROWS}
     number = segments[-1]["number"] + 1 if segments else 0
-    write_atomically(directory / f"rows-{number}.npz", lambda file: np.savez(file, **segment))
+    write_atomically(directory / f"rows-{number}.npz", lambda file: np.savez(file, allow_pickle=False, **segment))
     segments.append({"number": number, "start": start.tolist(), "count": count.tolist()})
     alive = [old for old in segments if any(np.add(old["start"], old["count"]) > end - rows)]
     state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner).items()} | dict(arrays)
     state |= {"host": np.array(json.dumps(host)), "segments": np.array(json.dumps(alive))}
-    write_atomically(directory / STATE, lambda file: np.savez(file, **state))
+    write_atomically(directory / STATE, lambda file: np.savez(file, allow_pickle=False, **state))
     for old in segments[: len(segments) - len(alive)]:
         (directory / f"rows-{old['number']}.npz").unlink(missing_ok=True)
 
 
 def load(directory: Path, template: Learner) -> tuple[Learner, dict[str, Any], dict[str, np.ndarray]]:
-    """Read a checkpoint into a learner of the same structure; returns it, and `host` and `arrays` as saved.
+    """Read a checkpoint into a learner of the structure of `template` (whose leaves may be only shapes).
+
+    Returns it, and `host` and `arrays` as saved.
 
     Raises:
         LareError: there is none, or it is of another structure.
@@ -119,7 +122,8 @@ def fill(template: Learner, state: Mapping[str, np.ndarray]) -> Learner:
 
 def with_rows(learner: Learner, directory: Path, segments: list[dict[str, Any]]) -> Learner:
     rows = capacity(learner.replay)
-    buffers = {field: np.zeros_like(getattr(learner.replay, field)) for field in ROWS}
+    buffer = partial(getattr, learner.replay)
+    buffers = {field: np.zeros(buffer(field).shape, buffer(field).dtype) for field in ROWS}
     for segment in segments:
         with np.load(directory / f"rows-{segment['number']}.npz", allow_pickle=False) as saved:
             for field in ROWS:

@@ -70,7 +70,7 @@ def init(key: PRNGKeyArray, recipe: Recipe) -> Learner:
 def features(steps: Step | Draw, method: Method) -> Float[Array, "batch features"]:
     """What the method's decoder sees of some steps."""
     if method.encoder is Encoder.LATENT:
-        return steps.factors
+        return jnp.asarray(steps.factors)
     change = steps.observation - steps.next_observation
     return jnp.concatenate([steps.observation, steps.action, change], axis=-1)
 
@@ -88,19 +88,22 @@ def store(learner: Learner, steps: Step, recipe: Recipe) -> Learner:
     if credit is not None:
         credit = decomposition.observe_steps(credit, features(steps, recipe.method))
         credit = decomposition.observe_returns(credit, mean_reward, finished)
-    return learner._replace(
-        credit=credit, scale=observe_scale(learner.scale, mean_reward, finished), replay=held
-    )
+    return learner._replace(credit=credit, scale=observe_scale(learner.scale, mean_reward, finished), replay=held)
 
 
 class Draws(NamedTuple):
     """Which transitions one update reads. Only numbers; the rows are read when the update runs."""
 
     batch: Int[Array, "*updates batch"]
-    steps: Int[Array, "*updates rows"] | None
-    """For the decoder, with `episode`, `length`, `mean_reward` and `counts` as in `Episodes`."""
-    episode: Int[Array, "*updates rows"] | None
-    episodes: replay.EpisodeDraw | None
+    credit: "CreditDraws | None"
+
+
+class CreditDraws(NamedTuple):
+    """Which steps one update of the decoder reads, and of which episodes (`episode` as in `Episodes`)."""
+
+    steps: Int[Array, "*updates rows"]
+    episode: Int[Array, "*updates rows"]
+    episodes: replay.EpisodeDraw
 
 
 def draw(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> Draws:
@@ -108,28 +111,24 @@ def draw(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> Draws
     batch_key, credit_key = jax.random.split(key)
     batch = replay.draw_transitions(held, batch_key, (updates, recipe.td3.batch_size))
     if recipe.method.fit is None:
-        return Draws(batch, None, None, None)
+        return Draws(batch, None)
     if recipe.method.fit is Fit.ALL_STEPS:
         whole = partial(draw_whole_episodes, held, recipe=recipe)
-        return Draws(batch, *jax.vmap(whole)(jax.random.split(credit_key, updates)))
-    return Draws(batch, *draw_parts_of_episodes(held, credit_key, updates, recipe))
+        return Draws(batch, jax.vmap(whole)(jax.random.split(credit_key, updates)))
+    return Draws(batch, draw_parts_of_episodes(held, credit_key, updates, recipe))
 
 
-def draw_parts_of_episodes(
-    held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe
-) -> tuple[Int[Array, "updates rows"], Int[Array, "updates rows"], replay.EpisodeDraw]:
+def draw_parts_of_episodes(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> CreditDraws:
     """K steps of each of `steps // K` episodes, for RRD."""
     episodes_key, steps_key = jax.random.split(key)
     drawn, count = recipe.credit.drawn_steps, max(1, recipe.credit.steps // recipe.credit.drawn_steps)
     episodes = replay.draw_episodes(held, episodes_key, (updates, count))
     steps = episodes.first[..., None] + replay.draw_steps(steps_key, episodes.length, drawn)
     episode = jnp.broadcast_to(jnp.repeat(jnp.arange(count), drawn), (updates, count * drawn))
-    return steps.reshape(updates, -1), episode, episodes
+    return CreditDraws(steps.reshape(updates, -1), episode, episodes)
 
 
-def draw_whole_episodes(
-    held: Replay, key: PRNGKeyArray, recipe: Recipe
-) -> tuple[Int[Array, " rows"], Int[Array, " rows"], replay.EpisodeDraw]:
+def draw_whole_episodes(held: Replay, key: PRNGKeyArray, recipe: Recipe) -> CreditDraws:
     """All steps of max(1, steps // mean length) episodes, one behind the other, for RD.
 
     The rows are as many as the longest episode has, or `steps` if that is more; an episode that would run over the end
@@ -145,7 +144,8 @@ def draw_whole_episodes(
     place = jnp.minimum(jnp.searchsorted(end, row, side="right"), places - 1)
     step = drawn.first[place] + row - (end - drawn.length)[place]
     belongs = (counts[place] > 0) & (row < end[place])
-    return jnp.where(belongs, step, drawn.first[0]), jnp.where(belongs, place, places), drawn._replace(counts=counts)
+    episodes = drawn._replace(counts=counts)
+    return CreditDraws(jnp.where(belongs, step, drawn.first[0]), jnp.where(belongs, place, places), episodes)
 
 
 def rewards(batch: Draw, learner: Learner, recipe: Recipe) -> Float[Array, " batch"]:
@@ -172,10 +172,10 @@ def improve(
         algorithm, credit = carry
         number, draws, key = turn
         measured = {}
-        if credit is not None and draws.episodes is not None and recipe.method.fit is not None:
-            seen = features(replay.read(held, draws.steps), recipe.method)
-            chosen = draws.episodes
-            episodes = Episodes(seen, draws.episode, chosen.length, chosen.mean_reward, chosen.counts)
+        if credit is not None and draws.credit is not None and recipe.method.fit is not None:
+            seen = features(replay.read(held, draws.credit.steps), recipe.method)
+            chosen = draws.credit.episodes
+            episodes = Episodes(seen, draws.credit.episode, chosen.length, chosen.mean_reward, chosen.counts)
             credit, measured = decomposition.update(credit, episodes, recipe.method.fit, recipe.credit)
         batch = replay.read(held, draws.batch)
         reward = rewards(batch, learner._replace(credit=credit), recipe)
@@ -207,7 +207,6 @@ def assess(learner: Learner, steps: int, recipe: Recipe) -> dict[str, Float[Arra
 class Compiled(NamedTuple):
     """The functions of a run, compiled, with a leading seed axis on every array but `done`."""
 
-    init: Callable[..., Learner]
     store: Callable[..., Learner]
     improve: Callable[..., tuple[Learner, dict[str, Float[Array, " seeds"]]]]
     assess: Callable[..., dict[str, Float[Array, " seeds"]]]
@@ -217,7 +216,6 @@ class Compiled(NamedTuple):
 def compiled(recipe: Recipe, updates: int) -> Compiled:
     """`store` and `improve` consume the learner that they are given: its memory holds the new one."""
     return Compiled(
-        init=jax.jit(jax.vmap(partial(init, recipe=recipe))),
         store=jax.jit(jax.vmap(partial(store, recipe=recipe)), donate_argnums=0),
         improve=jax.jit(
             jax.vmap(partial(improve, updates=updates, recipe=recipe), in_axes=(0, 0, None)), donate_argnums=0

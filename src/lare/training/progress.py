@@ -53,7 +53,12 @@ class Terminal:
     def started(self, name: str, step: int, steps: int) -> None:
         self.steps = steps
         if self.console.is_terminal:
-            columns = (TextColumn(name), BarColumn(bar_width=20), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"))
+            columns = (
+                TextColumn(name),
+                BarColumn(bar_width=20),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[figures]}"),
+            )
             self.progress = Progress(*columns, TimeRemainingColumn(), console=self.console)
             self.progress.add_task(name, total=steps, completed=step, figures="compiling")
             self.progress.start()
@@ -91,7 +96,8 @@ class TensorBoard:
             raise LareError("TensorBoard events need an extra: pip install 'lare-rl[tensorboard]'") from None
         # What an earlier process wrote behind the checkpoint comes again, and is purged.
         self.writers = {
-            seed: SummaryWriter(str(directory / f"seed-{seed}"), purge_step=step or None, flush_secs=10) for seed in seeds
+            seed: SummaryWriter(str(directory / f"seed-{seed}"), purge_step=step or None, flush_secs=10)
+            for seed in seeds
         }
 
     def started(self, name: str, step: int, steps: int) -> None: ...

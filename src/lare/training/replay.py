@@ -17,7 +17,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
+
+Rows = Array | np.ndarray
+"""What comes from the host may still be there."""
 
 
 class Replay(NamedTuple):
@@ -50,13 +54,13 @@ class Replay(NamedTuple):
 class Step(NamedTuple):
     """One step of the environment, on its way into the replay."""
 
-    observation: Float[Array, "*batch observation"]
-    action: Float[Array, "*batch action"]
-    factors: Float[Array, "*batch factors"]
-    reward: Float[Array, "*batch"]
-    next_observation: Float[Array, "*batch observation"]
-    terminated: Bool[Array, "*batch"]
-    ended: Bool[Array, "*batch"]
+    observation: Float[Rows, "*batch observation"]
+    action: Float[Rows, "*batch action"]
+    factors: Float[Rows, "*batch factors"]
+    reward: Float[Rows, "*batch"]
+    next_observation: Float[Rows, "*batch observation"]
+    terminated: Bool[Rows, "*batch"]
+    ended: Bool[Rows, "*batch"]
     """Terminated, or out of time."""
 
 

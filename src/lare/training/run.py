@@ -1,9 +1,9 @@
 """The run directory: what a run leaves on the disk, and reading it again.
 
-    config.json          every setting, the package version, the spec's and the function's hash
-    latent_function.py   the phi in use, and .json: replies, checks
-    metrics.jsonl        one JSON object a line, for each seed and evaluation
-    checkpoint/          see checkpoint.py
+config.json          every setting, the package version, the spec's and the function's hash
+latent_function.py   the phi in use, and .json: replies, checks
+metrics.jsonl        one JSON object a line, for each seed and evaluation
+checkpoint/          see checkpoint.py
 """
 
 import contextlib
@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 import lare
-from lare.errors import LareError, first_problem
+from lare.errors import Checked, LareError
 from lare.latent.function import LatentFunction, load
-from lare.tasks.spec import TaskSpec
+from lare.tasks.spec import Judges, TaskSpec, time_limit
+from lare.training.checkpoint import STATE, write_atomically
 from lare.training.settings import Settings
 
 CONFIG, METRICS, FUNCTION, CHECKPOINT = "config.json", "metrics.jsonl", "latent_function.py", "checkpoint"
@@ -31,16 +31,16 @@ VERSIONS = ("jax", "optax", "gymnasium", "mujoco", "numpy")
 """Packages that figures depend on."""
 
 
-class Config(BaseModel):
+class Config(Checked):
     """config.json."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     lare: str
     """Version of the package."""
     settings: Settings
     task: TaskSpec
     task_sha256: str
+    longest_episode: int
+    """The environment's time limit."""
     function_sha256: str | None
     isolation: str | None
     """Where the latent function runs while training."""
@@ -49,11 +49,16 @@ class Config(BaseModel):
 
 
 def describe(task: TaskSpec, settings: Settings, function: LatentFunction | None) -> Config:
+    """Everything that the run depends on. Raises `LareError` where the replay could not hold a single episode."""
+    longest = time_limit(task)
+    if settings.rows < longest + 2:
+        raise LareError(f"capacity = {settings.rows} is too small: an episode of {task.name} takes up to {longest + 1}")
     return Config(
         lare=lare.__version__,
         settings=settings,
         task=task,
         task_sha256=task.digest,
+        longest_episode=longest,
         function_sha256=function.digest if function else None,
         isolation="in process, after verification in a process apart" if function else None,
         versions={name: version(name) for name in VERSIONS} | {"python": platform.python_version()},
@@ -73,6 +78,19 @@ class Run:
     def checkpoint(self) -> Path:
         return self.directory / CHECKPOINT
 
+    @property
+    def seeds(self) -> list[int]:
+        return self.config.settings.all_seeds
+
+    @property
+    def judges(self) -> Judges:
+        """Which observation the factors judge a step by."""
+        return self.config.settings.judges or self.config.task.judges
+
+    def has_checkpoint(self) -> bool:
+        """Whether it came as far as its first checkpoint."""
+        return (self.checkpoint / STATE).exists()
+
     def metrics(self) -> list[dict[str, Any]]:
         """Every complete line of metrics.jsonl, in order."""
         path = self.directory / METRICS
@@ -89,7 +107,9 @@ class Run:
                 os.fsync(file.fileno())
                 return file.tell()
         except OSError as error:
-            raise LareError(f"{path} cannot be written: {error.strerror or error}; the last checkpoint is whole") from error
+            raise LareError(
+                f"{path} cannot be written: {error.strerror or error}; the last checkpoint is whole"
+            ) from error
 
     def truncate(self, length: int) -> None:
         """Take back the lines that were written after a checkpoint; they come again."""
@@ -113,7 +133,9 @@ def create(directory: Path, task: TaskSpec, settings: Settings, function: Latent
     try:
         if function is not None:
             function.save(directory / FUNCTION)
-        (directory / CONFIG).write_text(config.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        # Last, and whole or not at all: what has a config.json is a run.
+        text = config.model_dump_json(indent=1) + "\n"
+        write_atomically(directory / CONFIG, lambda file: file.write(text.encode()))
     except OSError as error:
         raise LareError(f"{directory} cannot be written: {error.strerror}") from error
     return Run(directory, config, function)
@@ -139,10 +161,9 @@ def open_run(directory: str | Path) -> Run:
     if not path.is_file():
         raise LareError(f"{directory} is not a run: there is no {CONFIG} in it")
     try:
-        config = Config.model_validate_json(path.read_text(encoding="utf-8"))
-    except (ValidationError, OSError, UnicodeDecodeError) as error:
-        reason = first_problem(error) if isinstance(error, ValidationError) else str(error)
-        raise LareError(f"{path}: {reason}") from error
+        config = Config(**json.loads(path.read_text(encoding="utf-8")))
+    except (LareError, OSError, ValueError, TypeError) as error:
+        raise LareError(f"{path}: {error}") from error
     function = load(directory / FUNCTION, config.task) if config.function_sha256 else None
     if function is not None and function.digest != config.function_sha256:
         raise LareError(f"{directory / FUNCTION} is not the function that this run was trained with: its hash changed")

@@ -1,43 +1,42 @@
 """Every setting of a run. Together with the task and the latent function they say all that a run depends on."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from lare.algorithms.td3 import TD3Settings
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
+from lare.errors import Checked
 from lare.tasks.spec import Judges
 
 LARGEST_SEED = 2**31 - 1
 
 
-class Settings(BaseModel):
+class Settings(Checked):
     """What `lare train` and `lare.train` are given."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     method: str = "lare-rrdu"
     """How credit is assigned: dense, episodic, rd, rrd, rrdu, lare-rd or lare-rrdu."""
     algorithm: Literal["td3"] = "td3"
     """The reinforcement learning algorithm."""
-    steps: int = Field(1_000_000, ge=1)
+    steps: Annotated[int, Field(ge=1)] = 1_000_000
     """Environment steps of each seed."""
-    seeds: int = Field(1, ge=1)
+    seeds: Annotated[int, Field(ge=1)] = 1
     """How many seeds to train, in lockstep in one process."""
-    seed: int = Field(0, ge=0, le=LARGEST_SEED)
+    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 0
     """The first seed; the others follow it."""
     judges: Judges | None = None
     """Which observation the factors judge a step by; what the task says, unless given."""
-    draw: int = Field(0, ge=0)
+    draw: Annotated[int, Field(ge=0)] = 0
     """Which recorded reply of the language model to take phi from (0 to 4); independent of the seed."""
-    chunk: int = Field(50, ge=1)
+    chunk: Annotated[int, Field(ge=1)] = 50
     """Environment steps, and then as many updates, between two calls of the compiled training step."""
-    evaluate_every: int = Field(5000, ge=1)
+    evaluate_every: Annotated[int, Field(ge=1)] = 5000
     """Environment steps between two evaluations; a checkpoint is written at each of them."""
-    evaluation_episodes: int = Field(10, ge=1)
+    evaluation_episodes: Annotated[int, Field(ge=1)] = 10
     """Episodes of the deterministic policy in one evaluation."""
-    capacity: int = Field(1_000_000, ge=4)
+    capacity: Annotated[int, Field(ge=4)] = 1_000_000
     """Observations that the replay of a seed holds; an episode of T steps takes T + 1."""
     scale_rewards: bool = False
     """Divide the rewards that the algorithm sees by the running root mean square of R/T."""
@@ -51,7 +50,11 @@ class Settings(BaseModel):
 
     @model_validator(mode="after")
     def whole_chunks(self) -> "Settings":
-        for name, steps in (("steps", self.steps), ("evaluate_every", self.evaluate_every), ("td3.warmup", self.td3.warmup)):
+        for name, steps in (
+            ("steps", self.steps),
+            ("evaluate_every", self.evaluate_every),
+            ("td3.warmup", self.td3.warmup),
+        ):
             if steps % self.chunk:
                 raise ValueError(f"{name} = {steps} is not a multiple of chunk = {self.chunk}")
         return self

@@ -1,0 +1,68 @@
+"""What a run's decoder gives to the steps of an episode, beside what they truly paid."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from lare.credit import decomposition
+from lare.training import off_policy, replay
+from lare.training.off_policy import RECENT, Learner, Recipe
+from lare.training.run import Run
+from lare.training.session import load_learner
+
+
+@dataclass(frozen=True)
+class Credit:
+    """The last finished episode of a run's first seed, and the factors' correlations."""
+
+    reward: Float[np.ndarray, " steps"]
+    """True."""
+    proxy: Float[np.ndarray, " steps"]
+    """By the decoder of the last checkpoint."""
+    factors: Float[np.ndarray, "steps factors"]
+    correlations: Float[np.ndarray, " factors"]
+    """Pearson's, of each factor with the true reward, over the last steps of all seeds. NaN where one never varies."""
+
+
+def factor_labels(run: Run) -> list[tuple[str, str]]:
+    """Name and meaning of each column of z."""
+    if run.function is None:
+        return []
+    labels = list(zip(run.function.names, run.function.meanings, strict=True))
+    if run.judges != "both":
+        return labels
+    return [(f"{name} ({which})", meaning) for which in ("before", "after") for name, meaning in labels]
+
+
+def credit_of(run: Run) -> Credit | None:
+    """None for a method without a decoder, and as long as no episode has finished."""
+    recipe, learner, _, _ = load_learner(run)
+    if learner.credit is None or not int(replay.finished(first_seed(learner).replay)):
+        return None
+    one = first_seed(learner)
+    episode = one.replay.episodes - 1
+    begin = int(one.replay.first[episode % len(one.replay.first)])
+    steps = replay.read(one.replay, jnp.arange(begin, int(replay.end_of(one.replay, episode))))
+    assert one.credit is not None
+    proxy = decomposition.proxy_rewards(one.credit, off_policy.features(steps, recipe.method), recipe.credit)
+    return Credit(
+        np.asarray(steps.reward), np.asarray(proxy), np.asarray(steps.factors), factor_correlations(learner, recipe)
+    )
+
+
+def first_seed(learner: Learner) -> Learner:
+    return jax.tree.map(lambda leaf: leaf[0], learner)
+
+
+def factor_correlations(learner: Learner, recipe: Recipe) -> Float[np.ndarray, " factors"]:
+    def recent(held: replay.Replay) -> replay.Draw:
+        return replay.read(held, jnp.maximum(held.transitions - 1 - jnp.arange(RECENT), replay.oldest_transition(held)))
+
+    steps = jax.vmap(recent)(learner.replay)
+    reward = np.asarray(steps.reward).ravel()
+    factors = np.asarray(steps.factors).reshape(len(reward), recipe.factors)
+    with np.errstate(invalid="ignore"):
+        return np.array([np.corrcoef(column, reward)[0, 1] for column in factors.T])

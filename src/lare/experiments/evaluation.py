@@ -1,0 +1,78 @@
+"""The policy of a finished (or stopped) run, evaluated and filmed."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from lare.algorithms import td3
+from lare.errors import LareError
+from lare.tasks.spec import check_against_environment
+from lare.training.environments import Policy, Stream, episode_seed, evaluate, make_episodic, to_bounds
+from lare.training.run import Run, open_run
+from lare.training.session import load_learner
+
+
+def load_policy(run: Run) -> Policy:
+    """The deterministic policies of all seeds, as of the last checkpoint."""
+    _, learner, _, _ = load_learner(run)
+    act = jax.jit(jax.vmap(td3.act))
+    return lambda observation: np.asarray(act(learner.algorithm.online.actor, observation))
+
+
+def evaluate_run(directory: str | Path, episodes: int = 10) -> dict[int, Float[np.ndarray, " episodes"]]:
+    """True returns of the deterministic policy, by seed.
+
+    Raises:
+        LareError: the directory is no run, or its task's environment has changed.
+    """
+    if episodes < 1:
+        raise LareError(f"episodes = {episodes}: at least one is needed")
+    run = open_run(directory)
+    task = run.config.task
+    check_against_environment(task)
+    environments = [[make_episodic(task) for _ in range(episodes)] for _ in run.seeds]
+    returns = evaluate(environments, load_policy(run), run.seeds).returns
+    return dict(zip(run.seeds, returns, strict=True))
+
+
+def record_video(directory: str | Path, path: str | Path) -> None:
+    """Film one episode of the first seed's policy, as a .gif, or as an .mp4 with the extra `lare-rl[video]`.
+
+    Raises:
+        LareError: the environment cannot be drawn on this machine, or the file cannot be written.
+    """
+    run, path = open_run(directory), Path(path)
+    environment = make_episodic(run.config.task, render_mode="rgb_array")
+    policy, fps = load_policy(run), environment.metadata.get("render_fps", 30)
+    observation, _ = environment.reset(seed=episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
+    frames, ended = [], False
+    try:
+        while not ended:
+            frames.append(environment.render())
+            everyone = np.broadcast_to(np.asarray(observation, np.float32), (len(run.seeds), len(observation)))
+            action = to_bounds(policy(everyone)[0], environment.action_space)
+            observation, _, terminated, truncated, _ = environment.step(action)
+            ended = terminated or truncated
+    except Exception as error:  # a missing display shows itself in as many ways as there are graphics libraries
+        raise LareError(
+            f"{run.config.task.environment} cannot be drawn here: {error}; without a screen, MUJOCO_GL=egl or "
+            "MUJOCO_GL=osmesa in the environment may help"
+        ) from error
+    write_video(path, frames, fps)
+
+
+def write_video(path: Path, frames: list, fps: int) -> None:
+    import imageio.v3 as imageio
+
+    try:
+        if path.suffix == ".gif":
+            # Browsers play a GIF at 50 frames a second at most.
+            imageio.imwrite(path, frames[:: max(1, round(fps / 25))], duration=40, loop=0)
+        else:
+            imageio.imwrite(path, frames, fps=fps)
+    except (OSError, ValueError, ImportError, TypeError) as error:
+        raise LareError(
+            f"the video {path} cannot be written: {error}; .gif always works, .mp4 needs lare-rl[video]"
+        ) from error

@@ -1,0 +1,87 @@
+"""Figures as SVG text, each from plain arrays, drawn to be read on a phone and on paper."""
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
+"""Okabe and Ito's colours, which the colour-blind can tell apart."""
+
+STYLE: Any = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "lare",
+    "font.family": "sans-serif",
+    "font.size": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e6e6e6",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+}
+
+Curve = tuple[Float[np.ndarray, " evaluations"], Float[np.ndarray, "seeds evaluations"]]
+"""Steps, and what was measured at them."""
+
+
+def svg(figure: Figure) -> str:
+    text = io.StringIO()
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(text, format="svg", bbox_inches="tight", metadata={"Date": None})
+    drawn = text.getvalue()
+    return drawn[drawn.index("<svg") :]
+
+
+def new_figure(rows: int = 1, height: float = 3.4) -> tuple[Figure, np.ndarray]:
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, height * rows if rows == 1 else height), layout="constrained")
+        return figure, figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+
+
+def curves(by_name: Mapping[str, Curve], label: str, *, from_zero: bool = False) -> str:
+    """Means over seeds as lines, the standard deviation over seeds as a band."""
+    figure, (axes,) = new_figure()
+    for colour, (name, (steps, values)) in zip(COLOURS * len(by_name), by_name.items(), strict=False):
+        mean = values.mean(axis=0)
+        axes.plot(steps, mean, color=colour, label=f"{name} ({len(values)} seed{'s' * (len(values) > 1)})")
+        if len(values) > 1:
+            spread = values.std(axis=0, ddof=1)
+            axes.fill_between(steps, mean - spread, mean + spread, color=colour, alpha=0.18, linewidth=0)
+    if from_zero:
+        axes.set_ylim(bottom=0)
+    axes.set(xlabel="environment steps", ylabel=label)
+    axes.xaxis.set_major_formatter(lambda x, _: f"{x / 1e6:g}M" if x >= 1e6 else f"{x / 1e3:g}k" if x else "0")
+    legend_above(axes)
+    return svg(figure)
+
+
+def credit(reward: Float[np.ndarray, " steps"], proxy: Float[np.ndarray, " steps"]) -> str:
+    """Proxy and true reward of an episode, step by step."""
+    figure, (axes,) = new_figure()
+    axes.plot(reward, color="#999999", linewidth=1.6, label="true reward")
+    axes.plot(proxy, color=COLOURS[0], linewidth=0.9, label="proxy reward")
+    axes.set(xlabel="step of the episode", ylabel="reward")
+    legend_above(axes)
+    return svg(figure)
+
+
+def courses(factors: Float[np.ndarray, "steps factors"], names: Sequence[str]) -> str:
+    """Each factor over an episode, one under the other."""
+    figure, rows = new_figure(len(names), height=0.5 + 0.95 * len(names))
+    for colour, axes, name, column in zip(COLOURS * len(names), rows, names, factors.T, strict=False):
+        axes.plot(column, color=colour, linewidth=0.9)
+        axes.set_title(name, loc="left", fontsize=10, pad=2)
+        axes.tick_params(labelsize=9)
+        axes.locator_params(axis="y", nbins=3)
+    rows[-1].set_xlabel("step of the episode")
+    return svg(figure)
+
+
+def legend_above(axes: Axes) -> None:
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2, handlelength=1.4, fontsize=10)

@@ -1,0 +1,210 @@
+"""The report: one HTML file that needs nothing else, of one run or of several laid over each other."""
+
+import json
+from collections.abc import Iterable, Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import lare
+from lare.credit.methods import find_method
+from lare.errors import LareError
+from lare.experiments import figures
+from lare.experiments.credit import credit_of, factor_labels
+from lare.training.run import Run, open_run
+from lare.training.settings import Settings
+
+PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+{style}</style>
+</head>
+<body>
+{body}
+</body>
+</html>
+"""
+
+
+def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> Path:
+    """Draw the report of one or more runs; returns where it was written.
+
+    Args:
+        runs: run directories, finished or not.
+        out: the file; report.html in the first run's directory unless given.
+
+    Raises:
+        LareError: one of them is no run, or has nothing to show yet, or the file cannot be written.
+    """
+    if not runs:
+        raise LareError("say which runs to report on")
+    opened = [open_run(directory) for directory in runs]
+    for run in opened:
+        if not run.metrics():
+            raise LareError(f"{run.directory} has no evaluation yet: there is nothing to report")
+    path = Path(out) if out is not None else opened[0].directory / "report.html"
+    names = labels(opened)
+    tasks = sorted({run.config.task.name for run in opened})
+    title = f"{', '.join(tasks)}: {', '.join(names)}" if len(opened) < 4 else f"{', '.join(tasks)}: {len(opened)} runs"
+    parts = [f"<h1>{escape(title)}</h1>", summary(opened, names)]
+    for task in tasks:
+        chosen = {name: run for name, run in zip(names, opened, strict=True) if run.config.task.name == task}
+        parts.extend(learning(task, chosen))
+    for name, run in zip(names, opened, strict=True):
+        parts.extend(details(name, run))
+    style = (files("lare.experiments") / "report.css").read_text(encoding="utf-8")
+    try:
+        path.write_text(PAGE.format(title=escape(title), style=style, body="\n".join(parts)), encoding="utf-8")
+    except OSError as error:
+        raise LareError(f"the report {path} cannot be written: {error.strerror}") from error
+    return path
+
+
+def labels(runs: Sequence[Run]) -> list[str]:
+    """A name for each run: its method; where two would be the same, its directory too."""
+    methods = [run.config.settings.method for run in runs]
+    named = [
+        method if methods.count(method) == 1 else f"{method} ({run.directory.name})"
+        for method, run in zip(methods, runs, strict=True)
+    ]
+    return [f"{name} #{place + 1}" if named.count(name) > 1 else name for place, name in enumerate(named)]
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
+    """An HTML table of escaped cells; the columns in `numbers` are set as figures."""
+
+    def cells(tag: str, row: Sequence[str]) -> str:
+        kinds = (' class="number"' if place in numbers else "" for place in range(len(row)))
+        return "".join(f"<{tag}{kind}>{escape(cell)}</{tag}>" for kind, cell in zip(kinds, row, strict=True))
+
+    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    return f'<div class="wide"><table><tr>{cells("th", head)}</tr>\n{body}\n</table></div>'
+
+
+def curve(run: Run, key: str) -> figures.Curve | None:
+    """One number of metrics.jsonl over the steps; None where the run has none of it."""
+    lines = [line for line in run.metrics() if line["seed"] in run.seeds]
+    steps = sorted({line["step"] for line in lines})
+    place = {(line["step"], line["seed"]): line.get(key) for line in lines}
+    if all(value is None for value in place.values()):
+        return None
+    values = [[place.get((step, seed)) for step in steps] for seed in run.seeds]
+    return np.array(steps, float), np.array(values, float)
+
+
+def spread(run: Run, key: str, form: str) -> str:
+    """The last value: its mean over the seeds, and their standard deviation."""
+    found = curve(run, key)
+    if found is None:
+        return "-"
+    last = found[1][:, -1]
+    return f"{last.mean():{form}}" + (f" ± {last.std(ddof=1):{form}}" if len(last) > 1 else "")
+
+
+def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
+    head = ("task", "method", "seeds", "steps", "return", "credit error", "correlation")
+    rows = [
+        (
+            run.config.task.name,
+            name,
+            str(len(run.seeds)),
+            f"{run.metrics()[-1]['step']:,}",
+            spread(run, "evaluation/return", ".1f"),
+            spread(run, "credit/error", ".3g"),
+            spread(run, "credit/correlation", ".3f"),
+        )
+        for name, run in zip(names, runs, strict=True)
+    ]
+    note = (
+        "Return: mean true return of the deterministic policy at the last evaluation. Credit error: mean |proxy reward - "
+        "true reward| over the last 5,000 steps; correlation: Pearson's, over the same. ±: standard deviation over seeds."
+    )
+    return table(head, rows, range(2, 7)) + f'<p class="note">{escape(note)}</p>'
+
+
+def learning(task: str, runs: dict[str, Run]) -> Iterable[str]:
+    """Curves of one task, all its runs in each."""
+    yield f"<h2>Learning {escape(task)}</h2>"
+    shown = ["evaluation/return", "credit/error", "credit/correlation"]
+    shown[1:1] = [f"evaluation/{name}" for name in next(iter(runs.values())).config.task.measures]
+    titles = {
+        "evaluation/return": "true return",
+        "credit/error": "mean |proxy - true reward|",
+        "credit/correlation": "correlation of proxy and true reward",
+    }
+    for key in shown:
+        found = {name: points for name, run in runs.items() if (points := curve(run, key)) is not None}
+        if found:
+            label = titles.get(key, key.removeprefix("evaluation/"))
+            yield f"<h3>{escape(label[0].upper() + label[1:])}</h3>"
+            yield figures.curves(found, label, from_zero=key == "credit/error")
+    yield '<p class="note">Line: mean over seeds. Band: ± one standard deviation over seeds.</p>'
+
+
+def details(name: str, run: Run) -> Iterable[str]:
+    """Credit, factors, function and settings of one run."""
+    method = find_method(run.config.settings.method)
+    yield f"<h2>{escape(name)} on {escape(run.config.task.name)}</h2>"
+    yield f"<p>{escape(method.summary[0].upper() + method.summary[1:])}. Source: {escape(method.source)}.</p>"
+    credit = credit_of(run)
+    if credit is not None:
+        yield f"<h3>Credit over one episode ({len(credit.reward)} steps)</h3>"
+        yield figures.credit(credit.reward, credit.proxy)
+        yield (
+            '<p class="note">The last training episode of the first seed, exploration included, judged by the newest '
+            f"decoder. Return {credit.reward.sum():.1f}, sum of the proxy rewards {credit.proxy.sum():.1f}.</p>"
+        )
+    if run.function is not None:
+        yield from factors(run, credit)
+        yield "<h3>The latent function</h3>"
+        yield f'<p class="note">By {escape(run.function.model)}. SHA-256 {run.function.digest}.</p>'
+        yield f"<pre>{escape(run.function.source)}</pre>"
+    yield "<h3>Settings</h3>"
+    yield settings_table(run)
+
+
+def factors(run: Run, credit: Any) -> Iterable[str]:
+    named = factor_labels(run)
+    yield "<h3>The factors</h3>"
+    correlations = credit.correlations if credit is not None else [np.nan] * len(named)
+    rows = [
+        (name, meaning, "-" if np.isnan(value) else f"{value:.2f}")
+        for (name, meaning), value in zip(named, correlations, strict=True)
+    ]
+    yield table(("factor", "meaning, in the model's words", "correlation with the true reward"), rows, (2,))
+    if credit is not None:
+        yield figures.courses(credit.factors, [name for name, _ in named])
+    yield f'<p class="note">phi judges the observation {escape(judged(run))} the step.</p>'
+
+
+def judged(run: Run) -> str:
+    return {"before": "before", "after": "after", "both": "before and the observation after"}[run.judges]
+
+
+def settings_table(run: Run) -> str:
+    """What differs from the defaults in sight, everything else folded away."""
+    chosen, defaults = (flatten(settings.model_dump()) for settings in (run.config.settings, Settings()))
+    rows = [(key, json.dumps(value)) for key, value in chosen.items() if value != defaults[key] or key == "method"]
+    config = run.config
+    rows.append(("LaRe", f"{config.lare}; {', '.join(f'{name} {number}' for name, number in config.versions.items())}"))
+    rows.append(("machine", config.machine))
+    everything = escape(config.model_dump_json(indent=1))
+    return (
+        table(("setting", "value"), rows)
+        + f"<details><summary>Everything (config.json)</summary><pre>{everything}</pre></details>"
+        + f'<p class="note">Drawn by LaRe {escape(lare.__version__)}.</p>'
+    )
+
+
+def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat

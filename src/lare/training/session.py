@@ -1,0 +1,205 @@
+"""A run under way: the training state, the environments around it, and one chunk of the work at a time."""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare.credit.methods import find_method
+from lare.errors import LareError
+from lare.tasks.episodic import EpisodicReward
+from lare.training import checkpoint, replay
+from lare.training.environments import (
+    Collected,
+    Lane,
+    Policy,
+    Stream,
+    collect,
+    evaluate,
+    generator,
+    make_episodic,
+)
+from lare.training.off_policy import Compiled, Learner, Recipe, compiled, init
+from lare.training.run import Run
+from lare.training.settings import Settings
+
+
+@dataclass
+class Session:
+    """The training state, and what is around it on the host."""
+
+    run: Run
+    recipe: Recipe
+    functions: Compiled
+    lanes: list[Lane]
+    evaluation: list[list[EpisodicReward]]
+    learner: Learner
+    step: int = 0
+    """Environment steps done, of each seed."""
+    metrics_length: int = 0
+    """Bytes of metrics.jsonl that belong to the state."""
+    latest: dict[str, Float[Array, " seeds"]] = field(default_factory=dict)
+    """What the last chunk of updates measured."""
+
+    @property
+    def settings(self) -> Settings:
+        return self.run.config.settings
+
+    def policy(self, observation: np.ndarray) -> np.ndarray:
+        return np.asarray(self.functions.act(self.learner.algorithm.online.actor, observation))
+
+    def advance(self) -> None:
+        """One chunk: steps, factors, replay, updates."""
+        collected = collect(self.lanes, *self.behaviour())
+        steps = collected.steps._replace(factors=self.factors(collected))
+        self.learner = self.functions.store(self.learner, steps)
+        warmup = self.settings.td3.warmup
+        if self.step >= warmup:
+            keys = seed_keys(jnp.asarray(self.run.seeds), self.step + 1)
+            self.learner, self.latest = self.functions.improve(self.learner, keys, self.step - warmup)
+        self.step += self.settings.chunk
+
+    def behaviour(self) -> tuple[Policy, Float[np.ndarray, "time seeds action"]]:
+        """The policy that collects the next chunk, and the noise on its actions."""
+        shape, td3 = (self.settings.chunk, self.recipe.action_size), self.settings.td3
+        random = [generator(seed, Stream.EXPLORATION, self.step) for seed in self.run.seeds]
+        if self.step < td3.warmup:
+            idle = np.zeros((len(self.lanes), self.recipe.action_size), np.float32)
+            return lambda _: idle, np.stack([one.uniform(-1, 1, shape) for one in random], 1).astype(np.float32)
+        noise = np.stack([one.standard_normal(shape) for one in random], 1)
+        return self.policy, (td3.exploration_noise * noise).astype(np.float32)
+
+    def factors(self, collected: Collected) -> Float[np.ndarray, "seeds time factors"]:
+        """Z of new steps: `phi` on the observations that the task says it judges."""
+        action = collected.environment_action
+        if self.run.function is None:
+            return np.zeros((*action.shape[:2], 0), np.float32)
+        before, after = np.asarray(collected.steps.observation), np.asarray(collected.steps.next_observation)
+        judged = {"before": [before], "after": [after], "both": [before, after]}[self.run.judges]
+        rows = [self.run.function(flat(observation), flat(action)) for observation in judged]
+        return np.concatenate(rows, axis=1).reshape(*action.shape[:2], -1)
+
+    def report(self, rate: float) -> list[dict[str, Any]]:
+        """Evaluate; one line of metrics.jsonl for each seed."""
+        config = self.run.config
+        evaluation = evaluate(self.evaluation, self.policy, self.run.seeds, config.task.measures)
+        measured = {"evaluation/return": evaluation.returns.mean(axis=1)}
+        measured |= {f"evaluation/{name}": values.mean(axis=1) for name, values in evaluation.measures.items()}
+        measured |= {name: np.asarray(value) for name, value in self.functions.assess(self.learner).items()}
+        measured |= {name: np.asarray(value) for name, value in self.latest.items()}
+        lines = []
+        for place, seed in enumerate(self.run.seeds):
+            numbers = {name: float(values[place]) for name, values in measured.items()}
+            # JSON knows no NaN: a correlation with something that never varies is null.
+            known = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+            lines.append({"step": self.step, "seed": seed, **known, "time/steps_per_second": round(rate, 1)})
+        return lines
+
+    def check_diverged(self, lines: Sequence[dict[str, Any]]) -> None:
+        for line in lines:
+            for name in ("critic/loss", "credit/loss"):
+                if name in line and line[name] is None:
+                    raise LareError(
+                        f"training diverged: {name} of seed {line['seed']} is not finite at step {self.step}; "
+                        f"the last checkpoint in {self.run.checkpoint} is whole"
+                    )
+
+    def save(self) -> None:
+        host = {
+            "step": self.step,
+            "metrics_length": self.metrics_length,
+            "episodes": [lane.episode for lane in self.lanes],
+        }
+        arrays = {}
+        for place, lane in enumerate(self.lanes):
+            arrays[f"lane{place}/actions"] = np.reshape(lane.actions, (-1, self.recipe.action_size))
+            arrays[f"lane{place}/observation"] = lane.observation
+        checkpoint.save(self.run.checkpoint, self.learner, host, arrays)
+
+    def return_to(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[str]:
+        """Put everything around the learner back to a checkpoint; returns what is to be said about it."""
+        self.step, self.metrics_length = host["step"], host["metrics_length"]
+        messages, dropped = [], []
+        for place, (lane, episode) in enumerate(zip(self.lanes, host["episodes"], strict=True)):
+            lane.episode = episode
+            actions, observation = arrays[f"lane{place}/actions"], arrays[f"lane{place}/observation"]
+            restored = lane.replay(list(actions), observation)
+            dropped.append(not restored)
+            if not restored:
+                lane.begin()
+                messages.append(
+                    f"episode {episode} of seed {lane.seed} was dropped after {len(actions)} steps: the environment did "
+                    "not come back to the same observation by the same actions"
+                )
+        if any(dropped):
+            self.learner = self.learner._replace(replay=drop(self.learner.replay, jnp.asarray(dropped)))
+        return messages
+
+    def close(self) -> None:
+        for environment in itertools.chain((lane.environment for lane in self.lanes), *self.evaluation):
+            environment.close()
+
+
+def flat(rows: np.ndarray) -> np.ndarray:
+    """Seeds and time in one axis."""
+    return rows.reshape(-1, rows.shape[-1])
+
+
+@jax.jit
+def drop(held: replay.Replay, dropped: Array) -> replay.Replay:
+    """Forget the running episodes of the seeds where `dropped` is true."""
+
+    def choose(shorter: Array, whole: Array) -> Array:
+        return jnp.where(dropped.reshape(-1, *[1] * (whole.ndim - 1)), shorter, whole)
+
+    return jax.tree.map(choose, jax.vmap(replay.drop_running)(held), held)
+
+
+@jax.jit
+def seed_keys(seeds: Array, number: int) -> PRNGKeyArray:
+    """A key for each seed that depends on the seed and `number` alone: there is no state to save."""
+    return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), number))(seeds)
+
+
+def recipe_for(run: Run) -> Recipe:
+    task, settings = run.config.task, run.config.settings
+    factors = run.function.size if run.function else 0
+    return Recipe(
+        method=find_method(settings.method),
+        td3=settings.td3,
+        credit=settings.credit,
+        scale_rewards=settings.scale_rewards,
+        observation_size=task.observation_size,
+        action_size=task.action_size,
+        factors=2 * factors if run.judges == "both" else factors,
+        longest_episode=run.config.longest_episode,
+        capacity=settings.rows,
+    )
+
+
+def load_learner(run: Run) -> tuple[Recipe, Learner, dict[str, Any], dict[str, np.ndarray]]:
+    """The training state of a run's last checkpoint, and what stood with it."""
+    recipe = recipe_for(run)
+    template = jax.eval_shape(partial(new_learner, run))
+    return recipe, *checkpoint.load(run.checkpoint, template)
+
+
+def new_learner(run: Run) -> Learner:
+    return jax.jit(jax.vmap(partial(init, recipe=recipe_for(run))))(seed_keys(jnp.asarray(run.seeds), 0))
+
+
+def begin(run: Run, learner: Learner) -> Session:
+    """Environments and compiled functions around a learner."""
+    recipe, task = recipe_for(run), run.config.task
+    lanes = [Lane(seed, make_episodic(task)) for seed in run.seeds]
+    for lane in lanes:
+        lane.begin()
+    evaluation = [[make_episodic(task) for _ in range(run.config.settings.evaluation_episodes)] for _ in lanes]
+    return Session(run, recipe, compiled(recipe, run.config.settings.chunk), lanes, evaluation, learner)
