@@ -1,62 +1,40 @@
-"""What the tests share: small toys that train in a second."""
+"""Fixtures for all tests."""
 
-import gymnasium
-import numpy as np
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
 import pytest
-from gymnasium.spaces import Box
 
 from lare.tasks.spec import TaskSpec
+from toys import PHI, Chase, toy_spec
 
+# Most of a small run's time is compilation, and many tests compile the same.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
-class Chase(gymnasium.Env):
-    """A toy that every algorithm must learn: r = -(a - s_0)^2, and nothing that the agent does changes s."""
+collect_ignore = ["toys.py"]
+"""No tests in there, and looking for doctests would import it, and register its environments, a second time."""
 
-    observation_space = Box(-1, 1, (2,), np.float32)
-    action_space = Box(-2, 2, (1,), np.float32)
-
-    def __init__(self, scale: float = 1.0):
-        self.scale = scale
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.observe(), {}
-
-    def observe(self):
-        self.state = self.np_random.uniform(-1, 1, 2).astype(np.float32)
-        return self.state
-
-    def step(self, action):
-        reward = -self.scale * float((action[0] - self.state[0]) ** 2)
-        return self.observe(), reward, False, False, {"distance": abs(float(action[0] - self.state[0]))}
-
-
-gymnasium.register("toys/Chase-v0", entry_point=Chase, max_episode_steps=20)
-
-PHI = """import numpy as np
-
-def evaluation_func(observation, action):
-    # 1. how near the action comes
-    f_near = -np.square(action - observation[:, 0:1])
-    # 2. effort
-    f_effort = -np.square(action)
-    return [f_near, f_effort]
-"""
-
-
-def toy_spec(**changes) -> TaskSpec:
-    values = {
-        "name": "Chase",
-        "environment": "toys/Chase-v0",
-        "observation_size": 2,
-        "action_size": 1,
-        "judges": "before",
-        "description": "Follow the first entry.",
-        "observation": "0: the target. 1: noise.",
-        "action": "0: the guess.",
-    }
-    return TaskSpec(**(values | changes))
+__all__ = ["PHI", "Chase", "toy_spec"]
 
 
 @pytest.fixture
 def chase() -> TaskSpec:
     return toy_spec()
+
+
+@pytest.fixture
+def spec_file(tmp_path) -> Callable[..., Path]:
+    """Writes the toy's spec to a TOML file, with changes; None leaves a key out."""
+
+    def write(**changes) -> Path:
+        values = toy_spec().model_dump(exclude_defaults=True) | changes
+        path = tmp_path / "chase.toml"
+        # These JSON values are TOML values too.
+        path.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items() if value is not None))
+        return path
+
+    return write

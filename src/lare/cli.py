@@ -62,8 +62,9 @@ def design(task: Task, kind: Kind = "factors", draw: int = 0, candidates: int = 
     from lare.latent.design import design as design_function
     from lare.tasks.spec import load_task
 
-    if out is not None and out.with_suffix(".py").exists():
-        raise LareError(f"{out.with_suffix('.py')} exists, and is not overwritten; choose another --out")
+    for path in (out.with_suffix(".py"), out.with_suffix(".json")) if out is not None and out.name else ():
+        if path.exists():
+            raise LareError(f"{path} exists, and is not overwritten; choose another --out")
     function = design_function(load_task(task), kind, draw=draw, candidates=candidates)
     if out is None:
         say(function.source)

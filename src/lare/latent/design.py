@@ -6,6 +6,7 @@ from typing import Any
 
 from lare.errors import LareError
 from lare.latent.function import LatentFunction
+from lare.latent.namespace import normal
 from lare.latent.verify import verify
 from lare.llm import prompts
 from lare.llm.client import Model, RecordedModel, shipped_recordings
@@ -42,6 +43,8 @@ def design(
     Raises:
         LareError: the model cannot answer, or no attempt passed.
     """
+    if candidates < 1:
+        raise LareError(f"candidates = {candidates}: at least one is needed")
     model = model or RecordedModel(shipped_recordings(kind, draw), task.name)
     exchanges: list[dict[str, Any]] = []
 
@@ -69,7 +72,7 @@ def design(
 def examine(reply: str, task: TaskSpec, kind: Kind) -> tuple[LatentFunction | None, str]:
     """The verified function of a reply, or what is wrong with it."""
     try:
-        source = parse(reply).functions.strip("\n")
+        source = normal(parse(reply).functions)
     except MalformedReply as error:
         return None, str(error)
     verdict = verify(source, task, kind)

@@ -2,6 +2,7 @@
 
 import functools
 import hashlib
+import itertools
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
-from lare.latent.namespace import compile_function, factor_meanings, factor_names
+from lare.latent.namespace import compile_function, factor_meanings, factor_names, normal
 from lare.latent.verify import verify
 from lare.latent.worker import Check
 from lare.llm.prompts import Kind
@@ -74,7 +75,8 @@ class LatentFunction:
         """
         try:
             with np.errstate(all="ignore"):
-                columns = self.compiled(observation, action)
+                # Copies: a function that writes into its input must not change what is stored.
+                columns = self.compiled(observation.copy(), action.copy())
                 factors = np.concatenate(columns, axis=1).astype(np.float32)
         except Exception as error:  # generated code may raise anything
             raise LatentRewardError(f"the latent function failed: {type(error).__name__}: {error}") from error
@@ -91,8 +93,15 @@ class LatentFunction:
         return factors
 
     def save(self, path: str | Path) -> None:
-        """Write `path` (Python, to be read) and beside it a .json with replies and checks."""
-        path = Path(path).with_suffix(".py")
+        """Write `path` (Python, to be read) and beside it a .json with replies and checks.
+
+        Raises:
+            LareError: it cannot be written.
+        """
+        path = Path(path)
+        if not path.name:
+            raise LareError(f"{path} is not the name of a file")
+        path = path.with_suffix(".py")
         top = (
             f"task: {self.task}",
             f"kind: {self.kind}",
@@ -100,12 +109,16 @@ class LatentFunction:
             f"sha256: {self.digest}",
             f"passed: {', '.join(check.name for check in self.checks)}",
         )
-        path.write_text("".join(f"{HEADER}{line}\n" for line in top) + self.source + "\n", encoding="utf-8")
-        path.with_suffix(".json").write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+        try:
+            path.write_text("".join(f"{HEADER}{line}\n" for line in top) + self.source + "\n", encoding="utf-8")
+            path.with_suffix(".json").write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def verified(source: str, task: TaskSpec, kind: Kind = "factors") -> LatentFunction:
     """A function from source. Raises `LareError` with every error where it does not pass."""
+    source = normal(source)
     verdict = verify(source, task, kind)
     if not verdict.passed:
         raise LareError(f"the function does not fit task {task.name!r}: {verdict.errors}")
@@ -123,9 +136,11 @@ def load(path: str | Path, task: TaskSpec) -> LatentFunction:
     if not source_path.is_file():
         raise LareError(f"there is no function file {source_path}")
     lines = read_text(source_path).splitlines()
-    source = "\n".join(line for line in lines if not line.startswith(HEADER)).strip("\n")
+    header = list(itertools.takewhile(lambda line: line.startswith(HEADER), lines))
+    source = "\n".join(lines[len(header) :])
+    kind: Kind = "reward" if f"{HEADER}kind: reward" in header else "factors"
     try:
-        function = verified(source, task)
+        function = verified(source, task, kind)
     except LareError as error:
         raise LareError(f"{source_path}: {error}") from error
     return with_provenance(function, source_path.with_suffix(".json"))

@@ -17,7 +17,7 @@ import numpy as np
 NAME = "evaluation_func"
 """What a reply must call its function."""
 
-MODULES = {"numpy": np, "math": math}
+MODULES = ("numpy", "math")
 
 BUILTINS = (
     "abs all any bool dict enumerate float int isinstance len list map max min pow range reversed round sorted sum "
@@ -28,10 +28,16 @@ BUILTINS = (
 NUMBERING = re.compile(r"^(factor\s*)?\d+\s*[.:)]\s*", re.IGNORECASE)
 
 
-def imported(name: str, *_: Any) -> Any:
-    if name not in MODULES:
+def imported(name: str, *rest: Any) -> Any:
+    # NumPy's own C code imports parts of itself through its caller's __import__, at the first `x.mean()`.
+    if name.partition(".")[0] not in MODULES:
         raise ImportError(f"only numpy and math can be imported, not {name}")
-    return MODULES[name]
+    return __import__(name, *rest)
+
+
+def normal(source: str) -> str:
+    """The source as it is kept: line ends of one kind, no blank lines around it."""
+    return "\n".join(source.splitlines()).strip("\n")
 
 
 def compile_function(source: str) -> Callable[[np.ndarray, np.ndarray], Any]:

@@ -46,7 +46,13 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors") -> Verdict:
     """Run the checks of `worker.py` on `source`, in a process without this one's environment."""
     observation, action = random_steps(task)
     archive = io.BytesIO()
-    np.savez(archive, source=np.array(source), kind=np.array(kind), observation=observation, action=action)
+    np.savez(
+        archive,
+        source=np.frombuffer(source.encode(), np.uint8),
+        kind=np.array(kind),
+        observation=observation,
+        action=action,
+    )
     command = [sys.executable, "-I", "-m", "lare.latent.worker"]
     try:
         worker = subprocess.run(command, input=archive.getvalue(), capture_output=True, timeout=TIME_LIMIT, env={})

@@ -69,7 +69,10 @@ def check_finite(factors: np.ndarray) -> None:
     for number, column in enumerate(factors.T, start=1):
         bad = ~np.isfinite(column.astype(np.float32))
         if bad.any():
-            raise Failed(f"factor {number} is {column[bad][0]} for {bad.sum()} of {len(column)} recorded steps")
+            raise Failed(
+                f"factor {number} is {column[bad][0]}, which is no finite float32, for {bad.sum()} of {len(column)} "
+                "recorded steps"
+            )
 
 
 def check_rows_alone(
@@ -129,7 +132,8 @@ def verdicts(source: str, kind: str, observation: np.ndarray, action: np.ndarray
         except Failed as failure:
             return [*done, Check(name, False, str(failure))], 0
         except Exception as error:  # generated code may raise anything
-            return [*done, Check(name, False, f"{type(error).__name__}: {error}{where(error)}")], 0
+            said = error.msg if isinstance(error, SyntaxError) else error
+            return [*done, Check(name, False, f"{type(error).__name__}: {said}{where(error)}")], 0
         done.append(Check(name, True, ""))
     return done, size
 
@@ -138,7 +142,9 @@ def main() -> None:
     with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as given:
         values = {name: given[name] for name in given.files}
     np.seterr(all="ignore")
-    found, size = verdicts(str(values["source"]), str(values["kind"]), values["observation"], values["action"])
+    found, size = verdicts(
+        values["source"].tobytes().decode(), str(values["kind"]), values["observation"], values["action"]
+    )
     json.dump({"checks": [asdict(check) for check in found], "size": size}, sys.stdout)
 
 

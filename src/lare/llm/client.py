@@ -6,7 +6,7 @@ A live model is anything with a `name` and a `reply`; the design loop knows no m
 import json
 from collections.abc import Sequence
 from importlib.resources import files
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from lare.errors import Checked, LareError
 from lare.llm.prompts import Kind, Message, Stage
@@ -14,6 +14,7 @@ from lare.llm.prompts import Kind, Message, Stage
 SHIPPED = files("lare.llm") / "recordings"
 
 
+@runtime_checkable
 class Model(Protocol):
     """Whoever answers a request."""
 
@@ -65,7 +66,7 @@ def read_recording(text: str, name: str) -> Recording:
         return Recording(**json.loads(text))
     except LareError as error:
         raise LareError(f"recording {name}: {error}") from error
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise LareError(f"recording {name} is not JSON: {error}") from error
 
 
@@ -86,6 +87,6 @@ class RecordedModel:
                     return exchange.replies[sample]
         raise LareError(
             f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}): recordings answer only "
-            "the exact texts of a shipped task. Restore its texts, ask for at most as many candidates as were "
-            "recorded, or give a function of your own with --function FILE"
+            "the exact texts of a shipped task, and the number of candidates that was recorded (or 1). Restore them, "
+            "or give a function of your own with --function FILE"
         )

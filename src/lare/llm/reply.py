@@ -26,7 +26,7 @@ def parse(text: str) -> Reply:
     """Raises `MalformedReply`, with what was wrong."""
     try:
         values = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise MalformedReply(f"the reply is not one JSON object: {error}") from error
     if not isinstance(values, dict):
         raise MalformedReply(f"the reply is JSON, but not an object: {text.strip()[:40]!r}")

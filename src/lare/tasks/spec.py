@@ -85,7 +85,7 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     """The keys of a spec, those of the spec that it is `like` filled in."""
     if task in shipped_tasks():
         text = (SHIPPED / f"{task}.toml").read_text(encoding="utf-8")
-    elif Path(task).is_file():
+    elif is_file(task):
         text = read_text(Path(task))
     else:
         close = difflib.get_close_matches(task, shipped_tasks(), n=1)
@@ -103,6 +103,13 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     if not isinstance(parent, str) or parent in seen or parent == task:
         raise LareError(f"task {task!r}: like = {parent!r} must name another task, without a circle")
     return read_values(parent, (*seen, task)) | values
+
+
+def is_file(name: str) -> bool:
+    try:
+        return Path(name).is_file()
+    except (OSError, ValueError):  # too long, or with a character that no file name has
+        return False
 
 
 def read_text(path: Path) -> str:
@@ -141,7 +148,7 @@ def check_spaces(spec: TaskSpec, environment: gymnasium.Env) -> None:
 
 def time_limit(spec: TaskSpec) -> int:
     """The most steps that an episode can have. Raises `LareError` where neither spec nor environment sets a limit."""
-    limit = spec.max_episode_steps or gymnasium.spec(spec.environment).max_episode_steps
+    limit = spec.max_episode_steps or gymnasium.spec(spec.environment.rpartition(":")[2]).max_episode_steps
     if limit is None:
         raise LareError(
             f"task {spec.name!r}: {spec.environment} has no time limit, so an episode may never pay; "

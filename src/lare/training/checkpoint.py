@@ -11,7 +11,6 @@ A row file is only ever added; `state.npz` is written beside the old one and ren
 import json
 import os
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -121,15 +120,15 @@ def fill(template: Learner, state: Mapping[str, np.ndarray]) -> Learner:
 
 
 def with_rows(learner: Learner, directory: Path, segments: list[dict[str, Any]]) -> Learner:
-    rows = capacity(learner.replay)
-    buffer = partial(getattr, learner.replay)
-    buffers = {field: np.zeros(buffer(field).shape, buffer(field).dtype) for field in ROWS}
-    for segment in segments:
-        with np.load(directory / f"rows-{segment['number']}.npz", allow_pickle=False) as saved:
-            for field in ROWS:
+    held, rows = learner.replay, capacity(learner.replay)
+    for field in ROWS:  # one after the other, so that only one of them is in memory twice
+        buffer = np.zeros(getattr(held, field).shape, getattr(held, field).dtype)
+        for segment in segments:
+            with np.load(directory / f"rows-{segment['number']}.npz", allow_pickle=False) as saved:
                 values = saved[field]
-                for seed, (start, count) in enumerate(zip(segment["start"], segment["count"], strict=True)):
-                    # Of a stretch longer than the buffer only the end is left, as it was when it was written.
-                    where = np.arange(start, start + count)[-rows:]
-                    buffers[field][seed, where % rows] = values[seed, :count][-rows:]
-    return learner._replace(replay=learner.replay._replace(**{f: jnp.asarray(b) for f, b in buffers.items()}))
+            for seed, (start, count) in enumerate(zip(segment["start"], segment["count"], strict=True)):
+                # Of a stretch longer than the buffer only the end is left, as it was when it was written.
+                where = np.arange(start, start + count)[-rows:]
+                buffer[seed, where % rows] = values[seed, :count][-rows:]
+        held = held._replace(**{field: jnp.asarray(buffer)})
+    return learner._replace(replay=held)

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -14,6 +14,7 @@ Metrics = Sequence[Mapping[str, Any]]
 """One mapping a seed, as in metrics.jsonl."""
 
 
+@runtime_checkable
 class Listener(Protocol):
     """Whoever wants to know how a run is going."""
 

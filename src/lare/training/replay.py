@@ -225,7 +225,7 @@ def draw_steps(key: PRNGKeyArray, length: Int[Array, "*episodes"], drawn: int) -
     repeats_key, key = jax.random.split(key)
     uniform = jax.random.uniform(key, (drawn, *length.shape))
 
-    def take(chosen: Int[Array, "*episodes {drawn}"], turn: tuple[Int[Scalar, ""], Float[Array, "*episodes"]]):
+    def take(chosen: Int[Array, "*episodes K"], turn: tuple[Int[Scalar, ""], Float[Array, "*episodes"]]):
         i, u = turn
         j = length - drawn + i
         t = jnp.minimum(jnp.floor(u * (j + 1)).astype(jnp.int32), j)

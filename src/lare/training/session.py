@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Key
 
 from lare.credit.methods import find_method
 from lare.errors import LareError
@@ -163,7 +163,7 @@ def drop(held: replay.Replay, dropped: Array) -> replay.Replay:
 
 
 @jax.jit
-def seed_keys(seeds: Array, number: int) -> PRNGKeyArray:
+def seed_keys(seeds: Int[Array, " seeds"], number: int | Array) -> Key[Array, " seeds"]:
     """A key for each seed that depends on the seed and `number` alone: there is no state to save."""
     return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), number))(seeds)
 

@@ -62,6 +62,7 @@ def resume(directory: str | Path, *, tensorboard: bool = False, listeners: Seque
     run = open_run(directory)
     with locked(run):
         if not run.has_checkpoint():
+            run.truncate(0)
             return start(run, tensorboard, listeners)
         _, learner, host, arrays = load_learner(run)
         run.truncate(host["metrics_length"])

@@ -1,0 +1,103 @@
+"""What the benchmarks share: interleaved rounds, sessions to time, and results that say where they come from."""
+
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import jax
+
+import lare
+from lare.credit.methods import Encoder, find_method
+from lare.training.run import create
+from lare.training.session import Session, begin, new_learner
+
+PACKAGES = ("lare-rl", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "stable-baselines3", "sbx-rl", "torch")
+
+
+def interleave(contenders: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
+    """Seconds that each contender took in each round: A B C A B C ..., after one round that compiles and is not counted."""
+    seconds: dict[str, list[float]] = {name: [] for name in contenders}
+    for number in range(rounds + 1):
+        for name, work in contenders.items():
+            start = time.perf_counter()
+            work()
+            if number:
+                seconds[name].append(time.perf_counter() - start)
+    return seconds
+
+
+def ratio(seconds: Sequence[float], reference: Sequence[float]) -> float:
+    """Median over the rounds of the ratio within a round: what slows a whole round down cancels."""
+    return median(one / other for one, other in zip(seconds, reference, strict=True))
+
+
+def summary(seconds: Mapping[str, Sequence[float]], per: int, reference: str) -> dict[str, dict[str, Any]]:
+    """Milliseconds for one of the `per` things that a round does, and the ratio to `reference`."""
+    table = {}
+    for name, values in seconds.items():
+        ms = [1000 * value / per for value in values]
+        figures = {"median ms": median(ms), "least ms": min(ms), "most ms": max(ms)}
+        table[name] = {
+            **figures,
+            "ratio": ratio(values, seconds[reference]),
+            "rounds ms": [round(one, 4) for one in ms],
+        }
+    return table
+
+
+def show(title: str, table: Mapping[str, Mapping[str, Any]], reference: str) -> None:
+    print(f"\n{title:28s} {'median ms':>10s} {'least':>9s} {'most':>9s}   to {reference}")
+    for name, row in table.items():
+        print(f"{name:28s} {row['median ms']:10.4f} {row['least ms']:9.4f} {row['most ms']:9.4f} {row['ratio']:8.3f}")
+
+
+def write(name: str, figures: Mapping[str, Any]) -> None:
+    """results/NAME.json: the figures, the command, and everything they depend on."""
+    out = Path(__file__).parent / "results" / f"{name}.json"
+    out.parent.mkdir(exist_ok=True)
+    out.write_text(json.dumps({**provenance(), **figures}, indent=1) + "\n")
+    print(f"\nwritten to {out.relative_to(Path(__file__).parent.parent)}")
+
+
+def provenance() -> dict[str, Any]:
+    """The command, the machine and the versions of all packages that figures depend on."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    command = " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]])
+    return {"command": command, "machine": machine(), "versions": versions}
+
+
+def machine() -> dict[str, Any]:
+    """Processor and cores; `usable` are those that this process may run on (`taskset`)."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    model = models[0] if models else platform.processor()
+    return {"processor": model, "cores": os.cpu_count(), "usable": usable, "backend": jax.default_backend()}
+
+
+def new_session(directory: Path, task_name: str, settings: lare.Settings) -> Session:
+    """What `lare.train` starts, without the loop around it."""
+    task = lare.load_task(task_name)
+    latent = find_method(settings.method).encoder is Encoder.LATENT
+    run = create(directory, task, settings, lare.design(task, draw=settings.draw) if latent else None)
+    return begin(run, new_learner(run))
+
+
+def advance(session: Session, steps: int) -> None:
+    """`steps` environment steps of each seed, to the last computation."""
+    for _ in range(steps // session.settings.chunk):
+        session.advance()
+    jax.block_until_ready(session.learner)

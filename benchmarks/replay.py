@@ -1,0 +1,175 @@
+"""The replay: what a draw costs, however much is stored, and how much memory a full one takes.
+
+    python benchmarks/replay.py             a draw at 10 thousand, 100 thousand and 1 million transitions
+    python benchmarks/replay.py --memory    peak memory of a whole process that trains on a full replay
+
+A draw is what one update of LaRe-RRDu reads on HalfCheetah-v4: 256 transitions, and 64 steps of each of 4 episodes; the
+three replays take turns. For the memory, a session on HumanoidStandup-v4 (376 numbers an observation) has its replay of a
+million observations filled with random numbers, in chunks, the way it stores its own steps, and then goes on training.
+"""
+
+import resource
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import psutil
+import tyro
+from measure import advance, interleave, new_session, show, summary, write
+
+import lare
+from lare.algorithms.td3 import TD3Settings
+from lare.credit.decomposition import CreditSettings
+from lare.credit.methods import find_method
+from lare.training import off_policy, replay
+from lare.training.off_policy import Recipe
+from lare.training.replay import Replay, Step
+from lare.training.session import Session
+
+SEED, EPISODE, UPDATES = 0, 1000, 50
+STORED = (10_000, 100_000, 1_000_000)
+RECIPE = Recipe(
+    method=find_method("lare-rrdu"),
+    td3=TD3Settings(),
+    credit=CreditSettings(),
+    scale_rewards=False,
+    observation_size=17,
+    action_size=6,
+    factors=6,
+    longest_episode=EPISODE,
+    capacity=1_010_000,
+)
+
+
+def filled(transitions: int) -> Replay:
+    """A replay as whole episodes of 1000 random steps would leave it, with a leading seed axis of 1."""
+    random, number = np.random.default_rng(SEED), np.arange(transitions)
+    episodes, rows = transitions // EPISODE, RECIPE.capacity
+    held = replay.empty(RECIPE.capacity, RECIPE.observation_size, RECIPE.action_size, RECIPE.factors)
+
+    def numbers(*shape: int) -> np.ndarray:
+        return random.standard_normal((rows, *shape), np.float32)
+
+    held = held._replace(
+        observation=numbers(RECIPE.observation_size),
+        action=numbers(RECIPE.action_size),
+        factors=numbers(RECIPE.factors),
+        reward=numbers(),
+        row=np.asarray(held.row.at[:transitions].set(number + number // EPISODE)),
+        episode=np.asarray(held.episode.at[:transitions].set(number // EPISODE)),
+        first=np.asarray(held.first.at[:episodes].set(EPISODE * np.arange(episodes))),
+        episode_return=random.standard_normal(held.episode_return.shape, np.float32),
+        next_row=jnp.asarray(episodes * (EPISODE + 1)),
+        transitions=jnp.asarray(transitions),
+        episodes=jnp.asarray(episodes),
+    )
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], held)
+
+
+def reads(held: Replay, key: jax.Array) -> Any:
+    """Everything that 50 updates read, one after the other; what the last one read is returned."""
+    draws = off_policy.draw(held, key, UPDATES, RECIPE)
+
+    def one(draw: off_policy.Draws) -> Any:
+        assert draw.credit is not None
+        drawn, batch = replay.read(held, draw.credit.steps), replay.read(held, draw.batch)
+        credit = off_policy.features(drawn, RECIPE.method), draw.credit.episodes
+        features = off_policy.features(batch, RECIPE.method)
+        return credit, features, batch.observation, batch.action, batch.next_observation, batch.continues
+
+    start = jax.tree.map(jnp.zeros_like, one(jax.tree.map(lambda leaf: leaf[0], draws)))
+    return jax.lax.scan(lambda _, draw: (one(draw), None), start, draws)[0]
+
+
+def draws(rounds: int, calls: int) -> None:
+    """Time it."""
+    compiled = jax.jit(jax.vmap(reads))
+
+    def work(held: Replay) -> None:
+        for call in range(calls):
+            jax.block_until_ready(compiled(held, jax.random.split(jax.random.key(call), 1)))
+
+    contenders: dict[str, Callable[[], object]] = {f"{stored:,}": partial(work, filled(stored)) for stored in STORED}
+    table = summary(interleave(contenders, rounds), calls * UPDATES, f"{STORED[0]:,}")
+    show("draw, by transitions stored", table, f"{STORED[0]:,}")
+    write("replay", {"seeds": [SEED], "rounds": rounds, "draws in a round": calls * UPDATES, "draw": table})
+
+
+def fill(session: Session, transitions: int) -> None:
+    """Random steps into a session's replay, by its own compiled `store`."""
+    recipe, chunk, random = session.recipe, session.settings.chunk, np.random.default_rng(SEED)
+
+    def numbers(*shape: int) -> np.ndarray:
+        return random.standard_normal((1, chunk, *shape), np.float32)
+
+    for start in range(0, transitions, chunk):
+        ended = (start + 1 + np.arange(chunk)) % EPISODE == 0
+        steps = Step(
+            observation=numbers(recipe.observation_size),
+            action=numbers(recipe.action_size),
+            factors=numbers(recipe.factors),
+            reward=numbers(),
+            next_observation=numbers(recipe.observation_size),
+            terminated=np.zeros((1, chunk), bool),
+            ended=ended[None],
+        )
+        session.learner = session.functions.store(session.learner, steps)
+    session.step = transitions
+
+
+def used() -> dict[str, int]:
+    """Bytes of this process, now and at most so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return {"resident": psutil.Process().memory_info().rss, "peak": peak}
+
+
+def memory(transitions: int) -> None:
+    """Fill a replay, train on, and see what it took."""
+    stages = {"packages imported": used()}
+    with tempfile.TemporaryDirectory() as place:
+        settings = lare.Settings(method="lare-rrdu", seed=SEED)
+        session = new_session(Path(place) / "run", "HumanoidStandup-v4", settings)
+        jax.block_until_ready(session.learner)
+        stages["session begun"] = used()
+        fill(session, transitions)
+        jax.block_until_ready(session.learner)
+        stages["replay filled"] = used()
+        advance(session, 1000)
+        stages["1000 training steps later"] = used()
+        session.close()
+    arrays = sum(leaf.nbytes for leaf in jax.tree.leaves(session.learner.replay))
+    held = session.learner.replay
+    stored = int(held.transitions[0] - jax.vmap(replay.oldest_transition)(held)[0])
+    print(f"{stored:,} transitions stored; the arrays of the replay: {arrays / 1e9:.3f} GB")
+    for stage, bytes_used in stages.items():
+        print(f"{stage:28s} resident {bytes_used['resident'] / 1e9:.3f} GB, peak {bytes_used['peak'] / 1e9:.3f} GB")
+    write("memory", {"seeds": [SEED], "transitions stored": stored, "bytes of the replay": arrays, "bytes": stages})
+
+
+@dataclass
+class Arguments:
+    """What is to be measured."""
+
+    memory: bool = False
+    """Memory, not time."""
+    rounds: int = 7
+    """How often each replay has its turn."""
+    calls: int = 40
+    """Calls, of 50 draws each, in a turn."""
+    transitions: int = 1_000_000
+    """Transitions that are stored before the memory is measured; a multiple of 1000."""
+
+
+if __name__ == "__main__":
+    arguments = tyro.cli(Arguments, description=__doc__)
+    if arguments.memory:
+        memory(arguments.transitions)
+    else:
+        draws(arguments.rounds, arguments.calls)

@@ -1,0 +1,45 @@
+"""What five seeds in one process cost, against one: LaRe-RRDu on HalfCheetah-v4, the two taking turns.
+
+    python benchmarks/seeds.py
+
+The environments of the seeds are stepped one after the other; everything else is one array operation for all of them.
+"""
+
+import tempfile
+from functools import partial
+from pathlib import Path
+
+import tyro
+from measure import advance, interleave, new_session, show, summary, write
+
+import lare
+from lare.algorithms.td3 import TD3Settings
+
+TASK, BEFORE = "HalfCheetah-v4", 2000
+
+
+def main(rounds: int = 7, steps: int = 1000, seeds: int = 5, method: str = "lare-rrdu") -> None:
+    """Measure.
+
+    Args:
+        rounds: how often each of the two has its turn.
+        steps: environment steps of each seed in a turn, a multiple of 50.
+        seeds: how many seeds are compared with one.
+        method: how credit is assigned.
+    """
+    contenders = {}
+    with tempfile.TemporaryDirectory() as place:
+        for number in (1, seeds):
+            settings = lare.Settings(method=method, seeds=number, evaluation_episodes=1, td3=TD3Settings(warmup=BEFORE))
+            session = new_session(Path(place) / str(number), TASK, settings)
+            advance(session, BEFORE)
+            contenders[f"seeds: {number}"] = partial(advance, session, steps)
+        seconds = interleave(contenders, rounds)
+    table = summary(seconds, steps, "seeds: 1")
+    show(f"{method}, a step of all seeds", table, "one seed")
+    figures = {"task": TASK, "method": method, "seeds": list(range(seeds)), "rounds": rounds, "steps in a round": steps}
+    write("seeds", {**figures, "step of all seeds": table})
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

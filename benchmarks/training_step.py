@@ -1,0 +1,203 @@
+"""What a training step costs: one environment step of HalfCheetah-v4 and one update, side by side with others' TD3.
+
+    python benchmarks/training_step.py
+
+LaRe's methods, TD3 of Stable-Baselines3 and TD3 of SBX take turns in one process; all with batches of 256, networks of
+256-256, one update a step, the actor every second one, a replay for a million transitions. `matrix products` are those
+of one LaRe-RRDu update alone, in a compiled loop, on random numbers. A second table has LaRe-RRDu by its chunk length.
+"""
+
+import tempfile
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import sbx
+import stable_baselines3
+import tyro
+from jax import Array
+from measure import advance, interleave, new_session, ratio, show, summary, write
+from stable_baselines3.common.noise import NormalActionNoise
+
+import lare
+from lare.algorithms.td3 import TD3Settings
+from lare.training.session import Session
+
+TASK, SEED = "HalfCheetah-v4", 0
+BEFORE = 2000
+"""Random steps before the first update: every method has whole episodes to draw."""
+CHUNKS = (1, 10, 50, 200, 1000)
+
+
+def ours(directory: Path, method: str, chunk: int = 50) -> Session:
+    settings = lare.Settings(
+        method=method, seed=SEED, chunk=chunk, evaluation_episodes=1, td3=TD3Settings(warmup=BEFORE)
+    )
+    session = new_session(directory / f"{method}-{chunk}", TASK, settings)
+    advance(session, BEFORE)
+    return session
+
+
+def theirs(algorithm: Callable[..., Any]) -> Any:
+    model = algorithm(
+        "MlpPolicy",
+        TASK,
+        learning_rate=3e-4,
+        buffer_size=1_000_000,
+        learning_starts=BEFORE,
+        batch_size=256,
+        tau=0.005,
+        gamma=0.99,
+        train_freq=1,
+        gradient_steps=1,
+        policy_delay=2,
+        action_noise=NormalActionNoise(np.zeros(6), 0.1 * np.ones(6)),
+        policy_kwargs={"net_arch": [256, 256]},
+        seed=SEED,
+        device="cpu",
+    )
+    return model.learn(BEFORE, log_interval=1_000_000)
+
+
+def go_on(model: Any, steps: int) -> None:
+    model.learn(steps, reset_num_timesteps=False, log_interval=1_000_000)
+
+
+Weights = list[Array]
+
+
+def forward(weights: Weights, x: Array) -> tuple[list[Array], Array]:
+    """One product a layer; returns what each layer was given, and the output."""
+    given = []
+    for weight in weights:
+        given.append(x)
+        x = x @ weight
+    return given, x
+
+
+def backward(
+    weights: Weights, given: list[Array], gradient: Array, *, to_weights: bool = True, to_input: bool = False
+) -> Weights:
+    """Two products a layer, that to the first layer's input only where it is wanted."""
+    found = []
+    for layer in reversed(range(len(weights))):
+        if to_weights:
+            found.append(given[layer].T @ gradient)
+        if layer or to_input:
+            gradient = gradient @ weights[layer].T
+    return [*found, gradient] if to_input else found
+
+
+def matrix_products(factors: int, observation: int, action: int, updates: int = 50) -> Callable[[], object]:
+    """A compiled loop over the matrix products of `updates` LaRe-RRDu updates.
+
+    decoder: forward and backward on 256 drawn steps, forward on the 256 of the batch (relabelling)
+    target actor, both target critics: forward;  both critics: forward and backward
+    every second update: actor and first critic forward, back through the critic to its input, back through the actor
+
+    Every product's result is carried on, or used by another that is, so that none can be left out.
+    """
+    draw = np.random.default_rng(SEED)
+
+    def network(inputs: int, outputs: int) -> Weights:
+        sizes = (inputs, 256, 256, outputs)
+        return [jnp.asarray(draw.normal(0, m**-0.5, (m, n)), jnp.float32) for m, n in pairwise(sizes)]
+
+    def rows(width: int) -> Array:
+        return jnp.asarray(draw.normal(size=(updates, 256, width)), jnp.float32)
+
+    pair = observation + action
+    networks = {
+        "decoder": network(factors, 1),
+        "actor": network(observation, action),
+        "target actor": network(observation, action),
+        "critics": [network(pair, 1), network(pair, 1)],
+        "target critics": [network(pair, 1), network(pair, 1)],
+    }
+    inputs = {
+        "number": jnp.arange(updates),
+        "drawn": rows(factors),
+        "batch": rows(factors),
+        "pair": rows(pair),
+        "observation": rows(observation),
+        "next": rows(observation),
+        "next pair": rows(pair),
+        "policy pair": rows(pair),
+    }
+
+    def actor_update(networks: dict[str, Any], turn: dict[str, Array]) -> list[Array]:
+        given, taken = forward(networks["actor"], turn["observation"])
+        critic = networks["critics"][0]
+        through, value = forward(critic, turn["policy pair"])
+        (to_pair,) = backward(critic, through, value, to_weights=False, to_input=True)
+        return [taken, *backward(networks["actor"], given, to_pair[:, observation:])]
+
+    def one(networks: dict[str, Any], before: Any, turn: dict[str, Array]) -> Any:
+        given, r_hat = forward(networks["decoder"], turn["drawn"])
+        found = backward(networks["decoder"], given, r_hat)
+        found.append(forward(networks["decoder"], turn["batch"])[1])
+        found.append(forward(networks["target actor"], turn["next"])[1])
+        found += [forward(critic, turn["next pair"])[1] for critic in networks["target critics"]]
+        for critic in networks["critics"]:
+            given, value = forward(critic, turn["pair"])
+            found += backward(critic, given, value)
+        delayed = jax.lax.cond(turn["number"] % 2 == 1, lambda: actor_update(networks, turn), lambda: before["delayed"])
+        return {"found": found, "delayed": delayed}
+
+    @jax.jit
+    def loop(networks: dict[str, Any], inputs: dict[str, Array]) -> Any:
+        first = jax.tree.map(lambda x: x[0], inputs)
+        delayed = jax.tree.map(jnp.zeros_like, jax.eval_shape(actor_update, networks, first))
+        shapes = jax.eval_shape(one, networks, {"delayed": delayed}, first)
+        start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        return jax.lax.scan(lambda before, turn: (one(networks, before, turn), None), start, inputs)[0]
+
+    return lambda: jax.block_until_ready(loop(networks, inputs))
+
+
+def repeat(work: Callable[[], object], times: int) -> None:
+    for _ in range(times):
+        work()
+
+
+def side_by_side(directory: Path, steps: int) -> Iterator[tuple[str, Callable[[], object]]]:
+    for method in ("lare-rrdu", "rrdu", "dense"):
+        session = ours(directory, method)
+        yield method, partial(advance, session, steps)
+        if method == "lare-rrdu":
+            recipe = session.recipe
+            products = matrix_products(recipe.factors, recipe.observation_size, recipe.action_size)
+            yield "matrix products", partial(repeat, products, steps // 50)
+    yield "Stable-Baselines3 TD3", partial(go_on, theirs(stable_baselines3.TD3), steps)
+    yield "SBX TD3", partial(go_on, theirs(sbx.TD3), steps)
+
+
+def main(rounds: int = 7, steps: int = 1000) -> None:
+    """Measure.
+
+    Args:
+        rounds: how often each contender has its turn.
+        steps: environment steps in a turn, a multiple of 50.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        seconds = interleave(dict(side_by_side(Path(place), steps)), rounds)
+        chunks = {chunk: ours(Path(place) / "chunks", "lare-rrdu", chunk) for chunk in CHUNKS if chunk <= steps}
+        by_chunk = interleave({str(chunk): partial(advance, chunks[chunk], steps) for chunk in chunks}, rounds)
+    table, chunk_table = summary(seconds, steps, "SBX TD3"), summary(by_chunk, steps, "50")
+    show("training step", table, "SBX TD3")
+    share = ratio(seconds["matrix products"], seconds["lare-rrdu"])
+    print(f"the matrix products alone: {share:.1%} of lare-rrdu")
+    show("lare-rrdu, by chunk", chunk_table, "chunk 50")
+    figures = {"task": TASK, "seeds": [SEED], "rounds": rounds, "steps in a round": steps}
+    share_of = {"matrix products, share of lare-rrdu": share}
+    write("training_step", {**figures, "training step": table, **share_of, "by chunk": chunk_table})
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_platforms", "cpu")
+    tyro.cli(main, description=__doc__)

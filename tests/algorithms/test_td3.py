@@ -1,0 +1,95 @@
+"""TD3's update against a slow NumPy twin, and its rules one by one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lare.algorithms import td3
+from lare.algorithms.td3 import TD3Settings, Transitions
+
+SETTINGS = TD3Settings(hidden=(8, 8), batch_size=16)
+
+
+@pytest.fixture(scope="module")
+def state():
+    return td3.init(jax.random.key(0), 3, 2, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    rng = np.random.default_rng(0)
+    s, a, r, n = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in [(16, 3), (16, 2), (16,), (16, 3)])
+    return Transitions(s, jnp.tanh(a), r, n, jnp.asarray(np.arange(16) % 4 > 0, jnp.float32))
+
+
+def forward(network, x):
+    """An MLP in plain NumPy."""
+    for layer in network.layers[:-1]:
+        x = np.maximum(x @ np.asarray(layer.weight) + np.asarray(layer.bias), 0)
+    return x @ np.asarray(network.layers[-1].weight) + np.asarray(network.layers[-1].bias)
+
+
+def one_of(critics, place):
+    return jax.tree.map(lambda leaf: leaf[place], critics)
+
+
+def test_target_against_numpy(state, batch):
+    quiet = TD3Settings(hidden=(8, 8), policy_noise=0)
+    y = td3.target_values(state.target, batch, jax.random.key(1), quiet)
+    action = np.tanh(forward(state.target.actor, np.asarray(batch.next_observation)))
+    x = np.concatenate([batch.next_observation, action], axis=1)
+    future = np.minimum(*(forward(one_of(state.target.critics, i), x)[:, 0] for i in range(2)))
+    np.testing.assert_allclose(y, batch.reward + 0.99 * batch.continues * future, rtol=1e-5, atol=1e-6)
+
+
+def test_a_termination_ends_the_bootstrap_and_nothing_else_does(state, batch):
+    y = td3.target_values(state.target, batch, jax.random.key(1), SETTINGS)
+    ended = np.asarray(batch.continues) == 0
+    np.testing.assert_array_equal(y[ended], batch.reward[ended])
+    assert (np.asarray(y) != np.asarray(batch.reward))[~ended].all()
+
+
+def test_smoothing_noise_is_clipped(state, batch):
+    """With all noise at its bound the target is that of the action moved by the bound."""
+    loud = TD3Settings(hidden=(8, 8), policy_noise=1e6, noise_clip=0.25)
+    y = td3.target_values(state.target, batch, jax.random.key(1), loud)
+    signs = np.sign(np.asarray(jax.random.normal(jax.random.key(1), batch.action.shape)))
+    action = np.tanh(forward(state.target.actor, np.asarray(batch.next_observation)))
+    x = np.concatenate([batch.next_observation, np.clip(action + 0.25 * signs, -1, 1)], axis=1)
+    future = np.minimum(*(forward(one_of(state.target.critics, i), x)[:, 0] for i in range(2)))
+    np.testing.assert_allclose(y, batch.reward + 0.99 * batch.continues * future, rtol=1e-4, atol=1e-5)
+
+
+def test_policy_and_targets_wait_for_their_turn(state, batch):
+    update = jax.jit(lambda turn: td3.update(state, batch, jax.random.key(2), turn, SETTINGS)[0])
+    waited, acted = update(jnp.array(False)), update(jnp.array(True))
+    same = lambda a, b: jax.tree.all(jax.tree.map(jnp.array_equal, a, b))  # noqa: E731
+    assert same(waited.online.actor, state.online.actor)
+    assert same(waited.target, state.target)
+    assert same(waited.online.critics, acted.online.critics)
+    assert not same(waited.online.critics, state.online.critics)
+    assert not same(acted.online.actor, state.online.actor)
+    moved = jax.tree.map(lambda old, new: 0.995 * old + 0.005 * new, state.target, acted.online)
+    for a, b in zip(jax.tree.leaves(acted.target), jax.tree.leaves(moved), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7)
+
+
+def test_critic_loss_is_the_sum_of_both_squared_errors(state, batch):
+    _, metrics = td3.update(state, batch, jax.random.key(2), jnp.array(False), SETTINGS)
+    y = np.asarray(td3.target_values(state.target, batch, jax.random.key(2), SETTINGS))
+    x = np.concatenate([batch.observation, batch.action], axis=1)
+    want = sum(((forward(one_of(state.online.critics, i), x)[:, 0] - y) ** 2).mean() for i in range(2))
+    assert float(metrics["critic/loss"]) == pytest.approx(want, rel=1e-4)
+
+
+def test_the_critics_start_apart(state):
+    first, second = (one_of(state.online.critics, i) for i in range(2))
+    assert not np.array_equal(first.layers[0].weight, second.layers[0].weight)
+
+
+def test_networks_start_as_published(state):
+    # Uniform in ±1/sqrt(fan-in), as the published code's linear layers do.
+    weight = np.asarray(state.online.actor.layers[1].weight)
+    assert np.abs(weight).max() <= 8**-0.5
+    assert np.abs(weight).max() > 0.9 * 8**-0.5

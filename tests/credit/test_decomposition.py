@@ -1,0 +1,76 @@
+"""The learner finds step rewards from returns alone, whatever their scale."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lare.credit import decomposition
+from lare.credit.decomposition import CreditSettings, Episodes
+from lare.credit.methods import Fit
+
+EPISODES, LENGTH, FEATURES = 64, 10, 3
+
+
+def data(scale=1.0, feature_scale=1.0, seed=0):
+    """Episodes whose step reward is a linear function of the features."""
+    rng = np.random.default_rng(seed)
+    features = rng.normal(size=(EPISODES, LENGTH, FEATURES)).astype(np.float32)
+    reward = scale * (features @ np.array([1.0, -2.0, 0.5], np.float32) + 1)
+    return features * feature_scale, reward.astype(np.float32)
+
+
+def train(fit, settings, scale=1.0, feature_scale=1.0, updates=600):
+    features, reward = data(scale, feature_scale)
+    state = decomposition.init(jax.random.key(0), FEATURES, settings)
+    state = decomposition.observe_steps(state, jnp.asarray(features.reshape(-1, FEATURES)))
+    state = decomposition.observe_returns(state, jnp.asarray(reward.mean(axis=1)), jnp.ones(EPISODES, bool))
+    steps = LENGTH if fit is Fit.ALL_STEPS else 5
+    rng = np.random.default_rng(1)
+    update = jax.jit(lambda state, episodes: decomposition.update(state, episodes, fit, settings))
+    losses = []
+    for _ in range(updates):
+        chosen = rng.choice(EPISODES, 16, replace=False)
+        order = np.stack([rng.permutation(LENGTH)[:steps] for _ in chosen])
+        rows = features[chosen[:, None], order].reshape(-1, FEATURES)
+        episode = np.repeat(np.arange(16), steps)
+        length, mean = jnp.full(16, LENGTH), jnp.asarray(reward[chosen].mean(axis=1))
+        state, metrics = update(state, Episodes(jnp.asarray(rows), jnp.asarray(episode), length, mean, jnp.ones(16)))
+        losses.append(float(metrics["credit/loss"]))
+    r_hat = decomposition.proxy_rewards(state, jnp.asarray(features.reshape(-1, FEATURES)), settings)
+    return np.asarray(r_hat), reward.ravel(), losses
+
+
+@pytest.mark.parametrize("normalise", [True, False], ids=["normalised", "published"])
+@pytest.mark.parametrize("fit", list(Fit))
+def test_must_learn_step_rewards_from_returns(fit, normalise):
+    settings = CreditSettings(hidden=(32, 32), normalise=normalise, learning_rate=3e-3)
+    r_hat, reward, _ = train(fit, settings)
+    assert np.corrcoef(r_hat, reward)[0, 1] > 0.9
+    if fit is not Fit.DRAWN_STEPS:  # whose bias shrinks r_hat towards its mean
+        assert np.abs(r_hat - reward).mean() < 0.5 * np.abs(reward - reward.mean()).mean()
+
+
+def test_sum_form_learns_too():
+    r_hat, reward, _ = train(Fit.ALL_STEPS, CreditSettings(hidden=(32, 32), learning_rate=3e-3, sum_form=True))
+    assert np.corrcoef(r_hat, reward)[0, 1] > 0.9
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+@pytest.mark.parametrize("what", ["scale", "feature_scale"])
+def test_scaled_returns_and_features_train_the_same(what, factor):
+    settings = CreditSettings(hidden=(16,), learning_rate=1e-3)
+    plain, _, losses = train(Fit.DRAWN_STEPS_UNBIASED, settings, updates=100)
+    scaled, _, scaled_losses = train(Fit.DRAWN_STEPS_UNBIASED, settings, updates=100, **{what: factor})
+    np.testing.assert_allclose(losses, scaled_losses, rtol=1e-2, atol=1e-3)
+    unit = factor if what == "scale" else 1.0
+    np.testing.assert_allclose(plain, scaled / unit, rtol=2e-2, atol=2e-2)
+
+
+def test_without_an_episode_nothing_is_learned():
+    settings = CreditSettings(hidden=(8,), sum_form=True)
+    state = decomposition.init(jax.random.key(0), FEATURES, settings)
+    episodes = Episodes(jnp.ones((4, FEATURES)), jnp.zeros(4, int), jnp.ones(1, int), jnp.zeros(1), jnp.zeros(1))
+    after, metrics = decomposition.update(state, episodes, Fit.ALL_STEPS, settings)
+    assert float(metrics["credit/loss"]) == 0.0
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, state.decoder, after.decoder))

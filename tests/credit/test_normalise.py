@@ -1,0 +1,61 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lare.credit import normalise
+
+
+def observe_all(batches):
+    moments = normalise.no_moments(batches[0].shape[1])
+    for batch in batches:
+        moments = normalise.observe(moments, jnp.asarray(batch))
+    return moments
+
+
+@given(st.lists(st.integers(1, 7), min_size=1, max_size=5), st.integers(0, 1000), st.sampled_from([1e-6, 1.0, 1e6]))
+@settings(max_examples=30, deadline=None)
+def test_moments_are_those_of_everything_seen(sizes, seed, scale):
+    rng = np.random.default_rng(seed)
+    batches = [(scale * (3 + rng.normal(size=(size, 2)))).astype(np.float32) for size in sizes]
+    moments, rows = observe_all(batches), np.concatenate(batches)
+    np.testing.assert_allclose(moments.mean, rows.mean(axis=0), rtol=1e-4)
+    np.testing.assert_allclose(moments.squares, ((rows - rows.mean(axis=0)) ** 2).sum(axis=0), rtol=1e-2, atol=1e-10)
+
+
+def test_standardised_rows_have_unit_spread_and_are_cut_off():
+    rows = np.random.default_rng(0).normal(5, 3, (1000, 1)).astype(np.float32)
+    moments = observe_all([rows])
+    scaled = np.asarray(normalise.standardise(moments, jnp.asarray(rows)))
+    assert scaled.mean() == pytest.approx(0, abs=1e-4)
+    assert scaled.std() == pytest.approx(1, rel=1e-4)
+    assert float(normalise.standardise(moments, jnp.array([[1e9]]))[0, 0]) == normalise.CLIP
+
+
+@pytest.mark.parametrize("constant", [0.0, 7.0, 1e9, -1e-9])
+def test_a_feature_that_never_varies_becomes_zero(constant):
+    # Reacher's entry 10 is always 0.
+    rows = jnp.full((50, 1), constant)
+    assert float(jnp.abs(normalise.standardise(observe_all([rows, rows]), rows)).max()) == 0.0
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_scaled_features_standardise_alike(factor):
+    rows = np.random.default_rng(1).normal(2, 1, (100, 3)).astype(np.float32)
+    plain = normalise.standardise(observe_all([rows]), jnp.asarray(rows))
+    scaled = normalise.standardise(observe_all([rows * factor]), jnp.asarray(rows * factor))
+    np.testing.assert_allclose(plain, scaled, atol=1e-3)
+
+
+def test_scale_is_the_root_mean_square_of_what_counts():
+    scale = normalise.no_scale()
+    assert float(normalise.magnitude(scale)) == 1.0
+    scale = normalise.observe_scale(scale, jnp.array([3.0, 100.0]), jnp.array([True, False]))
+    scale = normalise.observe_scale(scale, jnp.array([4.0, 5.0]), jnp.array([True, True]))
+    assert float(normalise.magnitude(scale)) == pytest.approx(np.sqrt((9 + 16 + 25) / 3))
+
+
+def test_scale_is_one_as_long_as_every_return_was_zero():
+    scale = normalise.observe_scale(normalise.no_scale(), jnp.zeros(4), jnp.ones(4, bool))
+    assert float(normalise.magnitude(scale)) == 1.0

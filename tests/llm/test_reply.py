@@ -1,0 +1,80 @@
+"""Reading a reply: any text is a reply or a malformed one."""
+
+import contextlib
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lare.llm.reply import MalformedReply, Reply, parse
+
+GOOD = {"Understand": "u", "Analyze": "a", "Functions": "def f(): ..."}
+
+
+def test_a_reply_is_read():
+    reply = parse(f"\n {json.dumps(GOOD | {'Notes': 'more than was asked for'}, indent=1)} \n")
+    assert (reply.understand, reply.analyze, reply.functions) == ("u", "a", "def f(): ...")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "the reply is not one JSON object: Expecting value: line 1 column 1 (char 0)"),
+        ("Here it is.", "the reply is not one JSON object: Expecting value: line 1 column 1 (char 0)"),
+        ("```json\n{}\n```", "the reply is not one JSON object: Expecting value: line 1 column 1 (char 0)"),
+        ("{} {}", "the reply is not one JSON object: Extra data: line 1 column 4 (char 3)"),
+        ('{"Understand": "u"', "the reply is not one JSON object: Expecting ',' delimiter: line 1 column 19 (char 18)"),
+        ('{"a": "\n"}', "the reply is not one JSON object: Invalid control character at: line 1 column 8 (char 7)"),
+        ("[]", "the reply is JSON, but not an object: '[]'"),
+        ("null", "the reply is JSON, but not an object: 'null'"),
+        (json.dumps("x" * 99), "the reply is JSON, but not an object: '\"" + "x" * 39 + "'"),
+        ("{}", "the reply's JSON object is not as asked for: the key 'Understand' is missing (and 2 more)"),
+        (
+            '{"Understand": "u", "Analyze": "a", "functions": "f"}',
+            "the reply's JSON object is not as asked for: the key 'Functions' is missing",
+        ),
+        (
+            json.dumps(GOOD | {"Functions": ""}),
+            "the reply's JSON object is not as asked for: Functions = '': string should have at least 1 character",
+        ),
+        (
+            json.dumps(GOOD | {"Functions": ["def f(): ..."]}),
+            "the reply's JSON object is not as asked for: Functions = ['def f(): ...']: input should be a valid string",
+        ),
+        (
+            json.dumps(GOOD | {"Analyze": None}),
+            "the reply's JSON object is not as asked for: Analyze = None: input should be a valid string",
+        ),
+    ],
+)
+def test_a_malformed_reply_says_what_is_wrong(text, message):
+    with pytest.raises(MalformedReply) as error:
+        parse(text)
+    assert str(error.value) == message
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from([*GOOD, "More"]) | st.text(), inner),
+    max_leaves=8,
+)
+
+
+@settings(deadline=None)
+@given(st.text() | st.builds(json.dumps, JSON))
+def test_any_text_is_a_reply_or_a_malformed_one(text):
+    with contextlib.suppress(MalformedReply):
+        assert parse(text).functions
+
+
+@settings(deadline=None)
+@given(st.fixed_dictionaries({"Understand": st.text(), "Analyze": st.text(), "Functions": st.text(min_size=1)}))
+def test_what_is_as_asked_for_is_read_unchanged(values):
+    assert parse(json.dumps(values)) == Reply(**values)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"self": 1}', '{"Understand": "u", "Analyze": "a", "Functions": ""}'])
+def test_what_once_broke_the_parser(text):
+    with pytest.raises(MalformedReply):
+        parse(text)

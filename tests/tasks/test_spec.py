@@ -1,0 +1,200 @@
+"""Task specs: the shipped ones fit their environments, and a bad one is refused in one line that says how to mend it."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+
+from lare.errors import LareError
+from lare.tasks.spec import load_task, read_task, shipped_tasks, time_limit
+from toys import Chase, toy_spec
+
+NAMES = "HalfCheetah-v4, HalfCheetahSparse-v4, HumanoidStandup-v4, Reacher-v4, Walker2d-v4"
+
+
+class Unbounded(Chase):
+    action_space = Box(-np.inf, np.inf, (1,), np.float32)
+
+
+class Board(Chase):
+    observation_space = Box(-1, 1, (2, 2), np.float32)
+
+
+class Broken(Chase):
+    def __init__(self):
+        raise RuntimeError("the licence has run out\nsee the manual")
+
+
+gymnasium.register("misfits/Endless-v0", entry_point=Chase)
+gymnasium.register("misfits/Unbounded-v0", entry_point=Unbounded, max_episode_steps=20)
+gymnasium.register("misfits/Board-v0", entry_point=Board, max_episode_steps=20)
+gymnasium.register("misfits/Broken-v0", entry_point=Broken, max_episode_steps=20)
+
+
+@pytest.mark.parametrize("name", shipped_tasks())
+def test_every_shipped_task_fits_its_environment(name):
+    assert load_task(name).name == name
+
+
+@pytest.mark.parametrize("name", shipped_tasks())
+def test_no_text_speaks_of_the_reward(name):
+    task = read_task(name)
+    assert "reward" not in f"{task.description} {task.observation} {task.action}".lower()
+
+
+def test_shipped_names():
+    assert ", ".join(shipped_tasks()) == NAMES
+
+
+def test_a_task_of_ones_own_by_path(spec_file):
+    assert load_task(spec_file()) == toy_spec()
+    assert load_task(str(spec_file(judges=None, description="\n  Follow it. \n"))) == toy_spec(
+        judges="after", description="Follow it."
+    )
+
+
+def test_like_takes_over_what_is_not_said():
+    parent, child = read_task("HalfCheetah-v4"), read_task("HalfCheetahSparse-v4")
+    own = {"name", "environment", "measures"}
+    assert child.model_dump(exclude=own) == parent.model_dump(exclude=own)
+    assert {key: getattr(child, key) for key in own} == {
+        "name": "HalfCheetahSparse-v4",
+        "environment": "lare/HalfCheetahSparse-v4",
+        "measures": ("x_position",),
+    }
+
+
+def test_like_over_two_generations(spec_file, tmp_path):
+    child = tmp_path / "child.toml"
+    child.write_text(f'like = "{spec_file(like="Reacher-v4", action=None)}"\nname = "Child"\n')
+    assert read_task(child) == toy_spec(name="Child", action=read_task("Reacher-v4").action)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"action": None}, "task '{file}': the key 'action' is missing"),
+        ({"action": None, "observation": None}, "task '{file}': the key 'observation' is missing (and 1 more)"),
+        ({"reward": "1 a step"}, "task '{file}': there is no key 'reward'"),
+        ({"description": "  "}, "task '{file}': description = '  ': string should have at least 1 character"),
+        ({"judges": "during"}, "task '{file}': judges = 'during': input should be 'before', 'after' or 'both'"),
+        ({"name": "a/b"}, "task '{file}': name = 'a/b': string should match pattern '^[\\w.\\-]+$'"),
+        ({"action_size": 0}, "task '{file}': action_size = 0: input should be greater than or equal to 1"),
+        ({"max_episode_steps": 0}, "task '{file}': max_episode_steps = 0: input should be greater than or equal to 1"),
+        ({"like": 3}, "task '{file}': like = 3 must name another task, without a circle"),
+        (
+            {"like": "Reacher"},
+            f"no task 'Reacher' (did you mean 'Reacher-v4'?): neither a file nor one of the shipped tasks, {NAMES}",
+        ),
+        ({"observation_size": 3}, "task 'Chase': observation_size = 3, but toys/Chase-v0 has observations of size 2"),
+        ({"action_size": 2}, "task 'Chase': action_size = 2, but toys/Chase-v0 has actions of size 1"),
+        (
+            {"environment": "CartPole-v1", "observation_size": 4},
+            "task 'Chase': the action space of CartPole-v1 is Discrete(2), not a Box of one axis",
+        ),
+        (
+            {"environment": "misfits/Board-v0"},
+            "task 'Chase': the observation space of misfits/Board-v0 is Box(-1.0, 1.0, (2, 2), float32), "
+            "not a Box of one axis",
+        ),
+        (
+            {"environment": "misfits/Unbounded-v0"},
+            "task 'Chase': the actions of misfits/Unbounded-v0 have no bounds: Box(-inf, inf, (1,), float32)",
+        ),
+        (
+            {"environment": "misfits/Endless-v0"},
+            "task 'Chase': misfits/Endless-v0 has no time limit, so an episode may never pay; "
+            "set max_episode_steps in the spec",
+        ),
+        (
+            {"environment": "misfits/Broken-v0"},
+            "environment 'misfits/Broken-v0' cannot be made: the licence has run out",
+        ),
+    ],
+)
+def test_a_bad_spec_is_refused(spec_file, changes, message):
+    path = spec_file(**changes)
+    with pytest.raises(LareError) as error:
+        load_task(path)
+    assert str(error.value) == message.replace("{file}", str(path))
+
+
+@pytest.mark.parametrize("environment", ["Nope-v0", "nowhere/Chase-v0", "nowhere:Chase-v0", "HalfCheetah-v99", "::"])
+def test_an_unknown_environment_is_refused(spec_file, environment):
+    with pytest.raises(LareError, match=rf"\Aenvironment '{environment}' cannot be made: [^\n]+\Z"):
+        load_task(spec_file(environment=environment))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"name = ", "task '{file}' is not valid TOML: Invalid value (at end of document)"),
+        (
+            b"Dear reader",
+            "task '{file}' is not valid TOML: Expected '=' after a key in a key/value pair (at line 1, column 6)",
+        ),
+        (b"\xff", "{file} cannot be read: 'utf-8' codec can't decode byte 0xff in position 0: invalid start byte"),
+        (b"", "task '{file}': the key 'name' is missing (and 6 more)"),
+    ],
+)
+def test_a_file_that_is_no_spec_is_refused(tmp_path, content, message):
+    path = tmp_path / "task.toml"
+    path.write_bytes(content)
+    with pytest.raises(LareError) as error:
+        load_task(path)
+    assert str(error.value) == message.replace("{file}", str(path))
+
+
+@pytest.mark.parametrize(
+    ("task", "hint"),
+    [
+        ("HalfCheeta-v4", " (did you mean 'HalfCheetah-v4'?)"),
+        ("walker2d-v4", " (did you mean 'Walker2d-v4'?)"),
+        ("chess", ""),
+        ("", ""),
+        ("/", ""),
+        ("no/such/file.toml", ""),
+    ],
+)
+def test_an_unknown_task_is_refused(task, hint):
+    with pytest.raises(LareError) as error:
+        load_task(task)
+    assert str(error.value) == f"no task {task!r}{hint}: neither a file nor one of the shipped tasks, {NAMES}"
+
+
+@pytest.mark.parametrize("circle", [["a"], ["a", "b"], ["a", "b", "c"]])
+def test_like_in_a_circle_is_refused(tmp_path, circle):
+    files = [tmp_path / name for name in circle]
+    for place, file in enumerate(files):
+        file.write_text(f'like = "{files[(place + 1) % len(files)]}"')
+    with pytest.raises(LareError) as error:
+        read_task(files[0])
+    assert str(error.value) == f"task '{files[-1]}': like = '{files[0]}' must name another task, without a circle"
+
+
+@pytest.mark.parametrize("key", ["name", "description", "observation", "action", "environment"])
+def test_the_digest_follows_every_text(key):
+    assert toy_spec().digest == toy_spec().digest
+    assert toy_spec(**{key: "another"}).digest != toy_spec().digest
+
+
+def test_the_time_limit_is_the_specs_before_the_environments():
+    assert time_limit(toy_spec()) == 20
+    assert time_limit(toy_spec(max_episode_steps=7)) == 7
+    assert time_limit(toy_spec(environment="misfits/Endless-v0", max_episode_steps=7)) == 7
+
+
+def test_a_key_called_self(spec_file):
+    path = spec_file(self="x")
+    with pytest.raises(LareError) as error:
+        load_task(path)
+    assert str(error.value) == f"task '{path}': there is no key 'self'"
+
+
+def test_an_id_that_names_its_module(spec_file):
+    assert load_task(spec_file(environment="toys:toys/Chase-v0")).environment == "toys:toys/Chase-v0"
+
+
+def test_a_name_too_long_for_a_file():
+    with pytest.raises(LareError, match="no task 'xxx"):
+        load_task("x" * 300)

@@ -1,0 +1,179 @@
+"""The command line, in this process: what it prints, and that a mistake is one line and exit status 2."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from lare import cli
+from lare.llm.prompts import candidate
+from lare.tasks.spec import read_task, shipped_tasks
+from toys import PHI
+
+TINY = (
+    "--steps 200 --chunk 50 --evaluate-every 100 --evaluation-episodes 1 "
+    "--td3.warmup 100 --td3.hidden 8 8 --credit.hidden 8 8"
+).split()
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Runs `lare ARGUMENTS` in an empty directory; gives exit status, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["lare", *map(str, arguments)])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as left:
+            status = left.code
+        return status, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def phi(tmp_path):
+    (tmp_path / "phi.py").write_text(PHI)
+    return tmp_path / "phi.py"
+
+
+def test_tasks_are_listed(command):
+    status, out, err = command("tasks")
+    assert (status, err) == (0, "")
+    head, *rows = [line.split() for line in out.splitlines()]
+    assert head == ["task", "environment", "observation", "action", "judges"]
+    assert [row[0] for row in rows] == shipped_tasks()
+    assert ["Reacher-v4", "Reacher-v4", "11", "2", "before"] in rows
+
+
+@pytest.mark.parametrize("kind", ["factors", "reward"])
+def test_prompt_prints_the_request(command, kind):
+    system, user = candidate(read_task("Reacher-v4"), kind)
+    printed = f"--- system ---\n{system['content']}\n\n--- user ---\n{user['content']}\n\n"
+    assert command("prompt", "Reacher-v4", "--kind", kind) == (0, printed, "")
+
+
+def test_prompt_of_a_task_of_ones_own(command, spec_file):
+    status, out, _ = command("prompt", spec_file(description="Catch the {first} entry."))
+    assert status == 0
+    assert "# Task\nCatch the {first} entry.\n" in out
+
+
+def test_design_prints_the_function(command):
+    status, out, err = command("design", "Reacher-v4", "--kind", "reward")
+    assert (status, err) == (0, "")
+    assert "def evaluation_func(observation, action):\n" in out
+
+
+def test_design_writes_the_function_once(command, tmp_path):
+    status, out, err = command("design", "Reacher-v4", "--out", "phi.py")
+    assert (status, err) == (0, "")
+    assert out.startswith("wrote phi.py: ")
+    written = {name: (tmp_path / name).read_bytes() for name in ("phi.py", "phi.json")}
+    assert command("design", "Reacher-v4", "--draw", 1, "--out", "phi") == (
+        2,
+        "",
+        "lare: phi.py exists, and is not overwritten; choose another --out\n",
+    )
+    assert {name: (tmp_path / name).read_bytes() for name in written} == written
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            "prompt Reacher",
+            "no task 'Reacher' (did you mean 'Reacher-v4'?): neither a file nor one of the shipped tasks, "
+            f"{', '.join(shipped_tasks())}",
+        ),
+        ("design Reacher-v4 --draw 7", "no recording of factors has draw 7; the draws are 0, 1, 2, 3, 4"),
+        ("train", "say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR"),
+        ("train --resume runs/none", "runs/none is not a run: there is no config.json in it"),
+        (
+            "train Reacher-v4 --resume runs/none",
+            "--resume goes on with the run's own settings: give it no task and no other settings",
+        ),
+        (
+            "train --resume runs/none --seed 1",
+            "--resume goes on with the run's own settings: give it no task and no other settings",
+        ),
+        ("train Reacher-v4 --function none.py", "there is no function file none.py"),
+        ("train Reacher-v4 --steps 120", "steps = 120 is not a multiple of chunk = 50"),
+        ("train Reacher-v4 --seed -1", "seed = -1: input should be greater than or equal to 0"),
+        (
+            "train Reacher-v4 --method magic",
+            "no method 'magic'; the methods are dense, episodic, rd, rrd, rrdu, lare-rd, lare-rrdu",
+        ),
+        ("evaluate .", ". is not a run: there is no config.json in it"),
+        ("report", "say which runs to report on"),
+        ("report one two", "one is not a run: there is no config.json in it"),
+    ],
+)
+def test_a_mistake_is_one_line_and_status_2(command, tmp_path, arguments, message):
+    assert command(*arguments.split()) == (2, "", f"lare: {message}\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [["--debug", "evaluate", "none"], ["evaluate", "none", "--debug"]])
+def test_debug_shows_where_it_came_from(command, arguments):
+    status, out, err = command(*arguments)
+    assert (status, out) == (2, "")
+    assert err.startswith("Traceback (most recent call last):\n")
+    assert err.endswith("\nlare: none is not a run: there is no config.json in it\n")
+
+
+def test_an_error_of_many_lines_is_printed_in_one(command, spec_file, tmp_path):
+    (tmp_path / "bad.py").write_text("def evaluation_func(o, a):\n    raise ValueError('one\\ntwo')\n")
+    status, _, err = command("train", spec_file(), "--function", "bad.py")
+    assert status == 2
+    assert err == "lare: bad.py: the function does not fit task 'Chase': runs: ValueError: one two (line 2)\n"
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["dance"], ["train", "--colour", "red"], ["prompt", "Reacher-v4", "--kind", "x"]]
+)
+def test_an_unknown_option_is_status_2(command, arguments):
+    status, out, err = command(*arguments)
+    assert (status, out) == (2, "")
+    assert "Traceback" not in err
+    assert "--help" in err
+
+
+def test_help_names_every_command(command):
+    status, out, _ = command("--help")
+    assert status == 0
+    assert all(name in out for name in cli.COMMANDS)
+
+
+def test_from_training_to_report(command, spec_file, phi):
+    run = Path("runs/Chase-lare-rrdu-td3-s0")
+    status, out, _ = command("train", spec_file(), *TINY, "--function", phi)
+    assert status == 0
+    assert out.endswith(f"finished {run}; to see it: lare report {run}\n")
+    metrics = (run / "metrics.jsonl").read_bytes()
+    assert metrics.count(b"\n") == 2
+
+    status, out, err = command("evaluate", run, "--episodes", 2)
+    assert (status, err) == (0, "")
+    assert out.startswith("seed 0: return -")
+    assert out.endswith(" over 2 episodes\n")
+
+    assert command("report", run) == (0, f"wrote {run / 'report.html'}\n", "")
+    assert "f_near" in (run / "report.html").read_text(encoding="utf-8")
+    assert command("report", run, run, "--out", "both.html") == (0, "wrote both.html\n", "")
+
+    # There is nothing left to do, and nothing is done again.
+    status, out, _ = command("train", "--resume", run)
+    assert status == 0
+    assert out.endswith(f"finished {run}; to see it: lare report {run}\n")
+    assert (run / "metrics.jsonl").read_bytes() == metrics
+
+    assert command("train", spec_file(), *TINY, "--function", phi, "--out", run) == (
+        2,
+        "",
+        f"lare: {run} exists, and a run never overwrites another: choose another --out, or go on with --resume\n",
+    )
+    assert (run / "metrics.jsonl").read_bytes() == metrics

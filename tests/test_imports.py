@@ -1,0 +1,89 @@
+"""The rooms: imports run downwards only, and nothing in the package names a device."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import lare
+
+PACKAGE = Path(lare.__file__).parent
+MODULES = {
+    ".".join(["lare", *path.relative_to(PACKAGE).with_suffix("").parts]).removesuffix(".__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+
+MUST_NOT_KNOW = {
+    "errors": "tasks llm latent credit networks algorithms training experiments cli",
+    "networks": "tasks llm latent credit algorithms training experiments cli",
+    "tasks": "llm latent credit networks algorithms training experiments cli",
+    "llm": "latent credit networks algorithms training experiments cli",
+    "latent": "credit networks algorithms training experiments cli",
+    "credit": "llm latent algorithms training experiments cli",
+    "algorithms": "tasks llm latent credit training experiments cli",
+    "training": "experiments cli",
+    "experiments": "cli",
+}
+
+
+def imported_by(module: str) -> set[str]:
+    """What of the package a module imports, at its top or inside a function; `lare.train` counts as where it lives."""
+    names = set()
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        match node:
+            case ast.Import():
+                names |= {alias.name for alias in node.names}
+            case ast.ImportFrom():
+                assert node.level == 0, f"{module} has a relative import, which this test does not follow"
+                names |= {f"{node.module}.{alias.name}" for alias in node.names}
+            case ast.Attribute(value=ast.Name(id="lare"), attr=name) if name in lare.HOMES:
+                names.add(lare.HOMES[name])
+    return {name for name in names if name.startswith("lare.")}
+
+
+def room(module: str) -> str:
+    return module.split(".")[1]
+
+
+def test_every_room_is_in_the_table():
+    assert {room(module) for module in MODULES if module != "lare"} == {*MUST_NOT_KNOW, "cli"}
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if room(module + ".") in MUST_NOT_KNOW])
+def test_imports_run_downwards(module):
+    known = {room(name) for name in imported_by(module)}
+    assert known.isdisjoint(MUST_NOT_KNOW[room(module)].split())
+
+
+def test_imports_are_found_wherever_they_stand():
+    # The lines that the test above rests on: at the top, inside a function, and by the package's name.
+    assert "lare.errors.LareError" in imported_by("lare.cli")
+    assert "lare.llm.prompts.candidate" in imported_by("lare.cli")
+    assert "lare.training.train" in imported_by("lare.cli")
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_module_names_a_device(module):
+    source = MODULES[module].read_text(encoding="utf-8")
+    assert re.search(r"\b(cuda|gpu|tpu)\b|jax\.(local_)?devices\(", source, re.IGNORECASE) is None
+
+
+@pytest.mark.parametrize("name", lare.__all__)
+def test_every_public_name_is_there(name):
+    assert getattr(lare, name) is not None
+    assert name in dir(lare)
+
+
+def test_another_name_is_not():
+    with pytest.raises(AttributeError, match="module 'lare' has no attribute 'trian'"):
+        lare.trian  # noqa: B018
+
+
+@pytest.mark.parametrize("module", ["lare", "lare.latent.worker", "lare.latent.design", "lare.tasks.spec"])
+def test_what_need_not_wait_for_jax_does_not(module):
+    program = f"import sys, {module}; print({module}.__name__, 'jax' in sys.modules)"
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert printed == f"{module} False\n"

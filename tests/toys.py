@@ -1,0 +1,85 @@
+"""Small toys that train in a second (`from toys import ...`)."""
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+
+from lare.tasks.spec import TaskSpec
+
+
+class Chase(gymnasium.Env):
+    """A toy that every algorithm must learn: r = -(a - s_0)^2, and nothing that the agent does changes s."""
+
+    observation_space = Box(-1, 1, (2,), np.float32)
+    action_space = Box(-2, 2, (1,), np.float32)
+
+    def __init__(self, scale: float = 1.0):
+        self.scale = scale
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observe(), {}
+
+    def observe(self):
+        self.state = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        return self.state
+
+    def step(self, action):
+        reward = -self.scale * float((action[0] - self.state[0]) ** 2)
+        return self.observe(), reward, False, False, {"distance": abs(float(action[0] - self.state[0]))}
+
+
+gymnasium.register("toys/Chase-v0", entry_point=Chase, max_episode_steps=20)
+
+PHI = """import numpy as np
+
+def evaluation_func(observation, action):
+    # 1. how near the action comes
+    f_near = -np.square(action - observation[:, 0:1])
+    # 2. effort
+    f_effort = -np.square(action)
+    return [f_near, f_effort]
+"""
+
+
+def toy_spec(**changes) -> TaskSpec:
+    values = {
+        "name": "Chase",
+        "environment": "toys/Chase-v0",
+        "observation_size": 2,
+        "action_size": 1,
+        "judges": "before",
+        "description": "Follow the first entry.",
+        "observation": "0: the target. 1: noise.",
+        "action": "0: the guess.",
+    }
+    return TaskSpec(**(values | changes))
+
+
+class Broken(Chase):
+    """Goes wrong in a given way at the 30th step that it makes."""
+
+    def __init__(self, fault: str):
+        super().__init__()
+        self.fault, self.made = fault, 0
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        self.made += 1
+        if self.made == 30:
+            reward = {"reward": float("nan"), "infinite": float("inf")}.get(self.fault, reward)
+            if self.fault == "observation":
+                observation = observation * np.float32("nan")
+        return observation, reward, terminated, truncated, info
+
+
+class Forgetful(Chase):
+    """Its chance does not come from the seed: an episode cannot be had again."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=None, options=options)
+        return self.observe(), {}
+
+
+gymnasium.register("toys/Broken-v0", entry_point=Broken, max_episode_steps=20)
+gymnasium.register("toys/Forgetful-v0", entry_point=Forgetful, max_episode_steps=20)

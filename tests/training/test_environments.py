@@ -1,0 +1,105 @@
+import gymnasium
+import numpy as np
+import pytest
+
+from lare.tasks.episodic import EpisodicReward
+from lare.training import environments
+from lare.training.environments import Lane, Stream, collect, episode_seed, evaluate, make_episodic, to_bounds
+from toys import toy_spec
+
+
+def lane(seed=0):
+    made = Lane(seed, make_episodic(toy_spec()))
+    made.begin()
+    return made
+
+
+def test_actions_are_rescaled():
+    space = gymnasium.spaces.Box(np.float32([-0.4, 0]), np.float32([0.4, 10]))
+    np.testing.assert_allclose(to_bounds(np.float32([-1, 1]), space), [-0.4, 10])
+    np.testing.assert_allclose(to_bounds(np.float32([0, 0]), space), [0, 5])
+
+
+def test_streams_of_random_numbers_are_apart():
+    seeds = {episode_seed(seed, stream, number) for seed in range(3) for stream in Stream for number in range(20)}
+    assert len(seeds) == 3 * len(Stream) * 20
+
+
+def test_collected_steps_follow_each_other_within_an_episode():
+    lanes = [lane(0), lane(1)]
+    collected = collect(lanes, lambda observation: observation[:, :1], np.zeros((45, 2, 1), np.float32))
+    steps = collected.steps
+    assert steps.observation.shape == (2, 45, 2)
+    inside = ~steps.ended[:, :-1]
+    np.testing.assert_array_equal(steps.next_observation[:, :-1][inside], steps.observation[:, 1:][inside])
+    np.testing.assert_array_equal(np.flatnonzero(steps.ended[0]), [19, 39])
+    assert not steps.terminated.any()
+    np.testing.assert_allclose(collected.environment_action, 2 * steps.action, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        steps.reward, -((collected.environment_action[..., 0] - steps.observation[..., 0]) ** 2), rtol=1e-4, atol=1e-6
+    )
+
+
+def test_noisy_actions_stay_in_bounds():
+    steps = collect([lane()], lambda observation: observation[:, :1], np.full((5, 1, 1), 3, np.float32)).steps
+    np.testing.assert_array_equal(steps.action, 1)
+
+
+def test_replaying_actions_leads_back():
+    first, second = lane(), lane()
+    collect([first], lambda observation: observation[:, :1], np.zeros((27, 1, 1), np.float32))
+    second.episode = first.episode
+    assert second.replay(first.actions, first.observation)
+    again = [
+        collect([one], lambda observation: observation[:, :1], np.zeros((5, 1, 1), np.float32)).steps
+        for one in (first, second)
+    ]
+    np.testing.assert_array_equal(again[0].next_observation, again[1].next_observation)
+    assert not second.replay(first.actions[:3], first.observation)
+
+
+def test_evaluations_start_alike_and_pay_the_true_return():
+    def one(seeds=(0, 1)):
+        return evaluate([[make_episodic(toy_spec()) for _ in range(3)] for _ in seeds], lambda o: o[..., :1] / 2, seeds)
+
+    first, second = one(), one()
+    assert first.returns.shape == (2, 3)
+    np.testing.assert_array_equal(first.returns, second.returns)
+    np.testing.assert_allclose(first.returns, 0, atol=1e-4)
+    shifted = one((1, 2))
+    assert shifted.returns.shape == (2, 3)
+
+
+def test_evaluation_of_episodes_of_different_lengths():
+    class Counts(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-1, 1, (1,))
+        action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+        def __init__(self, length):
+            self.length = length
+
+        def reset(self, *, seed=None, options=None):
+            self.left = self.length
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            assert self.left > 0, "stepped after the end"
+            self.left -= 1
+            return np.zeros(1, np.float32), 1.0, self.left == 0, False, {"left": self.left}
+
+    lengths = (3, 1, 7)
+    made = [[EpisodicReward(Counts(length)) for length in lengths]]
+    found = evaluate(made, lambda observation: observation, [0], ("left",))
+    np.testing.assert_array_equal(found.returns, [lengths])
+    np.testing.assert_array_equal(found.measures["left"], [[0, 0, 0]])
+
+
+def test_a_payment_that_is_not_finite_stops_an_evaluation():
+    class Pays(gymnasium.Wrapper):
+        def step(self, action):
+            observation, _, terminated, truncated, info = self.env.step(action)
+            return observation, float("nan"), terminated, truncated, info
+
+    bad = EpisodicReward(Pays(gymnasium.make("toys/Chase-v0")))
+    with pytest.raises(environments.EnvironmentFault, match="the environment paid nan in an evaluation of seed 5"):
+        evaluate([[bad]], lambda observation: observation[..., :1], [5])

@@ -1,0 +1,278 @@
+"""Whole runs: every method, killed and resumed, stopped, broken environments, full disks, and what must be learned."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lare
+from lare.algorithms.td3 import TD3Settings
+from lare.credit.methods import TABLE, Encoder
+from lare.errors import LareError
+from lare.training import checkpoint
+from lare.training.environments import EnvironmentFault
+from lare.training.run import open_run
+from lare.training.train import Interrupted
+from toys import toy_spec
+
+METHODS = [method.name for method in TABLE]
+
+
+class At:
+    """Does something when a run has come to a step."""
+
+    def __init__(self, step, action):
+        self.step, self.action, self.messages = step, action, []
+
+    def started(self, name, step, steps): ...
+    def evaluated(self, metrics): ...
+    def stopped(self): ...
+
+    def said(self, message):
+        self.messages.append(message)
+
+    def stepped(self, step):
+        if step == self.step:
+            self.action()
+
+
+def figures(run):
+    """Metrics without the times."""
+    return [{key: value for key, value in line.items() if not key.startswith("time/")} for line in run.metrics()]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_trains_and_reports(method, small, phi, tmp_path):
+    run = lare.train(toy_spec(), small(method=method), function=phi, out=tmp_path / "run", listeners=[])
+    lines = run.metrics()
+    assert [(line["step"], line["seed"]) for line in lines] == [
+        (s, seed) for s in (60, 120, 180, 240) for seed in (0, 1)
+    ]
+    assert all(np.isfinite(line["evaluation/return"]) for line in lines)
+    has_decoder = any(row.name == method and row.encoder for row in TABLE)
+    assert ("credit/error" in lines[-1]) == ("credit/correlation" in lines[-1]) == has_decoder
+    assert (run.directory / "latent_function.py").exists() == any(
+        row.name == method and row.encoder is Encoder.LATENT for row in TABLE
+    )
+    assert lare.write_report([run.directory]).read_text().count("<svg") >= 1
+
+
+@pytest.mark.parametrize("judges", ["before", "after", "both"])
+def test_judges(judges, small, phi, tmp_path):
+    run = lare.train(toy_spec(), small(judges=judges, steps=60), function=phi, out=tmp_path / "run", listeners=[])
+    with np.load(run.checkpoint / "rows-1.npz") as rows:
+        assert rows["factors"].shape[-1] == (4 if judges == "both" else 2)
+        observation, action, z = rows["observation"][0], rows["action"][0], rows["factors"][0]
+    # Row 0 to 1 is within the first episode; actions are stored in [-1, 1], the environment's go to ±2.
+    for column, row in {"before": [(0, 0)], "after": [(0, 1)], "both": [(0, 0), (2, 1)]}[judges]:
+        assert z[0, column] == pytest.approx(-((2 * action[0, 0] - observation[row, 0]) ** 2), rel=1e-4)
+
+
+@pytest.mark.parametrize("method", ["dense", "rd", "lare-rrdu"])
+def test_a_killed_run_resumes_bit_for_bit(method, small, phi, tmp_path):
+    """SIGKILL in a process of its own, in the middle of an episode and between two checkpoints."""
+    settings = small(method=method)
+    whole = lare.train(toy_spec(), settings, function=phi, out=tmp_path / "whole", listeners=[])
+    phi.save(tmp_path / "phi")
+    (tmp_path / "settings.json").write_text(settings.model_dump_json())
+    script = f"""
+import json, os, signal, sys
+from toys import toy_spec
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+import lare
+from test_train import At
+spec = toy_spec()
+kill = At(156, lambda: os.kill(os.getpid(), signal.SIGKILL))
+settings = lare.Settings(**json.load(open("settings.json")))
+lare.train(spec, settings, function=lare.load_function("phi.py", spec), out="killed", listeners=[kill])
+"""
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    died = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True)
+    assert died.returncode == -signal.SIGKILL, died.stderr.decode()
+    assert figures(open_run(tmp_path / "killed")) == figures(whole)[:4]
+    # What was written after the checkpoint, whole or not, comes again.
+    with (tmp_path / "killed" / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 180, "seed": 0}\n{"ste')
+    resumed = lare.resume(tmp_path / "killed", listeners=[])
+    assert figures(resumed) == figures(whole)
+    with np.load(whole.checkpoint / "state.npz") as a, np.load(resumed.checkpoint / "state.npz") as b:
+        for name in a.files:
+            if name not in ("host", "segments"):
+                np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+def test_resuming_a_finished_run_changes_nothing(small, tmp_path):
+    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    before = figures(run)
+    assert figures(lare.resume(tmp_path / "run", listeners=[])) == before
+
+
+def test_resuming_before_the_first_checkpoint_starts_anew(small, tmp_path):
+    whole = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    before = figures(whole)
+    for path in whole.checkpoint.iterdir():
+        path.unlink()
+    assert figures(lare.resume(tmp_path / "run", listeners=[])) == before
+
+
+def test_an_episode_that_cannot_be_restored_is_dropped_and_said(small, tmp_path):
+    spec = toy_spec(environment="toys/Forgetful-v0")
+    stop = At(108, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(Interrupted):
+        lare.train(spec, small(method="rrdu"), out=tmp_path / "run", listeners=[stop])
+    listener = At(0, lambda: None)
+    run = lare.resume(tmp_path / "run", listeners=[listener])
+    assert listener.messages == [
+        f"episode 5 of seed {seed} was dropped after 8 steps: the environment did not come back to the same "
+        "observation by the same actions"
+        for seed in (0, 1)
+    ]
+    assert run.metrics()[-1]["step"] == 240
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_saves_and_goes_on_as_if_nothing_had_been(number, small, phi, tmp_path):
+    whole = lare.train(toy_spec(), small(), function=phi, out=tmp_path / "whole", listeners=[])
+    handler = signal.getsignal(number)
+    stop = At(84, lambda: signal.raise_signal(number))
+    with pytest.raises(Interrupted) as caught:
+        lare.train(toy_spec(), small(), function=phi, out=tmp_path / "run", listeners=[stop])
+    assert str(caught.value) == f"stopped at step 84 and saved; go on with: lare train --resume {tmp_path / 'run'}"
+    assert signal.getsignal(number) is handler
+    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("reward", "the environment gave nan in its reward, at step 10 of episode 1 of seed 0"),
+        ("infinite", "the environment gave inf in its reward, at step 10 of episode 1 of seed 0"),
+        ("observation", "the environment gave nan in its observation, at step 10 of episode 1 of seed 0"),
+    ],
+)
+def test_a_broken_environment_stops_the_run_and_leaves_it_whole(fault, message, small, tmp_path, monkeypatch):
+    import gymnasium
+
+    monkeypatch.setitem(gymnasium.registry["toys/Broken-v0"].kwargs, "fault", fault)
+    spec = toy_spec(environment="toys/Broken-v0")
+    with pytest.raises(EnvironmentFault) as caught:
+        lare.train(spec, small(method="dense"), out=tmp_path / "run", listeners=[])
+    assert str(caught.value) == message
+    run = open_run(tmp_path / "run")
+    assert run.has_checkpoint()
+
+
+def test_a_full_disk_leaves_the_last_checkpoint_whole(small, tmp_path, monkeypatch):
+    savez, written = np.savez, []
+
+    def fails(file, **arrays):
+        written.append(file)
+        if len(written) == 4:  # the state of the second checkpoint
+            file.write(b"half of it")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return savez(file, **arrays)
+
+    monkeypatch.setattr(checkpoint.np, "savez", fails)
+    with pytest.raises(LareError, match=r"state.npz cannot be written \(No space left on device\); what was there is"):
+        lare.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[])
+    monkeypatch.undo()
+    assert not list((tmp_path / "run" / "checkpoint").glob("*.new"))
+    whole = lare.train(toy_spec(), small(method="dense"), out=tmp_path / "whole", listeners=[])
+    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+
+
+def test_a_run_never_overwrites_another(small, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "precious").write_text("mine")
+    with pytest.raises(LareError, match="exists, and a run never overwrites another"):
+        lare.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[])
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["precious"]
+
+
+def test_default_directories_are_numbered(small, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = small(method="dense", steps=60)
+    names = [lare.train(toy_spec(), settings, listeners=[]).directory.name for _ in range(2)]
+    assert names == ["Chase-dense-td3-s0", "Chase-dense-td3-s0-2"]
+
+
+def test_two_processes_cannot_train_in_one_directory(small, tmp_path):
+    def intrude():
+        with pytest.raises(LareError, match="another process is training in"):
+            lare.resume(tmp_path / "run", listeners=[])
+
+    lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[At(24, intrude)])
+
+
+def test_a_small_ring_forgets_and_goes_on(small, tmp_path):
+    """A replay that holds three episodes: row files that are overwritten are deleted, and the rest resumes."""
+    settings = small(method="rrdu", capacity=64, seeds=1)
+    whole = lare.train(toy_spec(), settings, out=tmp_path / "whole", listeners=[])
+    assert not (whole.checkpoint / "rows-1.npz").exists()
+    stop = At(192, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(Interrupted):
+        lare.train(toy_spec(), settings, out=tmp_path / "run", listeners=[stop])
+    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+
+
+def test_a_replay_too_small_for_an_episode_is_refused(small, tmp_path):
+    with pytest.raises(LareError, match="capacity = 20 is too small: an episode of Chase takes up to 21"):
+        lare.train(toy_spec(), small(method="dense", capacity=20), out=tmp_path / "run", listeners=[])
+    assert not (tmp_path / "run").exists()
+
+
+def test_seeds_differ_and_are_their_own(small, tmp_path):
+    pair = lare.train(toy_spec(), small(method="dense", seeds=2), out=tmp_path / "pair", listeners=[]).metrics()
+    alone = lare.train(toy_spec(), small(method="dense", seeds=1, seed=1), out=tmp_path / "one", listeners=[]).metrics()
+    second = [line for line in pair if line["seed"] == 1]
+    for a, b in zip(second, alone, strict=True):
+        assert a["evaluation/return"] == pytest.approx(b["evaluation/return"], rel=1e-2)
+    assert pair[-1]["evaluation/return"] != pair[-2]["evaluation/return"]
+
+
+def test_measures_are_reported(small, tmp_path):
+    run = lare.train(
+        toy_spec(measures=("distance",)), small(method="dense", steps=60), out=tmp_path / "run", listeners=[]
+    )
+    assert run.metrics()[-1]["evaluation/distance"] > 0
+    with pytest.raises(LareError, match="the task measures 'nonsense', but the last step's info has only distance"):
+        lare.train(toy_spec(measures=("nonsense",)), small(method="dense"), out=tmp_path / "two", listeners=[])
+
+
+def test_tensorboard_events(small, tmp_path):
+    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[], tensorboard=True)
+    assert len(list((run.directory / "tensorboard").glob("seed-*/events*"))) == 2
+
+
+def test_config_says_what_the_run_depends_on(small, phi, tmp_path):
+    run = lare.train(toy_spec(), small(steps=60), function=phi, out=tmp_path / "run", listeners=[])
+    config = json.loads((run.directory / "config.json").read_text())
+    assert config["function_sha256"] == phi.digest
+    assert config["task_sha256"] == toy_spec().digest
+    assert config["lare"] == lare.__version__
+    assert config["settings"]["td3"]["hidden"] == [8]
+    source = run.directory / "latent_function.py"
+    source.write_text(source.read_text().replace("effort", "other"))
+    with pytest.raises(LareError, match="is not the function that this run was trained with: its hash changed"):
+        open_run(run.directory)
+
+
+@pytest.mark.parametrize("method", ["dense", "lare-rrdu", "lare-rd", "rrdu"])
+def test_must_learn_the_toy(method, phi, tmp_path):
+    """A random policy gets -33 a seed, standing still -7; the optimum is 0."""
+    settings = lare.Settings(
+        method=method,
+        steps=2000,
+        chunk=20,
+        evaluate_every=2000,
+        td3=TD3Settings(hidden=(32, 32), learning_rate=3e-3, batch_size=64, gamma=0.5, warmup=500),
+        credit=lare.training.settings.CreditSettings(hidden=(32, 32), learning_rate=3e-3, drawn_steps=8, steps=64),
+    )
+    run = lare.train(toy_spec(), settings, function=phi, out=tmp_path / "run", listeners=[])
+    assert run.metrics()[-1]["evaluation/return"] > -3
