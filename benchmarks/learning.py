@@ -1,7 +1,7 @@
 """Learning curves: 3 seeds, 100 thousand steps, the methods side by side.
 
     python benchmarks/learning.py run RUNS [TASK/LABEL ...]   train what is missing, go on with the rest
-    python benchmarks/learning.py table RUNS                  write results/learning.json and print it as a table
+    python benchmarks/learning.py table RUNS                  write results/learning.json and docs/pictures, print a table
 
 Every experiment is a run directory RUNS/TASK/LABEL. Two processes on one core each train 1.1 times as much as one on two.
 """
@@ -14,6 +14,8 @@ import numpy as np
 
 import lare
 from lare.credit.decomposition import CreditSettings
+from lare.experiments import figures
+from lare.experiments.report import curve
 from lare.training.run import open_run
 
 PUBLISHED = {"credit": CreditSettings(normalise=False)}
@@ -62,12 +64,22 @@ def row(directory: Path) -> dict:
     late = [line for line in lines if line["step"] > 0.75 * last]
     seeds = sorted({line["seed"] for line in lines})
     by_seed = [np.mean([line["evaluation/return"] for line in late if line["seed"] == seed]) for seed in seeds]
-    figures = {"steps": last, "seeds": seeds, "last quarter": [np.mean(by_seed), np.std(by_seed, ddof=1)]}
+    found = {"steps": last, "seeds": seeds, "last quarter": [np.mean(by_seed), np.std(by_seed, ddof=1)]}
     for key in ("evaluation/return", "credit/error", "credit/correlation"):
         values = [line[key] for line in end if line.get(key) is not None]
         if values:
-            figures[key] = [np.mean(values), np.std(values, ddof=1)]
-    return {"machine": run.config.machine, "versions": run.config.versions, **figures}
+            found[key] = [np.mean(values), np.std(values, ddof=1)]
+    return {"machine": run.config.machine, "versions": run.config.versions, **found}
+
+
+def draw(directory: Path, labels: list[str]) -> None:
+    """The learning curves of a task, in the report's form."""
+    runs = {label: open_run(directory / label) for label in labels}
+    points = {label: curve(run, "evaluation/return") for label, run in runs.items()}
+    if points:
+        picture = Path(__file__).parents[1] / "docs" / "pictures" / f"{directory.name}.svg"
+        picture.parent.mkdir(exist_ok=True)
+        picture.write_text(figures.curves({k: v for k, v in points.items() if v is not None}, "true return") + "\n")
 
 
 def table(directory: Path) -> None:
@@ -80,13 +92,15 @@ def table(directory: Path) -> None:
     out = Path(__file__).parent / "results" / "learning.json"
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps(found, indent=1) + "\n")
-    for name, figures in found.items():
+    for task, labels in EXPERIMENTS.items():
+        draw(directory / task, [label for label in labels if f"{task}/{label}" in found])
+    for name, of_run in found.items():
         parts = [
             f"{key.split('/')[-1]} {value[0]:.3g} ± {value[1]:.2g}"
-            for key, value in figures.items()
+            for key, value in of_run.items()
             if isinstance(value, list) and key != "seeds"
         ]
-        print(f"{name:36s} {figures['steps']:>7d}  {', '.join(parts)}")
+        print(f"{name:36s} {of_run['steps']:>7d}  {', '.join(parts)}")
 
 
 if __name__ == "__main__":
