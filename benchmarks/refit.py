@@ -28,9 +28,7 @@ UPDATES, STRETCH = 20_000, 5_000
 
 
 @partial(jax.jit, static_argnames=("fit", "recipe"))
-def updates(
-    credit: Decomposition, held: replay.Replay, key: jax.Array, fit: Fit, recipe: Recipe
-) -> Decomposition:
+def updates(credit: Decomposition, held: replay.Replay, key: jax.Array, fit: Fit, recipe: Recipe) -> Decomposition:
     def one(credit: Decomposition, drawn: off_policy.CreditDraws) -> tuple[Decomposition, None]:
         features = off_policy.features(replay.read(held, drawn.steps), recipe.method)
         chosen = drawn.episodes
@@ -83,7 +81,9 @@ def main(directories: list[str]) -> None:
             "biased": (Fit.DRAWN_STEPS, own),
         }
         found = {name: refit(learner, recipe, *case) for name, case in cases.items()}
-        ceilings = [ceiling(jax.tree.map(lambda leaf, s=seed: leaf[s], everyone), recipe) for seed in range(len(run.seeds))]
+        ceilings = [
+            ceiling(jax.tree.map(lambda leaf, s=seed: leaf[s], everyone), recipe) for seed in range(len(run.seeds))
+        ]
         results[f"{run.config.task.name} {run.config.settings.method}"] = {"ceiling of each seed": ceilings, **found}
         print(f"{directory}: ceiling {', '.join(f'{value:.3f}' for value in ceilings)}")
         for name, steps in found.items():

@@ -44,7 +44,8 @@ def record_video(directory: str | Path, path: str | Path) -> None:
         LareError: the environment cannot be drawn on this machine, or the file cannot be written.
     """
     run, path = open_run(directory), Path(path)
-    environment = make_episodic(run.config.task, render_mode="rgb_array")
+    camera = {"camera_name": "track"} if has_tracking_camera(run) else {}
+    environment = make_episodic(run.config.task, render_mode="rgb_array", **camera)
     policy, fps = load_policy(run), environment.metadata.get("render_fps", 30)
     observation, _ = environment.reset(seed=episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
     frames, ended = [], False
@@ -61,6 +62,15 @@ def record_video(directory: str | Path, path: str | Path) -> None:
             "MUJOCO_GL=osmesa in the environment may help"
         ) from error
     write_video(path, frames, fps)
+
+
+def has_tracking_camera(run: Run) -> bool:
+    """Whether the environment is a MuJoCo model with a camera that follows it, which Gymnasium does not use by itself."""
+    environment = make_episodic(run.config.task)
+    model = getattr(environment.unwrapped, "model", None)
+    names = [model.camera(number).name for number in range(model.ncam)] if hasattr(model, "ncam") else []
+    environment.close()
+    return "track" in names
 
 
 def write_video(path: Path, frames: list, fps: int) -> None:

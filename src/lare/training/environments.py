@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -39,9 +40,9 @@ def episode_seed(seed: int, stream: Stream, episode: int) -> int:
     return int(generator(seed, stream, episode).integers(2**31))
 
 
-def make_episodic(task: TaskSpec, render_mode: str | None = None) -> EpisodicReward:
-    extra = {"render_mode": render_mode} if render_mode else {}
-    return EpisodicReward(make(task.environment, task.max_episode_steps, **extra))
+def make_episodic(task: TaskSpec, **kwargs: Any) -> EpisodicReward:
+    """The task's environment, paying at the end; `kwargs` go to its constructor."""
+    return EpisodicReward(make(task.environment, task.max_episode_steps, **kwargs))
 
 
 def to_bounds(action: Float[np.ndarray, " action"], space: gymnasium.Space) -> Float[np.ndarray, " action"]:
