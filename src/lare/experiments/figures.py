@@ -23,7 +23,6 @@ STYLE: Any = {
     "axes.grid": True,
     "grid.color": "#e6e6e6",
     "axes.axisbelow": True,
-    "legend.frameon": False,
 }
 
 Curve = tuple[Float[np.ndarray, " evaluations"], Float[np.ndarray, "seeds evaluations"]]
@@ -49,7 +48,7 @@ def curves(by_name: Mapping[str, Curve], label: str, *, from_zero: bool = False)
     figure, (axes,) = new_figure()
     for colour, (name, (steps, values)) in zip(COLOURS * len(by_name), by_name.items(), strict=False):
         mean = values.mean(axis=0)
-        axes.plot(steps, mean, color=colour, label=f"{name} ({len(values)} seed{'s' * (len(values) > 1)})")
+        axes.plot(steps, mean, color=colour, label=name)
         if len(values) > 1:
             spread = values.std(axis=0, ddof=1)
             axes.fill_between(steps, mean - spread, mean + spread, color=colour, alpha=0.18, linewidth=0)
@@ -84,4 +83,12 @@ def courses(factors: Float[np.ndarray, "steps factors"], names: Sequence[str]) -
 
 
 def legend_above(axes: Axes) -> None:
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.2, handlelength=1.4, fontsize=10)
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(0, 1),
+        ncols=2,
+        borderaxespad=0.2,
+        handlelength=1.4,
+        fontsize=10,
+        frameon=False,
+    )

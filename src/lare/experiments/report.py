@@ -68,12 +68,13 @@ def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> P
 
 
 def labels(runs: Sequence[Run]) -> list[str]:
-    """A name for each run: its method; where two would be the same, its directory too."""
+    """A name for each run: its method; where two would be the same, the directory that holds the method's name, or both."""
     methods = [run.config.settings.method for run in runs]
-    named = [
-        method if methods.count(method) == 1 else f"{method} ({run.directory.name})"
-        for method, run in zip(methods, runs, strict=True)
-    ]
+    named = []
+    for method, run in zip(methods, runs, strict=True):
+        directory = run.directory.name
+        clash = directory if directory.startswith(method) else f"{method} ({directory})"
+        named.append(method if methods.count(method) == 1 else clash)
     return [f"{name} #{place + 1}" if named.count(name) > 1 else name for place, name in enumerate(named)]
 
 
