@@ -1,6 +1,7 @@
 """The policy of a finished (or stopped) run, evaluated and filmed."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -67,7 +68,7 @@ def record_video(directory: str | Path, path: str | Path) -> None:
 def has_tracking_camera(run: Run) -> bool:
     """Whether the environment is a MuJoCo model with a camera that follows it, which Gymnasium does not use by itself."""
     environment = make_episodic(run.config.task)
-    model = getattr(environment.unwrapped, "model", None)
+    model: Any = getattr(environment.unwrapped, "model", None)
     names = [model.camera(number).name for number in range(model.ncam)] if hasattr(model, "ncam") else []
     environment.close()
     return "track" in names
