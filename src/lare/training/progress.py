@@ -64,7 +64,7 @@ class Terminal:
             self.progress.add_task(name, total=steps, completed=step, figures="compiling")
             self.progress.start()
         else:
-            self.say(f"{name}: step {step} of {steps}")
+            self.said(f"{name}: step {step} of {steps}")
 
     def stepped(self, step: int) -> None:
         if self.progress:
@@ -74,12 +74,9 @@ class Terminal:
         if self.progress:
             self.progress.update(self.progress.task_ids[0], figures=summary(metrics))
         else:
-            self.say(f"step {metrics[0]['step']:>{len(str(self.steps))}} of {self.steps}: {summary(metrics)}")
+            self.said(f"step {metrics[0]['step']:>{len(str(self.steps))}} of {self.steps}: {summary(metrics)}")
 
     def said(self, message: str) -> None:
-        self.say(message)
-
-    def say(self, message: str) -> None:
         self.console.print(message, highlight=False, markup=False, soft_wrap=True)
 
     def stopped(self) -> None:
