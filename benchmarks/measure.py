@@ -6,6 +6,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
@@ -93,7 +94,7 @@ def new_session(directory: Path, task_name: str, settings: lare.Settings) -> Ses
     task = lare.load_task(task_name)
     latent = find_method(settings.method).encoder is Encoder.LATENT
     run = create(directory, task, settings, lare.design(task, draw=settings.draw) if latent else None)
-    return begin(run, new_learner(run))
+    return begin(run, partial(new_learner, run))
 
 
 def advance(session: Session, steps: int) -> None:

@@ -5,17 +5,24 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import pytest
 
 from lare.tasks.spec import TaskSpec
 from toys import PHI, Chase, toy_spec
 
-# Most of a small run's time is compilation, and many tests compile the same.
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+# Most of a small run's time is compilation, and many tests compile the same. JAX may have been imported already, and
+# some tests start processes of their own.
+CACHE = {
+    "jax_compilation_cache_dir": str(Path(__file__).parents[1] / ".pytest_cache" / "jax"),
+    "jax_persistent_cache_min_compile_time_secs": 0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
+for option, value in CACHE.items():
+    os.environ.setdefault(option.upper(), str(value))
+    jax.config.update(option, value)
 
-collect_ignore = ["toys.py"]
+collect_ignore = ["toys.py", "servers.py"]
 """No tests in there, and looking for doctests would import it, and register its environments, a second time."""
 
 __all__ = ["PHI", "Chase", "toy_spec"]

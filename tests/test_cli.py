@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from lare import cli
+from lare.latent.checks import CHECKS
 from lare.llm.prompts import candidate
 from lare.tasks.spec import read_task, shipped_tasks
 from toys import PHI
@@ -64,13 +65,13 @@ def test_prompt_of_a_task_of_ones_own(command, spec_file):
 
 def test_design_prints_the_function(command):
     status, out, err = command("design", "Reacher-v4", "--kind", "reward")
-    assert (status, err) == (0, "")
+    assert (status, err) == (0, "".join(f"candidate {n}: passes\n" for n in range(1, 6)) + "attempt 1: passes\n")
     assert "def evaluation_func(observation, action):\n" in out
 
 
 def test_design_writes_the_function_once(command, tmp_path):
-    status, out, err = command("design", "Reacher-v4", "--out", "phi.py")
-    assert (status, err) == (0, "")
+    status, out, _ = command("design", "Reacher-v4", "--out", "phi.py")
+    assert status == 0
     assert out.startswith("wrote phi.py: ")
     written = {name: (tmp_path / name).read_bytes() for name in ("phi.py", "phi.json")}
     assert command("design", "Reacher-v4", "--draw", 1, "--out", "phi") == (
@@ -79,6 +80,82 @@ def test_design_writes_the_function_once(command, tmp_path):
         "lare: phi.py exists, and is not overwritten; choose another --out\n",
     )
     assert {name: (tmp_path / name).read_bytes() for name in written} == written
+
+
+def test_verify_prints_each_check(command, phi, spec_file):
+    status, out, err = command("verify", phi, "--task", spec_file())
+    assert (status, err) == (0, "")
+    *checks, last = out.splitlines()
+    assert checks == [f"passed  {name}" for name in ("gate", *CHECKS)]
+    assert last.startswith("It ran in a process of its own (")
+
+
+def test_verify_prints_every_error(command, spec_file, tmp_path):
+    (tmp_path / "bad.py").write_text("import os\ndef evaluation_func(o, a):\n    return [np.clamp(a), open('x')]\n")
+    status, out, err = command("verify", "bad.py", "--task", spec_file())
+    assert (status, err) == (1, "")
+    assert out.splitlines() == [
+        "FAILED  gate",
+        "        E-IMPORT line 1: import os: only `import numpy as np` and `import math` are available",
+        "        E-CALL line 3: open is not a function that is available",
+        "        E-NUMPY line 3: np.clamp is not available: there is no such function; write np.clip",
+        "        E-STRING line 3: the string 'x' is not available here",
+    ]
+
+
+def test_verify_gives_advice(command, spec_file, tmp_path):
+    (tmp_path / "dull.py").write_text("def evaluation_func(o, a):\n    still = 0 * a\n    return [still, a]\n")
+    status, out, _ = command("verify", "dull.py", "--task", spec_file())
+    assert status == 0
+    assert "advice  factor 'still' never varies on the recorded steps\n" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("none.py --task Reacher-v4", "there is no function file none.py"),
+        ("phi.py --task Reacher", "no task 'Reacher' (did you mean 'Reacher-v4'?): "),
+    ],
+)
+def test_what_cannot_be_tried_is_status_2(command, phi, arguments, message):
+    status, out, err = command("verify", *arguments.split())
+    assert (status, out) == (2, "")
+    assert err.startswith(f"lare: {message}")
+
+
+def test_no_process_to_be_had_is_status_2(command, phi, spec_file, monkeypatch):
+    monkeypatch.setattr("lare.latent.jailed.START", "raise SystemExit('no Python here')")
+    status, out, err = command("verify", phi, "--task", spec_file())
+    assert (status, out) == (2, "")
+    assert err.startswith("lare: the process for the latent function does not start: ")
+    assert "no Python here" in err
+
+
+def test_a_new_task_is_written_once(command, tmp_path):
+    status, out, err = command("new-task", "Pendulum-v1")
+    assert (status, err) == (0, "")
+    assert out.splitlines()[0] == "wrote Pendulum-v1.toml; 2 sentences or rows that spoke of rewards were left out"
+    written = (tmp_path / "Pendulum-v1.toml").read_bytes()
+    again = "lare: Pendulum-v1.toml exists, and is not overwritten; choose another --out\n"
+    assert command("new-task", "Pendulum-v1") == (2, "", again)
+    assert (tmp_path / "Pendulum-v1.toml").read_bytes() == written
+    status, out, _ = command("prompt", "Pendulum-v1.toml")
+    assert status == 0
+    assert "# Task\nThe inverted pendulum swingup problem" in out
+
+
+def test_what_a_new_task_lacks_is_said(command):
+    status, out, _ = command("new-task", "Hopper-v4", "--out", "hopper.toml")
+    assert status == 0
+    assert [line for line in out.splitlines() if "fill in" in line] == [
+        f"  fill in: {key} (the environment does not document it)" for key in ("description", "observation", "action")
+    ]
+
+
+def test_the_ablation_without_pre_verification_keeps_what_runs(command):
+    status, out, err = command("design", "Reacher-v4", "--candidates", 1, "--no-pre-verification")
+    assert (status, err) == (0, "")
+    assert "def evaluation_func" in out
 
 
 @pytest.mark.parametrize(
@@ -126,10 +203,13 @@ def test_debug_shows_where_it_came_from(command, arguments):
 
 
 def test_an_error_of_many_lines_is_printed_in_one(command, spec_file, tmp_path):
-    (tmp_path / "bad.py").write_text("def evaluation_func(o, a):\n    raise ValueError('one\\ntwo')\n")
+    (tmp_path / "bad.py").write_text("def evaluation_func(o, a):\n    while True: pass\n    raise ValueError\n")
     status, _, err = command("train", spec_file(), "--function", "bad.py")
     assert status == 2
-    assert err == "lare: bad.py: the function does not fit task 'Chase': runs: ValueError: one two (line 2)\n"
+    assert err == (
+        "lare: bad.py: the function does not fit task 'Chase': E-CONSTRUCT line 2: while is not available "
+        "E-CONSTRUCT line 3: raise is not available\n"
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Small toys that train in a second (`from toys import ...`)."""
 
+import textwrap
+
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
@@ -40,6 +42,11 @@ def evaluation_func(observation, action):
     f_effort = -np.square(action)
     return [f_near, f_effort]
 """
+
+
+def phi(body: str) -> str:
+    """A latent function of some lines; the first of them is line 2."""
+    return "def evaluation_func(observation, action):\n" + textwrap.indent(body, "    ")
 
 
 def toy_spec(**changes) -> TaskSpec:

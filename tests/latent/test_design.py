@@ -5,21 +5,30 @@ import json
 import pytest
 
 from lare.errors import LareError
-from lare.latent.design import ATTEMPTS, design
+from lare.latent import design as module
+from lare.latent.checks import Check
+from lare.latent.design import ATTEMPTS, LONGEST_QUOTE, DesignFailed, design
+from lare.latent.verify import Verdict
 from lare.llm.prompts import candidate, combine, correct
+from lare.llm.recording import read_recording
 from lare.tasks.spec import read_task, shipped_tasks
-from toys import PHI, toy_spec
+from toys import PHI, phi, toy_spec
 
 
 def reply(source: str) -> str:
     return json.dumps({"Understand": "u", "Analyze": "a", "Functions": source})
 
 
-def failing(said: str) -> str:
-    return reply(f"def evaluation_func(observation, action):\n    raise ValueError('{said}')")
+def failing(name: str) -> str:
+    return reply(phi(f"return [{name}]"))
+
+
+def error_of(name: str) -> str:
+    return f"E-NAME line 2: {name} is not defined"
 
 
 GOOD = reply(PHI)
+OTHER = reply(PHI.replace("f_effort", "f_exertion"))
 MALFORMED = "Here is the function."
 NOT_JSON = "the reply is not one JSON object: Expecting value: line 1 column 1 (char 0)"
 
@@ -38,6 +47,12 @@ class Scripted:
         return self.lines.pop(0)
 
 
+@pytest.fixture
+def trusting(monkeypatch):
+    """Every source passes: for what is about the requests alone."""
+    monkeypatch.setattr(module, "verify", lambda *_: Verdict((Check("gate", True, ""),), 2))
+
+
 @pytest.mark.parametrize("name", shipped_tasks())
 def test_every_shipped_task_has_its_function(name):
     function = design(read_task(name))
@@ -49,50 +64,92 @@ def test_every_shipped_task_has_its_function(name):
     assert all(check.passed for check in function.checks)
 
 
-def test_draws_are_different_samples():
+def test_draws_are_different_samples(trusting):
     functions = [design(read_task("Reacher-v4"), draw=draw) for draw in (0, 1)]
     assert functions[0].digest != functions[1].digest
 
 
 def test_a_reward_is_one_factor():
-    function = design(read_task("Reacher-v4"), "reward")
+    function = design(read_task("Reacher-v4"), "reward", candidates=1)
     assert (function.kind, function.size) == ("reward", 1)
 
 
 def test_a_failure_goes_back_with_its_error(chase):
-    bad = failing("no idea")
-    model = Scripted("first", "second", bad, GOOD)
+    bad = failing("no_idea")
+    model = Scripted(GOOD, OTHER, bad, GOOD)
     function = design(chase, model=model, candidates=2)
     first = candidate(chase)
-    second = combine(chase, ["first", "second"])
-    third = correct(second, bad, "runs: ValueError: no idea (line 2)")
+    second = combine(chase, [GOOD, OTHER])
+    third = correct(second, bad, error_of("no_idea"))
     assert model.asked == [(first, 0), (first, 1), (second, 0), (third, 0)]
     assert function.exchanges == (
-        {"stage": "candidate", "messages": first, "replies": ["first", "second"]},
+        {"stage": "candidate", "messages": first, "replies": [GOOD, OTHER]},
         {"stage": "combine", "messages": second, "replies": [bad]},
         {"stage": "correct", "messages": third, "replies": [GOOD]},
     )
     assert (function.source, function.model) == (PHI.strip("\n"), "scripted")
 
 
-def test_one_candidate_is_not_combined(chase):
+def test_every_error_goes_back(chase):
+    bad = reply("import os\n" + phi("return [one, np.two(3)]"))
+    model = Scripted(bad, GOOD)
+    design(chase, model=model, candidates=1)
+    errors = (
+        "E-IMPORT line 1: import os: only `import numpy as np` and `import math` are available\n"
+        "E-NAME line 3: one is not defined\n"
+        "E-NUMPY line 3: np.two is not available: there is no such function"
+    )
+    assert model.asked[1] == (correct(candidate(chase), bad, errors), 0)
+
+
+def test_candidates_that_do_not_pass_are_left_out(chase):
+    model = Scripted(GOOD, failing("no_idea"), MALFORMED, OTHER, GOOD)
+    said = []
+    function = design(chase, model=model, candidates=4, said=said.append)
+    assert model.asked[-1] == (combine(chase, [GOOD, OTHER]), 0)
+    # What was left out was asked for all the same, and is kept.
+    assert function.exchanges[0]["replies"] == [GOOD, failing("no_idea"), MALFORMED, OTHER]
+    assert said == [
+        "candidate 1: passes",
+        f"candidate 2: {error_of('no_idea')}",
+        f"candidate 3: {NOT_JSON}",
+        "candidate 4: passes",
+        "attempt 1: passes",
+    ]
+
+
+def test_where_no_candidate_passes_all_are_shown(chase):
+    long = "x" * (LONGEST_QUOTE + 5)
+    model = Scripted(MALFORMED, failing("no_idea"), long, GOOD)
+    design(chase, model=model, candidates=3)
+    assert model.asked[-1] == (combine(chase, [MALFORMED, failing("no_idea"), "x" * LONGEST_QUOTE]), 0)
+
+
+def test_one_candidate_is_not_combined(chase, trusting):
     model = Scripted(GOOD)
     function = design(chase, model=model, candidates=1)
     assert model.asked == [(candidate(chase), 0)]
     assert [exchange["stage"] for exchange in function.exchanges] == ["candidate"]
 
 
-def test_a_malformed_reply_can_be_corrected(chase):
+def test_a_malformed_reply_can_be_corrected(chase, trusting):
     model = Scripted(MALFORMED, GOOD)
     design(chase, model=model, candidates=1)
     assert model.asked[1] == (correct(candidate(chase), MALFORMED, NOT_JSON), 0)
 
 
+def test_a_reply_without_end_is_shown_cut_off(chase, trusting):
+    long = "x" * (LONGEST_QUOTE + 5)
+    model = Scripted(long, GOOD)
+    design(chase, model=model, candidates=1)
+    assert model.asked[1] == (correct(candidate(chase), "x" * LONGEST_QUOTE, NOT_JSON), 0)
+
+
 def test_the_kind_is_what_is_asked_and_checked(chase):
-    one = reply("def evaluation_func(observation, action):\n    return [action]")
+    one = reply(phi("return [action]"))
     model = Scripted(GOOD, one)
     function = design(chase, "reward", model=model, candidates=1)
-    error = "form: evaluation_func must return exactly one reward array, but returned 2"
+    error = "E-FORM: evaluation_func must return exactly one reward array, but returned 2"
     assert [messages for messages, _ in model.asked] == [
         candidate(chase, "reward"),
         correct(candidate(chase, "reward"), GOOD, error),
@@ -101,22 +158,82 @@ def test_the_kind_is_what_is_asked_and_checked(chase):
 
 
 def test_it_gives_up_with_the_last_errors(chase):
-    bad = [failing(f"attempt {number}") for number in range(1, ATTEMPTS + 1)]
+    bad = [failing(f"attempt_{number}") for number in range(1, ATTEMPTS + 1)]
     model = Scripted(*bad, GOOD)
-    with pytest.raises(LareError) as error:
-        design(chase, model=model, candidates=1)
+    said = []
+    with pytest.raises(DesignFailed) as error:
+        design(chase, model=model, candidates=1, said=said.append)
     assert str(error.value) == (
-        "task 'Chase': none of 5 attempts passed; the last one failed: runs: ValueError: attempt 5 (line 2)"
+        f"task 'Chase': none of 5 attempts passed; the last one failed: {error_of('attempt_5')}"
     )
+    assert said == [f"attempt {number}: {error_of(f'attempt_{number}')}" for number in range(1, 6)]
     assert model.lines == [GOOD]
     # Each request carries all the failures before it.
     last, _ = model.asked[-1]
     assert [message["content"] for message in last if message["role"] == "assistant"] == bad[:-1]
+    # And nothing that was said is lost.
+    assert [exchange.replies for exchange in error.value.recorder.exchanges] == [[one] for one in bad]
+    assert error.value.model == "scripted"
 
 
-def test_the_last_attempt_may_be_the_good_one(chase):
+def test_the_last_attempt_may_be_the_good_one(chase, trusting):
     model = Scripted(*[MALFORMED] * (ATTEMPTS - 1), GOOD)
     assert len(design(chase, model=model, candidates=1).exchanges) == ATTEMPTS
+
+
+def test_a_record_is_kept_from_the_first_reply_on(chase, trusting, tmp_path):
+    path = tmp_path / "record.json"
+    kept = []
+
+    class Looks(Scripted):
+        def reply(self, messages, sample):
+            kept.append(path.exists())
+            return super().reply(messages, sample)
+
+    function = design(chase, model=Looks(MALFORMED, GOOD), candidates=1, record=path)
+    assert kept == [False, True]
+    recording = read_recording(path.read_text(encoding="utf-8"), "record.json")
+    assert tuple(exchange.model_dump() for exchange in recording.exchanges) == function.exchanges
+    before = path.read_text()
+    with pytest.raises(LareError, match="exists, and is not overwritten"):
+        design(chase, model=Scripted(GOOD), candidates=1, record=path)
+    assert path.read_text() == before
+
+
+# --- without verification, as an ablation ----------------------------------------------------------------------------
+
+
+def test_without_verification_whatever_runs_is_kept(chase):
+    # The gate refuses it, and so would half of the checks; in the jail it can do nothing.
+    source = phi("global calls\ntext = f'{action.mean()}'\nreturn [action * np.nan, action - action.mean()]")
+    model = Scripted(reply(source), GOOD)
+    function = design(chase, model=model, candidates=1, pre_verification=False)
+    assert (function.source, function.size) == (source, 2)
+    assert function.checks == (Check("executed", True, ""),)
+    assert model.lines == [GOOD]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (MALFORMED, NOT_JSON),
+        (reply(phi("raise ValueError('no idea')")), "E-RUN line 2: ValueError: no idea"),
+        (reply("import os\nos.listdir('/')"), "E-RUN line 2: PermissionError: [Errno 1] Operation not permitted: '/'"),
+        (
+            reply(phi("return action")),
+            "E-FORM: evaluation_func must return a list of arrays, "
+            "but returned an array of shape (256, 1) and type float32",
+        ),
+        (
+            reply("import os\nos._exit(3)"),
+            "the process that runs the latent function failed: it ended (exit status 3)",
+        ),
+    ],
+)
+def test_without_verification_what_does_not_run_is_no_function(chase, seccomp, line, message):
+    with pytest.raises(DesignFailed) as error:
+        design(chase, model=Scripted(line), candidates=1, pre_verification=False)
+    assert str(error.value) == f"task 'Chase': the reply does not run: {message}"
 
 
 def test_a_task_without_recordings_is_refused():

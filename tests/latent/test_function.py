@@ -1,51 +1,63 @@
 """The artifact: saved and loaded, verified again, and strict while a run is under way."""
 
+import gc
 import hashlib
 import json
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lare.errors import LareError
-from lare.latent.function import HEADER, LatentFunction, LatentRewardError, load, verified
-from lare.latent.worker import Check
-from toys import PHI
+from lare.latent import function as module
+from lare.latent.checks import CHECKS, Check
+from lare.latent.evaluator import LatentRewardError
+from lare.latent.function import HEADER, LatentFunction, load, read_source, verified
+from lare.latent.verify import Verdict
+from toys import PHI, phi, toy_spec
 
 SOURCE = PHI.strip("\n")
-
-
-def phi(body: str) -> str:
-    return f"def evaluation_func(observation, action):\n    {body}"
+NAMES = ("gate", *CHECKS)
 
 
 def batch(rows: int) -> tuple[np.ndarray, np.ndarray]:
     return np.zeros((rows, 2), np.float32), np.ones((rows, 1), np.float32)
 
 
+@pytest.fixture(scope="module")
+def sound() -> LatentFunction:
+    """The toy's function, verified once for all tests."""
+    return verified(SOURCE, toy_spec())
+
+
 @pytest.fixture
-def function(chase) -> LatentFunction:
+def function(sound) -> LatentFunction:
     exchanges = ({"stage": "candidate", "messages": [{"role": "user", "content": "Bitte ä"}], "replies": ["{}"]},)
-    return replace(verified(SOURCE, chase), model="Somebody, draw 0", exchanges=exchanges)
+    return replace(sound, model="Somebody, draw 0", exchanges=exchanges)
 
 
-def test_verified(chase):
-    function = verified(SOURCE, chase)
-    assert (function.task, function.kind, function.source, function.size) == ("Chase", "factors", SOURCE, 2)
-    assert (function.model, function.exchanges) == ("none: written by hand", ())
-    names = "runs", "form", "finite", "deterministic", "rows alone"
-    assert function.checks == tuple(Check(name, True, "") for name in names)
+@pytest.fixture
+def trusting(monkeypatch, sound):
+    """Every source passes: for what is about files alone, and would start two workers for each."""
+    monkeypatch.setattr(module, "verify", lambda source, task, kind: Verdict(sound.checks, sound.size))
 
 
-def test_blank_lines_around_a_source_do_not_count(chase):
-    assert verified(f"\n{PHI}\n", chase) == verified(SOURCE, chase)
+def test_verified(sound):
+    assert (sound.task, sound.kind, sound.source, sound.size) == ("Chase", "factors", SOURCE, 2)
+    assert (sound.model, sound.exchanges) == ("none: written by hand", ())
+    assert sound.checks == tuple(Check(name, True, "") for name in NAMES)
+
+
+def test_blank_lines_around_a_source_do_not_count(chase, sound, trusting):
+    assert verified(f"\n{PHI}\n", chase) == sound
 
 
 def test_what_does_not_pass_is_no_function(chase):
     with pytest.raises(LareError) as error:
-        verified(phi("return [undefined]"), chase)
+        verified(phi("x = [][0]\nreturn [x]"), chase)
     assert str(error.value) == (
-        "the function does not fit task 'Chase': runs: NameError: name 'undefined' is not defined (line 2)"
+        "the function does not fit task 'Chase': E-RUN line 2: IndexError: list index out of range"
     )
 
 
@@ -56,65 +68,80 @@ def test_the_factors_of_a_batch(function):
     np.testing.assert_array_equal(factors, [[-4, -9], [-1, -0.25]])
 
 
-def test_whatever_type_the_factors_have_they_become_float32(chase):
-    function = verified(phi("return [action > 0, action.astype(np.int8), action * 0.5]"), chase)
-    factors = function(*batch(2))
-    assert factors.dtype == np.float32
-    np.testing.assert_array_equal(factors, [[1, 1, 0.5]] * 2)
-
-
-# Each passes on the 256 recorded steps and on single ones, and fails on a batch of 7 or outside of the toy's range.
+# It passes on the 256 recorded steps and on everything that was made up of them, and fails in a batch of 7 or outside.
 @pytest.mark.parametrize(
-    ("body", "message"),
+    ("body", "rows", "message"),
     [
-        (
-            "if len(action) == 7: raise ValueError('seven')\n    return [action]",
-            "the latent function failed: ValueError: seven",
-        ),
+        ("x = [action][len(action) == 7]\nreturn [x]", 7, "E-RUN line 2: IndexError: list index out of range"),
         (
             "return [action[:3]] if len(action) == 7 else [action]",
-            "the latent function gave factors of shape (3, 1), not (7, 1)",
+            7,
+            "E-FORM: factor 1 must be an array of shape (batch_size, 1) = (7, 1), "
+            "but is an array of shape (3, 1) and type float32",
         ),
+        ("return [action] * (2 if len(action) == 7 else 1)", 7, "it gave 2 factors, not 1"),
         (
-            "return [action] * (2 if len(action) == 7 else 1)",
-            "the latent function gave factors of shape (7, 2), not (7, 1)",
+            "near = np.sqrt(observation[:, 0:1] + 5000)\nreturn [action, near]",
+            5,
+            "factor 'near' is nan for the observation [-6000.     0.]",
         ),
-        (
-            "near = np.sqrt(observation[:, 0:1] + 1)\n    return [action, near]",
-            "factor 'near' is nan for the observation [-2.  0.]",
-        ),
-        ("return [1e30 ** (observation[:, 0:1] ** 2)]", "factor 'factor_1' is inf for the observation [-2.  0.]"),
     ],
 )
-def test_a_function_that_fails_while_it_is_used(chase, body, message):
-    observation, action = batch(7)
-    observation[4, 0] = -2
+def test_a_function_that_fails_while_it_is_used(chase, body, rows, message):
+    observation, action = batch(rows)
+    observation[4, 0] = -6000
     function = verified(phi(body), chase)
     with pytest.raises(LatentRewardError) as error:
         function(observation, action)
-    assert str(error.value) == message
+    function.close()
+    assert str(error.value) == f"the latent function failed: {message}"
+    assert error.value.observation is observation
 
 
-@pytest.mark.parametrize(
-    ("source", "names", "meanings"),
-    [
-        (SOURCE, ["f_near", "f_effort"], ["how near the action comes", "effort"]),
-        (phi("return [-action, action]"), ["factor_1", "action"], ["", ""]),
-        (phi("factors = [action, -action]\n    return factors"), ["factor_1", "factor_2"], ["", ""]),
-        (phi("return [action] * 2"), ["factor_1", "factor_2"], ["", ""]),
-        (
-            phi(
-                "# Factor 1: energy,\n    # squared\n    energy = action**2\n\n    rest = -energy\n    return (rest, energy)"
-            ),
-            ["rest", "energy"],
-            ["", "energy, squared"],
-        ),
-    ],
-)
-def test_names_and_meanings_are_read_off_the_source(chase, source, names, meanings):
-    function = verified(source, chase)
-    assert function.names == names
-    assert function.meanings == meanings
+def test_names_and_meanings_are_read_off_the_source(function):
+    assert function.names == ["f_near", "f_effort"]
+    assert function.meanings == ["how near the action comes", "effort"]
+    other = replace(
+        function, source=phi("# Factor 1: energy,\n# squared\nenergy = action**2\nreturn [-energy, energy]")
+    )
+    assert other.names == ["factor_1", "energy"]
+    assert other.meanings == ["", "energy, squared"]
+
+
+# --- its workers -----------------------------------------------------------------------------------------------------
+
+
+def test_a_worker_is_started_when_it_is_needed_and_once(function):
+    assert function.evaluators == {}
+    function(*batch(2))
+    worker = function.evaluator(2, 1)
+    function(*batch(3))
+    assert function.evaluators == {(2, 1): worker}
+    function.close()
+    assert worker.program.process.returncode is not None
+    # It starts again when it is needed.
+    np.testing.assert_array_equal(function(*batch(2)), [[-1, -1]] * 2)
+    function.close()
+
+
+def test_the_workers_end_with_the_function(sound):
+    function = replace(sound)
+    process = function.evaluator(2, 1).program.process
+    assert process.poll() is None
+    del function
+    gc.collect()
+    assert process.returncode is not None
+
+
+def test_a_function_goes_to_another_process_without_its_workers(function):
+    function(*batch(2))
+    other = pickle.loads(pickle.dumps(function))
+    assert other == function
+    assert other.evaluators == {}
+    function.close()
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
 
 
 def test_the_digest_is_the_sources(function):
@@ -128,7 +155,8 @@ def test_saved_and_loaded_it_is_the_same(function, chase, tmp_path, ending):
     function.save(tmp_path / "phi.py")
     loaded = load((tmp_path / "phi").with_suffix(ending), chase)
     assert loaded == function
-    np.testing.assert_array_equal(loaded(*batch(3)), function(*batch(3)))
+    np.testing.assert_array_equal(loaded(*batch(3)), [[-1, -1]] * 3)
+    loaded.close()
 
 
 def test_the_file_is_python_with_its_provenance_on_top(function, tmp_path):
@@ -138,13 +166,14 @@ def test_the_file_is_python_with_its_provenance_on_top(function, tmp_path):
         "# lare: kind: factors\n"
         "# lare: model: Somebody, draw 0\n"
         f"# lare: sha256: {function.digest}\n"
-        "# lare: passed: runs, form, finite, deterministic, rows alone\n"
+        "# lare: passed: gate, runs, form, control flow, loops, finite, deterministic, rows apart, batch sizes, cost, "
+        "empty batch\n"
         f"{SOURCE}\n"
     )
     assert json.loads((tmp_path / "phi.json").read_text())["exchanges"] == list(function.exchanges)
 
 
-def test_headers_do_not_pile_up(function, chase, tmp_path):
+def test_headers_do_not_pile_up(function, chase, tmp_path, trusting):
     function.save(tmp_path / "phi.py")
     once = (tmp_path / "phi.py").read_text()
     load(tmp_path / "phi.py", chase).save(tmp_path / "phi.py")
@@ -152,21 +181,32 @@ def test_headers_do_not_pile_up(function, chase, tmp_path):
     assert once.count(HEADER) == 5
 
 
-def test_a_function_of_ones_own_needs_no_record(chase, tmp_path):
+def test_a_function_of_ones_own_needs_no_record(chase, sound, tmp_path, trusting):
     (tmp_path / "mine.py").write_text(PHI)
-    assert load(tmp_path / "mine.py", chase) == verified(SOURCE, chase)
+    assert load(tmp_path / "mine.py", chase) == sound
+
+
+def test_a_source_is_read_without_a_look_into_it(function, tmp_path):
+    function.save(tmp_path / "phi.py")
+    assert read_source(tmp_path / "phi.py") == read_source(tmp_path / "phi.json") == SOURCE
+    (tmp_path / "mine.py").write_text("\n\nno Python\n")
+    assert read_source(tmp_path / "mine.py") == "no Python"
+    with pytest.raises(LareError, match="there is no function file"):
+        read_source(tmp_path / "none.py")
 
 
 def test_loading_verifies_again(function, chase, tmp_path):
     path = tmp_path / "phi.py"
     function.save(path)
     path.write_text(path.read_text().replace("[f_near, f_effort]", "[f_near, effort]"))
-    with pytest.raises(LareError, match=r"name 'effort' is not defined") as error:
+    with pytest.raises(LareError) as error:
         load(path, chase)
-    assert str(error.value).startswith(f"{path}: the function does not fit task 'Chase': runs: NameError: ")
+    assert str(error.value) == (
+        f"{path}: the function does not fit task 'Chase': E-NAME line 8: effort is not defined; did you mean f_effort?"
+    )
 
 
-def test_a_change_by_hand_is_noted(function, chase, tmp_path):
+def test_a_change_by_hand_is_noted(function, chase, tmp_path, trusting):
     path = tmp_path / "phi.py"
     function.save(path)
     path.write_text(path.read_text().replace("# 2. effort", "# 2. exertion"))
@@ -204,7 +244,7 @@ def test_a_file_that_is_no_text_is_refused(chase, tmp_path):
         ('{"source": "", "model": "m", "exchanges": 3}', "TypeError(\"'int' object is not iterable\")"),
     ],
 )
-def test_a_broken_record_is_refused(function, chase, tmp_path, record, problem):
+def test_a_broken_record_is_refused(function, chase, tmp_path, trusting, record, problem):
     function.save(tmp_path / "phi.py")
     (tmp_path / "phi.json").write_text(record)
     with pytest.raises(LareError) as error:
@@ -215,7 +255,7 @@ def test_a_broken_record_is_refused(function, chase, tmp_path, record, problem):
 @pytest.mark.parametrize(
     "source", [PHI, "\n" + PHI, PHI.replace("\n", "\r\n"), PHI.replace("effort\n", "effort\x0c\n")]
 )
-def test_saved_and_loaded_it_is_the_same_whatever_its_line_ends(chase, tmp_path, source):
+def test_saved_and_loaded_it_is_the_same_whatever_its_line_ends(chase, tmp_path, trusting, source):
     function = verified(source, chase)
     function.save(tmp_path / "phi.py")
     assert load(tmp_path / "phi.py", chase).digest == function.digest
@@ -227,19 +267,11 @@ def test_a_reward_stays_a_reward(chase, tmp_path):
     assert load(tmp_path / "phi.py", chase) == function
 
 
-def test_a_function_that_writes_into_its_input_spoils_nothing(chase):
-    function = verified(phi("observation[:] = 0; action *= 0; return [action]"), chase)
-    observation, action = np.ones((3, 2), np.float32), np.ones((3, 1), np.float32)
-    function(observation, action)
-    assert observation.all()
-    assert action.all()
-
-
 def test_null(chase):
-    with pytest.raises(LareError, match="null bytes"):
+    with pytest.raises(LareError, match=r"E-SYNTAX line 1: [^\n]*null bytes"):
         verified(phi("return [action]") + "\0", chase)
 
 
-def test_save_nowhere(chase, tmp_path):
+def test_save_nowhere(sound, tmp_path):
     with pytest.raises(LareError, match="cannot be written"):
-        verified(PHI, chase).save(tmp_path / "none" / "phi.py")
+        sound.save(tmp_path / "none" / "phi.py")

@@ -2,8 +2,8 @@
 
 import pytest
 
-from lare.llm.client import SHIPPED, read_recording
 from lare.llm.prompts import candidate, combine, correct
+from lare.llm.recording import SHIPPED, read_recording
 from lare.tasks.spec import read_task
 
 RECORDINGS = sorted(f"{kind.name}/{entry.name}" for kind in SHIPPED.iterdir() for entry in kind.iterdir())

@@ -20,7 +20,9 @@ def test_a_reply_is_read():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "the reply is not one JSON object: Expecting value: line 1 column 1 (char 0)"),
+        ("", "the reply is empty"),
+        (" \n", "the reply is empty"),
+        ("x" * 200_001, "the reply has 200001 characters; at most 200000 are read"),
         ("Here it is.", "the reply is not one JSON object: Expecting value: line 1 column 1 (char 0)"),
         ("```json\n{}\n```", "the reply is not one JSON object: Expecting value: line 1 column 1 (char 0)"),
         ("{} {}", "the reply is not one JSON object: Extra data: line 1 column 4 (char 3)"),
@@ -52,6 +54,24 @@ def test_a_malformed_reply_says_what_is_wrong(text, message):
     with pytest.raises(MalformedReply) as error:
         parse(text)
     assert str(error.value) == message
+
+
+CODE = "def evaluation_func(observation, action):\n    return [action]"
+
+
+@pytest.mark.parametrize(
+    ("text", "understood"),
+    [
+        (f"```json\n{json.dumps(GOOD | {'Functions': CODE})}\n```", "u"),
+        (f"Sure! {{a: b}} Here it is:\n{json.dumps(GOOD | {'Functions': CODE})}\nI hope {{that}} helps.", "u"),
+        (json.dumps(GOOD | {"Functions": f"```python\n{CODE}\n```"}), "u"),
+        (f"The cart moves.\n```python\n{CODE}\n```\nThat is all.", "The cart moves.\n"),
+        (f"First:\n```sh\npip install numpy\n```\n```\n{CODE}\n```", "First:\n```sh\npip install numpy\n```\n"),
+    ],
+)
+def test_a_reply_is_found_among_other_words(text, understood):
+    reply = parse(text)
+    assert (reply.understand, reply.functions.strip()) == (understood, CODE)
 
 
 JSON = st.recursive(

@@ -15,11 +15,12 @@ import lare
 from lare.algorithms.td3 import TD3Settings
 from lare.credit.methods import TABLE, Encoder
 from lare.errors import LareError
+from lare.latent.function import verified
 from lare.training import checkpoint
 from lare.training.environments import EnvironmentFault
 from lare.training.run import open_run
 from lare.training.train import Interrupted
-from toys import toy_spec
+from toys import PHI, toy_spec
 
 METHODS = [method.name for method in TABLE]
 
@@ -63,6 +64,31 @@ def test_every_method_trains_and_reports(method, small, phi, tmp_path):
     assert lare.write_report([run.directory]).read_text().count("<svg") >= 1
 
 
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_worker_that_is_killed_or_starved_stops_the_run_and_harms_nothing(number, small, tmp_path, monkeypatch):
+    monkeypatch.setattr("lare.latent.jailed.TIME_LIMIT", 1.0)
+    whole = lare.train(toy_spec(), small(), function=verified(PHI, toy_spec()), out=tmp_path / "whole", listeners=[])
+    function = verified(PHI, toy_spec())
+    worker = function.evaluator(2, 1).program.process
+    stopper = At(132, lambda: os.kill(worker.pid, number))
+    with pytest.raises(LareError, match="the process that runs the latent function failed: ") as error:
+        lare.train(toy_spec(), small(), function=function, out=tmp_path / "run", listeners=[stopper])
+    assert stopper.messages[0].startswith("the latent function runs in a process of its own (")
+    assert str(error.value).endswith(
+        f"it was given the batch in {tmp_path / 'run' / 'failed_batch.npz'}; the last checkpoint is whole"
+    )
+    assert worker.poll() is not None
+    with np.load(tmp_path / "run" / "failed_batch.npz") as batch:
+        assert (batch["observation"].shape, batch["action"].shape) == ((24, 2), (24, 1))
+    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+
+
+def test_the_isolation_stands_in_the_config(small, phi, tmp_path):
+    run = lare.train(toy_spec(), small(steps=60), function=phi, out=tmp_path / "run", listeners=[])
+    assert run.config.isolation == phi.evaluator(2, 1).isolation
+    assert run.config.isolation.startswith("a process of its own (")
+
+
 @pytest.mark.parametrize("judges", ["before", "after", "both"])
 def test_judges(judges, small, phi, tmp_path):
     run = lare.train(toy_spec(), small(judges=judges, steps=60), function=phi, out=tmp_path / "run", listeners=[])
@@ -83,7 +109,7 @@ def test_a_killed_run_resumes_bit_for_bit(method, small, phi, tmp_path):
     (tmp_path / "settings.json").write_text(settings.model_dump_json())
     script = f"""
 import json, os, signal, sys
-from toys import toy_spec
+from toys import PHI, toy_spec
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 import lare
 from test_train import At

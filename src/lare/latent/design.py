@@ -1,16 +1,24 @@
 """Candidates, combine, verify, correct: lines 2 and 3 of Algorithm 1 of the LaRe paper."""
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+import contextlib
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
 
 from lare.errors import LareError
-from lare.latent.function import LatentFunction
-from lare.latent.namespace import normal
-from lare.latent.verify import verify
+from lare.latent.checks import Check, Failed, factors_of
+from lare.latent.evaluator import LatentRewardError
+from lare.latent.function import LatentFunction, normal
+from lare.latent.jailed import JailedProgram, WorkerFailed
+from lare.latent.reflect import episodes_of, gather
+from lare.latent.verify import Verdict, random_steps, verify
 from lare.llm import prompts
-from lare.llm.client import Model, RecordedModel, shipped_recordings
+from lare.llm.model import Model, recorded_model
 from lare.llm.prompts import Kind, Message, Stage
+from lare.llm.recording import Recorder
 from lare.llm.reply import MalformedReply, parse
 from lare.tasks.spec import TaskSpec
 
@@ -20,6 +28,143 @@ CANDIDATES = 5
 ATTEMPTS = 5
 """How often a function is verified, the first time included, before the loop gives up."""
 
+LONGEST_QUOTE = 20_000
+"""Characters of a failed reply that are shown to the model again."""
+
+
+class DesignFailed(LareError):
+    """No attempt passed. `recorder` holds all of them."""
+
+    def __init__(self, message: str, recorder: Recorder, model: str):
+        super().__init__(message)
+        self.recorder, self.model = recorder, model
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A reply, and what was found of it."""
+
+    reply: str
+    source: str
+    """Empty where the reply could not be read."""
+    verdict: Verdict
+    errors: str
+    """Everything that is wrong with it, for the model; empty where it passed."""
+
+
+def examine(reply: str, task: TaskSpec, kind: Kind) -> Attempt:
+    """Read and verify a reply."""
+    try:
+        source = normal(parse(reply).functions)
+    except MalformedReply as error:
+        return Attempt(reply, "", Verdict((), 0), str(error))
+    verdict = verify(source, task, kind)
+    return Attempt(reply, source, verdict, verdict.errors)
+
+
+def first_line(attempt: Attempt) -> str:
+    """What was found, in a line."""
+    lines = attempt.errors.splitlines() or ["passes"]
+    return lines[0] + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else "")
+
+
+@dataclass(frozen=True)
+class Conversation:
+    """A model, and what it is asked about a task. Every reply is taken down."""
+
+    task: TaskSpec
+    kind: Kind
+    model: Model
+    recorder: Recorder
+    said: Callable[[str], None]
+
+    def ask(self, stage: Stage, messages: Sequence[Message], sample: int = 0) -> str:
+        reply = self.model.reply(messages, sample)
+        self.recorder.take(stage, messages, reply, self.model.name)
+        return reply
+
+    def begin(self, candidates: int) -> tuple[list[Message], str]:
+        """Candidates, and their combination: the last request, and the reply to it.
+
+        A candidate that cannot be read or does not pass is left out of the combination, as long as another one passes.
+        """
+        request = prompts.candidate(self.task, self.kind)
+        replies = [self.ask("candidate", request, sample) for sample in range(candidates)]
+        if candidates == 1:
+            return request, replies[0]
+        with ThreadPoolExecutor() as pool:
+            tried = list(pool.map(lambda reply: examine(reply, self.task, self.kind), replies))
+        for number, attempt in enumerate(tried, start=1):
+            self.said(f"candidate {number}: {first_line(attempt)}")
+        sound = [attempt.reply for attempt in tried if not attempt.errors]
+        request = prompts.combine(self.task, sound or [quoted(reply) for reply in replies], self.kind)
+        return request, self.ask("combine", request)
+
+    def correct(self, request: list[Message], reply: str) -> Attempt:
+        """Verify a reply, and ask for a better one as long as it does not pass. Raises `DesignFailed`."""
+        attempt = examine(reply, self.task, self.kind)
+        for number in range(2, ATTEMPTS + 1):
+            self.said(f"attempt {number - 1}: {first_line(attempt)}")
+            if not attempt.errors:
+                return attempt
+            request = prompts.correct(request, quoted(attempt.reply), attempt.errors)
+            attempt = examine(self.ask("correct", request), self.task, self.kind)
+        self.said(f"attempt {ATTEMPTS}: {first_line(attempt)}")
+        if not attempt.errors:
+            return attempt
+        raise self.failed(f"none of {ATTEMPTS} attempts passed; the last one failed: {attempt.errors}")
+
+    def once(self, reply: str) -> Attempt:
+        """Take a reply as it is if it runs at all: the ablation without pre-verification. Raises `DesignFailed`."""
+        try:
+            source = normal(parse(reply).functions)
+            factors = run_once(source, self.task, self.kind)
+        except (MalformedReply, Failed, WorkerFailed) as error:
+            raise self.failed(f"the reply does not run: {error}") from error
+        return Attempt(reply, source, Verdict((Check("executed", True, ""),), factors.shape[1]), "")
+
+    def reflect(self, best: Attempt, rounds: int) -> Attempt:
+        """Show the model what its factors did on whole episodes; keep the function that predicts returns best."""
+        episodes = episodes_of(self.task)
+        evidence = gather(self.made(best), self.task, episodes)
+        self.said(f"reflection: before it, a linear decoder explains {evidence.fit:.3f} of unseen returns")
+        for number in range(1, rounds + 1):
+            request = prompts.reflect(self.task, best.reply, evidence.text, self.kind)
+            try:
+                attempt = self.correct(request, self.ask("reflect", request))
+                found = gather(self.made(attempt), self.task, episodes)
+            except (DesignFailed, LatentRewardError) as error:
+                self.said(f"reflection {number}: {error}")
+                continue
+            better = found.fit > evidence.fit
+            self.said(f"reflection {number}: {found.fit:.3f}, {'kept' if better else 'not better'}")
+            if better:
+                best, evidence = attempt, found
+        return best
+
+    def made(self, attempt: Attempt) -> LatentFunction:
+        """The artifact of an attempt."""
+        exchanges = tuple(exchange.model_dump() for exchange in self.recorder.exchanges)
+        verdict = attempt.verdict
+        return LatentFunction(
+            self.task.name, self.kind, attempt.source, verdict.size, verdict.checks, self.model.name, exchanges
+        )
+
+    def failed(self, why: str) -> DesignFailed:
+        return DesignFailed(f"task {self.task.name!r}: {why}", self.recorder, self.model.name)
+
+
+def quoted(reply: str) -> str:
+    """A reply as it is shown to the model again: not without end."""
+    return reply[:LONGEST_QUOTE]
+
+
+def run_once(source: str, task: TaskSpec, kind: Kind) -> np.ndarray:
+    """What a program gives on steps of its task, without the gate, in the jail. Raises where it does not run."""
+    observation, action = random_steps(task)
+    with contextlib.closing(JailedProgram(source, observation.shape[1], action.shape[1], gated=False)) as program:
+        return factors_of(program.failed or program.call(observation, action), len(observation), kind)
+
 
 def design(
     task: TaskSpec,
@@ -27,6 +172,10 @@ def design(
     model: Model | None = None,
     draw: int = 0,
     candidates: int = CANDIDATES,
+    reflect: int = 0,
+    pre_verification: bool = True,
+    record: Path | None = None,
+    said: Callable[[str], None] = lambda _: None,
 ) -> LatentFunction:
     """Ask a model for `phi` until there is one that passes every check.
 
@@ -38,44 +187,22 @@ def design(
     Args:
         model: whom to ask; without one, the shipped recordings.
         draw: which of the shipped recordings answers (0 to 4). Nothing to do with a training seed.
-        candidates: n; with 1, the single candidate is the function and nothing is combined.
+        candidates: n; with 1 (the paper's ablation without self-prompting), the single candidate is the function and
+            nothing is combined.
+        reflect: rounds of reflection on whole episodes, after a function has passed. Not in the paper.
+        pre_verification: without it (the paper's ablation), the first function is kept if it runs at all, in its jail.
+        record: a file that takes every exchange, from the first reply on.
+        said: is told how it goes.
 
     Raises:
-        LareError: the model cannot answer, or no attempt passed.
+        DesignFailed: no attempt passed.
+        LareError: the model cannot answer.
     """
     if candidates < 1:
         raise LareError(f"candidates = {candidates}: at least one is needed")
-    model = model or RecordedModel(shipped_recordings(kind, draw), task.name)
-    exchanges: list[dict[str, Any]] = []
-
-    def ask(stage: Stage, messages: Sequence[Message], times: int = 1) -> list[str]:
-        replies = [model.reply(messages, sample) for sample in range(times)]
-        exchanges.append({"stage": stage, "messages": list(messages), "replies": replies})
-        return replies
-
-    conversation = prompts.candidate(task, kind)
-    replies = ask("candidate", conversation, candidates)
-    if candidates > 1:
-        conversation = prompts.combine(task, replies, kind)
-        replies = ask("combine", conversation)
-    reply, errors = replies[0], ""
-    for attempt in range(ATTEMPTS):
-        function, errors = examine(reply, task, kind)
-        if function is not None:
-            return replace(function, model=model.name, exchanges=tuple(exchanges))
-        if attempt + 1 < ATTEMPTS:
-            conversation = prompts.correct(conversation, reply, errors)
-            reply = ask("correct", conversation)[0]
-    raise LareError(f"task {task.name!r}: none of {ATTEMPTS} attempts passed; the last one failed: {errors}")
-
-
-def examine(reply: str, task: TaskSpec, kind: Kind) -> tuple[LatentFunction | None, str]:
-    """The verified function of a reply, or what is wrong with it."""
-    try:
-        source = normal(parse(reply).functions)
-    except MalformedReply as error:
-        return None, str(error)
-    verdict = verify(source, task, kind)
-    if not verdict.passed:
-        return None, verdict.errors
-    return LatentFunction(task.name, kind, source, verdict.size, verdict.checks), ""
+    model = model or recorded_model(task.name, kind, draw)
+    recorder = Recorder(task.name, kind, getattr(model, "temperature", None), record)
+    conversation = Conversation(task, kind, model, recorder, said)
+    request, reply = conversation.begin(candidates)
+    attempt = conversation.correct(request, reply) if pre_verification else conversation.once(reply)
+    return conversation.made(conversation.reflect(attempt, reflect) if reflect else attempt)

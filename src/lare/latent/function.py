@@ -4,7 +4,6 @@ import functools
 import hashlib
 import itertools
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,18 +12,15 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
-from lare.latent.namespace import compile_function, factor_meanings, factor_names, normal
+from lare.latent.checks import Check
+from lare.latent.evaluator import Evaluator
+from lare.latent.names import factor_meanings, names_of
 from lare.latent.verify import verify
-from lare.latent.worker import Check
 from lare.llm.prompts import Kind
 from lare.tasks.spec import TaskSpec, read_text
 
 HEADER = "# lare: "
 """Marks the lines that `save` puts on top of the source."""
-
-
-class LatentRewardError(LareError):
-    """A verified function gave something that cannot be used, while a run was under way."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +48,7 @@ class LatentFunction:
     @property
     def names(self) -> list[str]:
         """A name for each factor."""
-        names = factor_names(self.source)
-        return names if names and len(names) == self.size else [f"factor_{i + 1}" for i in range(self.size)]
+        return names_of(self.source, self.size)
 
     @property
     def meanings(self) -> list[str]:
@@ -62,35 +57,40 @@ class LatentFunction:
         return [comments.get(name, "") for name in self.names]
 
     @functools.cached_property
-    def compiled(self) -> Callable[[np.ndarray, np.ndarray], list[np.ndarray]]:
-        return compile_function(self.source)
+    def evaluators(self) -> dict[tuple[int, int], Evaluator]:
+        """The workers that have been started, by the sizes of their arrays. They end with this object."""
+        return {}
+
+    def evaluator(self, observation_size: int, action_size: int) -> Evaluator:
+        """The worker that runs this function on arrays of such sizes, started when it is first asked for.
+
+        Raises:
+            NoWorker: no process is to be had.
+        """
+        sizes = observation_size, action_size
+        if sizes not in self.evaluators:
+            self.evaluators[sizes] = Evaluator(self.source, self.names, *sizes)
+        return self.evaluators[sizes]
 
     def __call__(
         self, observation: Float[np.ndarray, "batch observation"], action: Float[np.ndarray, "batch action"]
     ) -> Float[np.ndarray, "batch factors"]:
-        """The factors of a batch of steps.
+        """The factors of a batch of steps. They are computed in a process of their own, never in this one.
 
         Raises:
             LatentRewardError: the function failed, or gave the wrong shape or a number that is not finite.
         """
-        try:
-            with np.errstate(all="ignore"):
-                # Copies: a function that writes into its input must not change what is stored.
-                columns = self.compiled(observation.copy(), action.copy())
-                factors = np.concatenate(columns, axis=1).astype(np.float32)
-        except Exception as error:  # generated code may raise anything
-            raise LatentRewardError(f"the latent function failed: {type(error).__name__}: {error}") from error
-        if factors.shape != (len(observation), self.size):
-            raise LatentRewardError(
-                f"the latent function gave factors of shape {factors.shape}, not ({len(observation)}, {self.size})"
-            )
-        if not np.isfinite(factors).all():
-            row, column = np.argwhere(~np.isfinite(factors))[0]
-            raise LatentRewardError(
-                f"factor {self.names[column]!r} is {factors[row, column]} for the observation "
-                f"{np.array2string(observation[row], precision=3, threshold=6)}"
-            )
-        return factors
+        return self.evaluator(observation.shape[1], action.shape[1])(observation, action)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What goes to another process: everything but the workers, which start there anew."""
+        return {name: value for name, value in self.__dict__.items() if name != "evaluators"}
+
+    def close(self) -> None:
+        """End the workers. They start again when they are needed."""
+        for evaluator in self.evaluators.values():
+            evaluator.close()
+        self.evaluators.clear()
 
     def save(self, path: str | Path) -> None:
         """Write `path` (Python, to be read) and beside it a .json with replies and checks.
@@ -116,6 +116,11 @@ class LatentFunction:
             raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
 
+def normal(source: str) -> str:
+    """The source as it is kept: line ends of one kind, no blank lines around it, and no header but that of `save`."""
+    return split_header("\n".join(source.splitlines()).strip("\n"))[1].strip("\n")
+
+
 def verified(source: str, task: TaskSpec, kind: Kind = "factors") -> LatentFunction:
     """A function from source. Raises `LareError` with every error where it does not pass."""
     source = normal(source)
@@ -125,19 +130,35 @@ def verified(source: str, task: TaskSpec, kind: Kind = "factors") -> LatentFunct
     return LatentFunction(task.name, kind, source, verdict.size, verdict.checks)
 
 
+def source_file(path: str | Path) -> Path:
+    """The Python file of a function that was saved. Raises `LareError` where there is none."""
+    path = Path(path)
+    source_path = path.with_suffix(".py") if path.suffix == ".json" else path
+    if not source_path.is_file():
+        raise LareError(f"there is no function file {source_path}")
+    return source_path
+
+
+def split_header(text: str) -> tuple[list[str], str]:
+    """The lines that `save` has put on top, and the source."""
+    lines = text.splitlines()
+    header = list(itertools.takewhile(lambda line: line.startswith(HEADER), lines))
+    return header, "\n".join(lines[len(header) :])
+
+
+def read_source(path: str | Path) -> str:
+    """The source of a function file, not yet looked into. Raises `LareError` where it cannot be read."""
+    return normal(split_header(read_text(source_file(path)))[1])
+
+
 def load(path: str | Path, task: TaskSpec) -> LatentFunction:
     """Read a function that `save` or a person wrote, and verify it again, whoever wrote it.
 
     Raises:
         LareError: it cannot be read, or does not pass for this task.
     """
-    path = Path(path)
-    source_path = path.with_suffix(".py") if path.suffix == ".json" else path
-    if not source_path.is_file():
-        raise LareError(f"there is no function file {source_path}")
-    lines = read_text(source_path).splitlines()
-    header = list(itertools.takewhile(lambda line: line.startswith(HEADER), lines))
-    source = "\n".join(lines[len(header) :])
+    source_path = source_file(path)
+    header, source = split_header(read_text(source_path))
     kind: Kind = "reward" if f"{HEADER}kind: reward" in header else "factors"
     try:
         function = verified(source, task, kind)

@@ -1,25 +1,19 @@
-"""What a function must do before anything here executes it: run apart, on steps of the task, within a time limit.
+"""Whether a source is a latent function of a task: the gate, and the checks, with the program in its jail throughout."""
 
-This is where the static gate and the jail will stand: whatever wants a verdict calls `verify`, and nothing else in the
-package executes a source that has none.
-"""
-
-import io
-import json
-import subprocess
-import sys
+import contextlib
+import functools
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from lare.latent.worker import Check
+from lare.latent.checks import Check, Failed, Trial, advice, examine, failed
+from lare.latent.jailed import JailedProgram, WorkerFailed
+from lare.latent.names import names_of
 from lare.llm.prompts import Kind
 from lare.tasks.environment import make
 from lare.tasks.spec import TaskSpec
-
-TIME_LIMIT = 30.0
-"""Seconds for the whole of it, the start of the process included."""
 
 STEPS = 256
 """Random steps that a function is tried on."""
@@ -27,11 +21,15 @@ STEPS = 256
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the checks found. Passed when there is a check and every one of them passed."""
+    """What was found. Passed when there is a check and every one of them passed."""
 
     checks: tuple[Check, ...]
     size: int
     """Number of factors."""
+    advice: tuple[str, ...] = ()
+    """Not wrong, but worth a thought."""
+    isolation: str = ""
+    """What stood around the program while it was tried."""
 
     @property
     def passed(self) -> bool:
@@ -39,38 +37,54 @@ class Verdict:
 
     @property
     def errors(self) -> str:
-        return "\n".join(f"{check.name}: {check.message}" for check in self.checks if not check.passed)
+        return "\n".join(check.message for check in self.checks if not check.passed)
 
 
 def verify(source: str, task: TaskSpec, kind: Kind = "factors") -> Verdict:
-    """Run the checks of `worker.py` on `source`, in a process without this one's environment."""
+    """Try a source, in a process without this one's environment, files and rights.
+
+    Raises:
+        LareError: the task's environment cannot be made, or there is no process to be had.
+    """
     observation, action = random_steps(task)
-    archive = io.BytesIO()
-    np.savez(
-        archive,
-        source=np.frombuffer(source.encode(), np.uint8),
-        kind=np.array(kind),
-        observation=observation,
-        action=action,
-    )
-    command = [sys.executable, "-I", "-m", "lare.latent.worker"]
+    sizes = observation.shape[1], action.shape[1]
     try:
-        worker = subprocess.run(command, input=archive.getvalue(), capture_output=True, timeout=TIME_LIMIT, env={})
-    except subprocess.TimeoutExpired:
-        return Verdict((Check("time", False, f"the function did not finish within {TIME_LIMIT:.0f} s"),), 0)
-    try:
-        report = json.loads(worker.stdout)
-        return Verdict(tuple(Check(**check) for check in report["checks"]), report["size"])
-    except (ValueError, TypeError, KeyError):
-        last = worker.stderr.decode(errors="replace").strip().splitlines()[-1:] or [f"exit status {worker.returncode}"]
-        return Verdict((Check("runs", False, f"the process that ran the function broke off: {last[0]}"),), 0)
+        with contextlib.ExitStack() as stack:
+            # The second one only has to answer once; both start at the same time.
+            program = stack.enter_context(contextlib.closing(JailedProgram(source, *sizes)))
+            if program.problems:
+                return Verdict((Check("gate", False, "\n".join(map(str, program.problems))),), 0)
+            passed = Check("gate", True, "")
+            if program.failed is not None:
+                said = failed("E-RUN", program.failed.error or "", program.failed.line)
+                return Verdict((passed, Check("runs", False, str(said))), 0, isolation=program.isolation)
+            again = stack.enter_context(contextlib.closing(JailedProgram(source, *sizes)))
+            # Numbers that always come out the same for a source, and that its author cannot know.
+            random = np.random.default_rng(list(hashlib.sha256(source.encode(errors="replace")).digest()))
+            trial = Trial(program, again, observation, action, kind, random=random)
+            checks = (passed, *examine(trial))
+            if not all(check.passed for check in checks):
+                return Verdict(checks, 0, isolation=program.isolation)
+            factors = trial.known
+            size = factors.shape[1]
+            return Verdict(checks, size, tuple(advice(factors, names_of(source, size))), program.isolation)
+    except (WorkerFailed, Failed) as error:
+        return Verdict((Check("runs", False, f"E-RUN: {error}"),), 0)
 
 
 def random_steps(
     task: TaskSpec, steps: int = STEPS, seed: int = 0
 ) -> tuple[Float[np.ndarray, "steps observation"], Float[np.ndarray, "steps action"]]:
     """Steps of the task under uniformly random actions (the paper's pre-collected random state-action pairs)."""
-    environment = make(task.environment, task.max_episode_steps)
+    return steps_in(task.environment, task.max_episode_steps, steps, seed)
+
+
+@functools.lru_cache(maxsize=8)
+def steps_in(
+    name: str, max_episode_steps: int | None, steps: int, seed: int
+) -> tuple[Float[np.ndarray, "steps observation"], Float[np.ndarray, "steps action"]]:
+    """The same by the environment. Read-only: they are given to everybody who asks."""
+    environment = make(name, max_episode_steps)
     environment.action_space.seed(seed)
     observations, actions = [], []
     observation, _ = environment.reset(seed=seed)
@@ -82,4 +96,7 @@ def random_steps(
         if terminated or truncated:
             observation, _ = environment.reset()
     environment.close()
-    return np.asarray(observations, np.float32), np.asarray(actions, np.float32)
+    recorded = np.asarray(observations, np.float32), np.asarray(actions, np.float32)
+    for array in recorded:
+        array.setflags(write=False)
+    return recorded

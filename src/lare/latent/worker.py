@@ -1,152 +1,186 @@
-"""Runs a function that nobody has checked yet, in a process of its own: `python -I -m lare.latent.worker`.
+"""The process in which generated code runs, from its first check to the end of training: it goes to jail, then obeys.
 
-Reads an npz archive (source, kind, observation, action) from standard input and writes one JSON object: the checks in
-their order, and the number of factors. The first check that fails ends it; its message is written for the person and
-for the model alike.
+Requests come on standard input and answers go to standard output, one JSON object a line; arrays travel through two
+pieces of shared memory. `jailed` is the other end. Nothing in here judges what a program returns: whoever is in jail
+is no witness. It says what came back, and the parent checks the numbers.
 """
 
-import io
+import builtins
+import gc
 import json
+import mmap
+import os
+import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+import tracemalloc
+import unicodedata  # noqa: F401 - Python's parser wants it for names that are not ASCII
+import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from lare.latent.namespace import NAME, compile_function
+from lare.latent import gate, jail
+from lare.latent.language import NAME
+from lare.latent.oblivious import careful_functions, hidden
+from lare.latent.program import FILE, Program
 
 MOST_FACTORS = 32
-
-
-@dataclass(frozen=True)
-class Check:
-    """What one check found."""
-
-    name: str
-    passed: bool
-    message: str
-
-
-class Failed(Exception):
-    """A check's verdict; the message says what was expected and what came."""
-
+MOST_PROBLEMS = 30
 
 Function = Callable[[np.ndarray, np.ndarray], Any]
 
 
-def described(value: object) -> str:
-    if isinstance(value, np.ndarray):
-        return f"an array of shape {value.shape} and type {value.dtype}"
-    return f"a {type(value).__name__}"
+def main(argument: str) -> None:
+    """Serve until standard input closes. `argument`: the file descriptors of the memory, and what is to be watched."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # whoever asks a run to stop means the parent, which needs this to save
+    warnings.simplefilter("ignore")
+    given = json.loads(argument)
+    memory = mmap.mmap(given["input"], 0, prot=mmap.PROT_READ), mmap.mmap(given["output"], 0)
+    os.close(given["input"])
+    os.close(given["output"])
+    functions = careful_functions()
+    warm(functions)
+    events: list[str] = []
+    layers = jail.enter(kill=given["kill"])
+    send({"layers": layers})
+    start = receive()
+    source = memory[0][: start["source"]].decode()
+    problems = gate.inspect(source) if start["gate"] else []
+    try:
+        programs = {} if problems else load(source, functions, gated=start["gate"])
+        send({"problems": problems[:MOST_PROBLEMS]})
+    except BaseException as error:  # a program that is not gated does what it likes here
+        send({"problems": []} | failure(error))
+        return
+    sizes = start["observation"], start["action"], start["rows"]
+    if given["audit"]:
+        sys.addaudithook(lambda event, _: events.append(event))
+    while True:
+        request = receive()
+        events.clear()
+        # Whoever has lost its parent in the middle of a long call ends all the same: the signal is not handled.
+        signal.setitimer(signal.ITIMER_REAL, request["seconds"])
+        answer = serve(programs, request, memory, sizes)
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        send(answer | {"events": events[:10]} if given["audit"] else answer)
 
 
-def call(function: Function, observation: np.ndarray, action: np.ndarray) -> Any:
-    # Copies, so that a function that writes into its input spoils nobody else's.
-    return function(observation.copy(), action.copy())
+def load(source: str, functions: Any, gated: bool) -> dict[str, Function]:
+    """The program, as it is called in each mode."""
+    if gated:
+        program, watched = Program(source), Program(source, functions)
+        return {"plain": program, "strict": program, "traced": program, "oblivious": watched}
+    names: dict[str, Any] = {"__builtins__": builtins, "np": np}
+    exec(compile(source, FILE, "exec", dont_inherit=True), names)
+    return dict.fromkeys(("plain", "strict", "traced"), names[NAME])
 
 
-def check_form(factors: Any, rows: int, kind: str) -> np.ndarray:
-    """A list of real arrays (B, 1); returns them side by side."""
-    if not isinstance(factors, list | tuple):
-        raise Failed(f"{NAME} must return a list of arrays, but returned {described(factors)}")
-    if not 1 <= len(factors) <= MOST_FACTORS:
-        raise Failed(f"{NAME} must return 1 to {MOST_FACTORS} factors, but returned {len(factors)}")
-    if kind == "reward" and len(factors) != 1:
-        raise Failed(f"{NAME} must return exactly one reward array, but returned {len(factors)}")
-    for number, factor in enumerate(factors, start=1):
-        if not isinstance(factor, np.ndarray) or factor.shape != (rows, 1):
-            raise Failed(
-                f"factor {number} must be an array of shape (batch_size, 1) = ({rows}, 1), but is {described(factor)}"
-            )
-        if factor.dtype.kind not in "fiub":
-            raise Failed(f"factor {number} must hold real numbers, but is {described(factor)}")
-    return np.concatenate(factors, axis=1).astype(np.float64)
-
-
-def check_finite(factors: np.ndarray) -> None:
-    for number, column in enumerate(factors.T, start=1):
-        bad = ~np.isfinite(column.astype(np.float32))
-        if bad.any():
-            raise Failed(
-                f"factor {number} is {column[bad][0]}, which is no finite float32, for {bad.sum()} of {len(column)} "
-                "recorded steps"
-            )
-
-
-def check_rows_alone(
-    function: Function, observation: np.ndarray, action: np.ndarray, whole: np.ndarray, kind: str
-) -> None:
-    for row in range(0, len(observation), max(1, len(observation) // 8)):
-        alone = call(function, observation[row : row + 1], action[row : row + 1])
-        alone = check_form(alone, 1, kind)
-        if alone.shape[1] != whole.shape[1]:
-            raise Failed(f"{whole.shape[1]} factors for {len(whole)} rows, but {alone.shape[1]} for one row")
-        if not np.allclose(alone[0], whole[row], rtol=1e-4, atol=1e-6 + 1e-5 * np.abs(whole).max()):
-            raise Failed(f"row {row} has other factors when it is judged alone: a row must not depend on other rows")
-
-
-def checks(
-    source: str, kind: str, observation: np.ndarray, action: np.ndarray
-) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """The checks by name, in order; each builds on what those before it found."""
-    found: dict[str, Any] = {}
-
-    def runs() -> None:
-        found["function"] = compile_function(source)
-        found["returned"] = call(found["function"], observation, action)
-
-    def form() -> int:
-        found["factors"] = check_form(found["returned"], len(observation), kind)
-        return found["factors"].shape[1]
-
-    def same_again() -> None:
-        again = check_form(call(found["function"], observation, action), len(observation), kind)
-        if not np.array_equal(again, found["factors"]):
-            raise Failed("the same steps have other factors at a second call: a factor must not depend on chance")
-
-    yield "runs", runs
-    yield "form", form
-    yield "finite", lambda: check_finite(found["factors"])
-    yield "deterministic", same_again
-    yield "rows alone", lambda: check_rows_alone(found["function"], observation, action, found["factors"], kind)
-
-
-def where(error: BaseException) -> str:
-    """The line of the generated code that an exception came from."""
-    if isinstance(error, SyntaxError):
-        return f" (line {error.lineno})"
-    lines = [
-        frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == "latent_function.py"
-    ]
-    return f" (line {lines[-1]})" if lines else ""
-
-
-def verdicts(source: str, kind: str, observation: np.ndarray, action: np.ndarray) -> tuple[list[Check], int]:
-    done: list[Check] = []
-    size = 0
-    for name, check in checks(source, kind, observation, action):
-        try:
-            size = check() or size
-        except Failed as failure:
-            return [*done, Check(name, False, str(failure))], 0
-        except Exception as error:  # generated code may raise anything
-            said = error.msg if isinstance(error, SyntaxError) else error
-            return [*done, Check(name, False, f"{type(error).__name__}: {said}{where(error)}")], 0
-        done.append(Check(name, True, ""))
-    return done, size
-
-
-def main() -> None:
-    with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as given:
-        values = {name: given[name] for name in given.files}
-    np.seterr(all="ignore")
-    found, size = verdicts(
-        values["source"].tobytes().decode(), str(values["kind"]), values["observation"], values["action"]
+def warm(functions: Any) -> None:
+    """Let NumPy load now what it loads when it is first used; later there is no file system any more."""
+    x = np.linspace(-1.0, 1.0, 24, dtype=np.float32).reshape(8, 3)
+    for axis in (None, 0, 1):
+        for name in ("sum", "mean", "std", "var", "max", "min", "any", "all", "prod", "argmax", "cumsum"):
+            getattr(x, name)(axis=axis)
+    source = (
+        f"def {NAME}(x, a):\n"
+        "    y = np.linalg.norm(x @ x.T, axis=1, keepdims=True) + np.einsum('ij,ij->i', x, x)[:, None]\n"
+        "    np.median(x, axis=1); np.percentile(x, 50, axis=1); np.pad(x, 1); np.nan_to_num(x); np.linalg.det(x[:3])\n"
+        "    np.cross(x, x); np.tensordot(x, x.T, 1); np.select([x > 0], [x]); np.interp(x[:, 0], [0, 1], [0, 1])\n"
+        "    return [y, np.where(x[:, :1] > 0, y, -y)]"
     )
-    json.dump({"checks": [asdict(check) for check in found], "size": size}, sys.stdout)
+    with np.errstate(all="ignore"):
+        np.concatenate(Program(source)(x, x), axis=1)
+        Program(source, functions)(hidden(x), hidden(x))
+    tracemalloc.start()
+    tracemalloc.stop()
+    gc.collect()
 
 
-if __name__ == "__main__":
-    main()
+def serve(
+    programs: dict[str, Function],
+    request: dict[str, Any],
+    memory: tuple[mmap.mmap, mmap.mmap],
+    sizes: tuple[int, int, int],
+) -> dict[str, Any]:
+    """One call of the program. What it returned goes into the memory where it is what it should be, and is described."""
+    mode, rows = request["mode"], request["rows"]
+    function = programs[mode]
+    inputs = arrays(memory[0], rows, sizes, request["type"])
+    if mode == "oblivious":
+        inputs = hidden(inputs)
+    if mode == "traced":
+        tracemalloc.start()
+    try:
+        with np.errstate(all="raise" if mode == "strict" else "ignore", under="ignore"):
+            values = function(*inputs)
+            answer = {"values": describe(values)}
+            if fits(values, rows):
+                out = np.frombuffer(memory[1], np.float64, rows * len(values))
+                np.concatenate(values, axis=1, out=out.reshape(rows, len(values)), casting="unsafe")
+    except BaseException as error:  # the same
+        answer = failure(error)
+    peak = tracemalloc.get_traced_memory()[1] if mode == "traced" else 0
+    tracemalloc.stop()
+    return answer | {"steps": getattr(function, "steps", 0), "peak": peak}
+
+
+def arrays(memory: mmap.mmap, rows: int, sizes: tuple[int, int, int], kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """The batch in the memory: arrays that nobody can write into, since the memory is mapped so."""
+    observation, action, most = sizes
+    return (
+        np.frombuffer(memory, kind, rows * observation).reshape(rows, observation),
+        np.frombuffer(memory, kind, rows * action, offset=8 * most * observation).reshape(rows, action),
+    )
+
+
+def describe(values: Any) -> Any:
+    """What the parent is told of something that a program returned: [kind], or [kind, shape, type] of an array."""
+    if isinstance(values, list | tuple):
+        return [one(value) for value in values[: MOST_FACTORS + 1]]
+    return {"returned": one(values)}
+
+
+def one(value: Any) -> list[Any]:
+    if isinstance(value, np.ndarray):
+        return ["array", list(value.shape), str(value.dtype)[:20]]
+    return [type(value).__name__[:40]]
+
+
+def fits(values: Any, rows: int) -> bool:
+    return (
+        isinstance(values, list | tuple)
+        and 1 <= len(values) <= MOST_FACTORS
+        and all(isinstance(one, np.ndarray) and one.shape == (rows, 1) and one.dtype.kind in "fiub" for one in values)
+    )
+
+
+def failure(error: BaseException) -> dict[str, Any]:
+    """An exception, in a line, with the line of the program that it came from."""
+    try:
+        if isinstance(error, SyntaxError):
+            return {"error": f"SyntaxError: {error.msg}"[:500], "line": error.lineno}
+        lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == FILE]
+        said = " ".join(str(error).split())
+        return {"error": f"{type(error).__name__}: {said}"[:500], "line": lines[-1] if lines else None}
+    except BaseException:  # an exception class of the program's own may fail when it is shown
+        return {"error": "an exception that cannot be shown", "line": None}
+
+
+def send(answer: dict[str, Any]) -> None:
+    line = json.dumps(answer).encode() + b"\n"
+    while line:
+        line = line[os.write(1, line) :]
+
+
+def receive() -> dict[str, Any]:
+    """The next request. Standard input closes when the parent ends, however it ends, and then so does this."""
+    line = b""
+    while not line.endswith(b"\n"):
+        more = os.read(0, 4096)
+        if not more:
+            os._exit(0)
+        line += more
+    return json.loads(line)

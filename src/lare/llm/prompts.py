@@ -13,7 +13,7 @@ from lare.tasks.spec import TaskSpec
 Kind = Literal["factors", "reward"]
 """What is asked for: several factors (LaRe), or one reward (LLM reward design)."""
 
-Stage = Literal["candidate", "combine", "correct"]
+Stage = Literal["candidate", "combine", "correct", "reflect"]
 
 Message = dict[str, str]
 """`role` ("system", "user" or "assistant") and `content`."""
@@ -46,4 +46,13 @@ def correct(conversation: Sequence[Message], reply: str, errors: str) -> list[Me
         *conversation,
         {"role": "assistant", "content": reply.strip()},
         {"role": "user", "content": template("correct").replace("{error}", errors.strip())},
+    ]
+
+
+def reflect(task: TaskSpec, reply: str, evidence: str, kind: Kind = "factors") -> list[Message]:
+    """The request that shows what a function's factors did on whole episodes. Not in the paper."""
+    return [
+        *candidate(task, kind),
+        {"role": "assistant", "content": reply.strip()},
+        {"role": "user", "content": template("reflect").replace("{evidence}", evidence)},
     ]

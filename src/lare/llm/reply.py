@@ -1,10 +1,18 @@
 """What a reply must look like, and reading it."""
 
 import json
+import re
+from typing import Any
 
 from pydantic import ConfigDict, Field
 
 from lare.errors import Checked, LareError
+
+LONGEST = 200_000
+"""Characters of a reply."""
+
+MOST_STARTS = 100
+"""Places where an object may begin, in a text that is not one."""
 
 
 class MalformedReply(LareError):
@@ -22,15 +30,48 @@ class Reply(Checked):
     """Source of `evaluation_func(observation, action)`."""
 
 
+FENCE = re.compile(r"```[ \t]*([A-Za-z]*)[ \t]*\r?\n(.*?)```", re.DOTALL)
+"""A fenced block, with its language."""
+
+
 def parse(text: str) -> Reply:
-    """Raises `MalformedReply`, with what was wrong."""
+    """Read a reply: one JSON object, bare, in a fence, or among other words; or else a fenced function.
+
+    Raises:
+        MalformedReply: with what was wrong.
+    """
+    if not text.strip():
+        raise MalformedReply("the reply is empty")
+    if len(text) > LONGEST:
+        raise MalformedReply(f"the reply has {len(text)} characters; at most {LONGEST} are read")
     try:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise MalformedReply(f"the reply is not one JSON object: {error}") from error
+        values = embedded(text)
+        if values is None:
+            raise MalformedReply(f"the reply is not one JSON object: {error}") from error
     if not isinstance(values, dict):
         raise MalformedReply(f"the reply is JSON, but not an object: {text.strip()[:40]!r}")
     try:
-        return Reply(**values)
+        reply = Reply(**values)
     except LareError as error:
         raise MalformedReply(f"the reply's JSON object is not as asked for: {error}") from error
+    inner = FENCE.search(reply.functions)
+    return reply.model_copy(update={"functions": inner[2]}) if inner else reply
+
+
+def embedded(text: str) -> dict[str, Any] | None:
+    """The object that stands somewhere in a text, or the function that stands in a fence."""
+    decoder = json.JSONDecoder()
+    starts = [place for place, letter in enumerate(text) if letter == "{"][:MOST_STARTS]
+    for start in starts:
+        try:
+            value, _ = decoder.raw_decode(text, start)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(value, dict) and "Functions" in value:
+            return value
+    for fence in FENCE.finditer(text):
+        if "def " in fence[2]:
+            return {"Understand": text[: fence.start()], "Analyze": "", "Functions": fence[2]}
+    return None

@@ -8,19 +8,20 @@ import gymnasium
 
 from lare.errors import LareError
 from lare.tasks import mujoco
+from lare.tasks.spaces import as_rows
 
 mujoco.register()
 
 
 def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) -> gymnasium.Env:
-    """`gymnasium.make`, with every failure a `LareError`.
+    """`gymnasium.make`, with rows for observations and actions, and every failure a `LareError`.
 
     Versions are the user's choice (v4 and v5 scores are never mixed), so Gymnasium's advice to upgrade is left out.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
         try:
-            return gymnasium.make(environment, max_episode_steps=max_episode_steps, **kwargs)
+            return as_rows(gymnasium.make(environment, max_episode_steps=max_episode_steps, **kwargs))
         except Exception as error:  # an environment is foreign code: anything may come out of its constructor
             logging.getLogger(__name__).debug("making %s failed", environment, exc_info=True)
             reason = str(error).strip().splitlines() or [type(error).__name__]

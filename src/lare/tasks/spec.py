@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import gymnasium
 from gymnasium.spaces import Box
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
 from lare.errors import Checked, LareError
 from lare.tasks.environment import make
@@ -19,6 +19,9 @@ Judges = Literal["before", "after", "both"]
 the other with their factors put side by side."""
 
 SHIPPED = files("lare.tasks") / "specs"
+
+FILL_IN = "FILL IN"
+"""Stands in a new spec where nobody has said something yet."""
 
 
 class TaskSpec(Checked):
@@ -43,6 +46,13 @@ class TaskSpec(Checked):
     """Time limit, for an environment that has none of its own."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` that are averaged and reported beside the return."""
+
+    @model_validator(mode="after")
+    def is_filled_in(self) -> "TaskSpec":
+        for key in ("description", "observation", "action"):
+            if FILL_IN in getattr(self, key):
+                raise ValueError(f"{key} still says {FILL_IN!r}: say there what a language model must know")
+        return self
 
     @property
     def digest(self) -> str:

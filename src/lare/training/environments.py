@@ -13,6 +13,7 @@ from jaxtyping import Float
 from lare.errors import LareError
 from lare.tasks.environment import make
 from lare.tasks.episodic import TRUE_REWARD, EpisodicReward
+from lare.tasks.spaces import Choice
 from lare.tasks.spec import TaskSpec
 from lare.training.replay import Step
 
@@ -46,8 +47,10 @@ def make_episodic(task: TaskSpec, **kwargs: Any) -> EpisodicReward:
 
 
 def to_bounds(action: Float[np.ndarray, " action"], space: gymnasium.Space) -> Float[np.ndarray, " action"]:
-    """From [-1, 1] to the environment's own units."""
+    """From [-1, 1] to the environment's own units, or to the choice that the largest number makes."""
     assert isinstance(space, Box)
+    if isinstance(space, Choice):
+        return space.chosen(action)
     return np.asarray(space.low + (action + 1) / 2 * (space.high - space.low), np.float32)
 
 

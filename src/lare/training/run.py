@@ -4,6 +4,7 @@ config.json          every setting, the package version, the spec's and the func
 latent_function.py   the phi in use, and .json: replies, checks
 metrics.jsonl        one JSON object a line, for each seed and evaluation
 checkpoint/          see checkpoint.py
+failed_batch.npz     what the latent function was given, if it failed
 """
 
 import contextlib
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 import lare
 from lare.errors import Checked, LareError
@@ -26,6 +28,7 @@ from lare.training.checkpoint import STATE, write_atomically
 from lare.training.settings import Settings
 
 CONFIG, METRICS, FUNCTION, CHECKPOINT = "config.json", "metrics.jsonl", "latent_function.py", "checkpoint"
+FAILED_BATCH = "failed_batch.npz"
 
 VERSIONS = ("jax", "optax", "gymnasium", "mujoco", "numpy")
 """Packages that figures depend on."""
@@ -43,7 +46,7 @@ class Config(Checked):
     """The environment's time limit."""
     function_sha256: str | None
     isolation: str | None
-    """Where the latent function runs while training."""
+    """What stands around the latent function while training."""
     versions: dict[str, str]
     machine: str
 
@@ -60,10 +63,15 @@ def describe(task: TaskSpec, settings: Settings, function: LatentFunction | None
         task_sha256=task.digest,
         longest_episode=longest,
         function_sha256=function.digest if function else None,
-        isolation="in process, after verification in a process apart" if function else None,
+        isolation=isolation(task, function) if function else None,
         versions={name: version(name) for name in VERSIONS} | {"python": platform.python_version()},
         machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}",
     )
+
+
+def isolation(task: TaskSpec, function: LatentFunction) -> str:
+    """What stands around a task's latent function on this machine."""
+    return function.evaluator(task.observation_size, task.action_size).isolation
 
 
 @dataclass(frozen=True)
@@ -110,6 +118,12 @@ class Run:
             raise LareError(
                 f"{path} cannot be written: {error.strerror or error}; the last checkpoint is whole"
             ) from error
+
+    def keep_batch(self, observation: np.ndarray, action: np.ndarray) -> Path:
+        """Put the batch that a latent function failed with beside the run, to be looked at."""
+        path = self.directory / FAILED_BATCH
+        write_atomically(path, lambda file: np.savez(file, allow_pickle=False, observation=observation, action=action))
+        return path
 
     def truncate(self, length: int) -> None:
         """Take back the lines that were written after a checkpoint; they come again."""

@@ -1,8 +1,11 @@
 """A run under way: the training state, the environments around it, and one chunk of the work at a time."""
 
+import contextlib
+import ctypes
+import gc
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -14,6 +17,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from lare.credit.methods import find_method
 from lare.errors import LareError
+from lare.latent.evaluator import LatentRewardError
 from lare.tasks.episodic import EpisodicReward
 from lare.training import checkpoint, replay
 from lare.training.environments import (
@@ -83,7 +87,11 @@ class Session:
             return np.zeros((*action.shape[:2], 0), np.float32)
         before, after = np.asarray(collected.steps.observation), np.asarray(collected.steps.next_observation)
         judged = {"before": [before], "after": [after], "both": [before, after]}[self.run.judges]
-        rows = [self.run.function(flat(observation), flat(action)) for observation in judged]
+        try:
+            rows = [self.run.function(flat(observation), flat(action)) for observation in judged]
+        except LatentRewardError as error:
+            place = self.run.keep_batch(error.observation, error.action)
+            raise LareError(f"{error}; it was given the batch in {place}; the last checkpoint is whole") from error
         return np.concatenate(rows, axis=1).reshape(*action.shape[:2], -1)
 
     def report(self, rate: float) -> list[dict[str, Any]]:
@@ -187,19 +195,67 @@ def recipe_for(run: Run) -> Recipe:
 def load_learner(run: Run) -> tuple[Recipe, Learner, dict[str, Any], dict[str, np.ndarray]]:
     """The training state of a run's last checkpoint, and what stood with it."""
     recipe = recipe_for(run)
-    template = jax.eval_shape(partial(new_learner, run))
-    return recipe, *checkpoint.load(run.checkpoint, template)
+    return recipe, *checkpoint.load(run.checkpoint, learner_shape(run))
+
+
+def learner_shape(run: Run) -> Learner:
+    """A learner with the shapes of its arrays in their place."""
+    return jax.eval_shape(partial(new_learners, recipe=recipe_for(run)), seed_keys(jnp.asarray(run.seeds), 0))
 
 
 def new_learner(run: Run) -> Learner:
-    return jax.jit(jax.vmap(partial(init, recipe=recipe_for(run))))(seed_keys(jnp.asarray(run.seeds), 0))
+    """An untrained learner."""
+    keys = seed_keys(jnp.asarray(run.seeds), 0)
+    made = ahead(jax.jit(partial(new_learners, recipe=recipe_for(run))), keys)
+    give_memory_back()
+    return made(keys)
 
 
-def begin(run: Run, learner: Learner) -> Session:
-    """Environments and compiled functions around a learner."""
+def new_learners(keys: Key[Array, " seeds"], recipe: Recipe) -> Learner:
+    return jax.vmap(partial(init, recipe=recipe))(keys)
+
+
+def begin(run: Run, make_learner: Callable[[], Learner]) -> Session:
+    """Environments and compiled functions around a learner, which is made when they are there.
+
+    The compiler needs hundreds of megabytes for a while; what it gives back in time holds the replay.
+    """
     recipe, task = recipe_for(run), run.config.task
+    functions = compile_ahead(run, recipe)
+    give_memory_back()
+    learner = make_learner()
     lanes = [Lane(seed, make_episodic(task)) for seed in run.seeds]
     for lane in lanes:
         lane.begin()
     evaluation = [[make_episodic(task) for _ in range(run.config.settings.evaluation_episodes)] for _ in lanes]
-    return Session(run, recipe, compiled(recipe, run.config.settings.chunk), lanes, evaluation, learner)
+    return Session(run, recipe, functions, lanes, evaluation, learner)
+
+
+def compile_ahead(run: Run, recipe: Recipe) -> Compiled:
+    """The functions of a run, compiled for the shapes that they will see."""
+    seeds, chunk = len(run.seeds), run.config.settings.chunk
+
+    def shape(*sizes: int, dtype: type = np.float32) -> Any:
+        return jax.ShapeDtypeStruct((seeds, chunk, *sizes), dtype)
+
+    observation, flag = shape(recipe.observation_size), shape(dtype=bool)
+    steps = replay.Step(observation, shape(recipe.action_size), shape(recipe.factors), shape(), observation, flag, flag)
+    functions = compiled(recipe, chunk)
+    learner, keys = learner_shape(run), jax.eval_shape(seed_keys, jnp.asarray(run.seeds), 0)
+    return functions._replace(
+        store=ahead(functions.store, learner, steps),
+        improve=ahead(functions.improve, learner, keys, 0),
+        assess=ahead(functions.assess, learner),
+    )
+
+
+def ahead(function: Any, *shapes: Any) -> Any:
+    """A jitted function, compiled before it is called."""
+    return function.lower(*shapes).compile()
+
+
+def give_memory_back() -> None:
+    """What the compiler has freed, glibc keeps for the process unless it is asked not to."""
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):  # there is another C library, or none that can be asked
+        ctypes.CDLL(None).malloc_trim(0)

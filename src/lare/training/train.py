@@ -4,6 +4,7 @@ import contextlib
 import signal
 import threading
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from lare.credit.methods import Encoder, find_method
@@ -12,7 +13,7 @@ from lare.latent.design import design
 from lare.latent.function import LatentFunction
 from lare.tasks.spec import TaskSpec, load_task
 from lare.training.progress import Clock, Listener, TensorBoard, Terminal
-from lare.training.run import Run, create, default_directory, locked, open_run
+from lare.training.run import Run, create, default_directory, isolation, locked, open_run
 from lare.training.session import Session, begin, load_learner, new_learner
 from lare.training.settings import Settings
 
@@ -66,13 +67,13 @@ def resume(directory: str | Path, *, tensorboard: bool = False, listeners: Seque
             return start(run, tensorboard, listeners)
         _, learner, host, arrays = load_learner(run)
         run.truncate(host["metrics_length"])
-        session = begin(run, learner)
+        session = begin(run, lambda: learner)
         return finish(session, tensorboard, listeners, *session.return_to(host, arrays))
 
 
 def start(run: Run, tensorboard: bool, listeners: Sequence[Listener] | None) -> Run:
     """From the first step on. The untrained learner is saved, so that there is a checkpoint whatever happens."""
-    session = begin(run, new_learner(run))
+    session = begin(run, partial(new_learner, run))
     session.save()
     return finish(session, tensorboard, listeners)
 
@@ -86,6 +87,8 @@ def finish(session: Session, tensorboard: bool, listeners: Sequence[Listener] | 
     for listener in told:
         for message in messages:
             listener.said(message)
+        if run.function is not None:
+            listener.said(f"the latent function runs in {isolation(run.config.task, run.function)}")
         listener.started(f"{run.config.task.name} {settings.method}", session.step, settings.steps)
     clock = Clock(session.step)
     try:

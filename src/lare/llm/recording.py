@@ -1,28 +1,17 @@
-"""Models that answer requests. For now: those that answer from a recording.
+"""Recordings: a model's replies to exact requests, kept in a file, and the model that answers from them."""
 
-A live model is anything with a `name` and a `reply`; the design loop knows no more of it.
-"""
-
+import datetime
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from importlib.resources import files
-from typing import Literal, Protocol, runtime_checkable
+from pathlib import Path
+from typing import Literal
 
 from lare.errors import Checked, LareError
 from lare.llm.prompts import Kind, Message, Stage
 
 SHIPPED = files("lare.llm") / "recordings"
-
-
-@runtime_checkable
-class Model(Protocol):
-    """Whoever answers a request."""
-
-    name: str
-
-    def reply(self, messages: Sequence[Message], sample: int) -> str:
-        """The text of answer number `sample` (0, 1, ...) to the same request. Raises `LareError`."""
-        ...
 
 
 class Exchange(Checked):
@@ -87,6 +76,51 @@ class RecordedModel:
                     return exchange.replies[sample]
         raise LareError(
             f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}): recordings answer only "
-            "the exact texts of a shipped task, and the number of candidates that was recorded (or 1). Restore them, "
-            "or give a function of your own with --function FILE"
+            "the exact texts of a shipped task, and the number of candidates that was recorded (or 1). Ask a live model "
+            "with lare design --model NAME, or give a function of your own with --function FILE"
         )
+
+
+@dataclass
+class Recorder:
+    """Takes down every exchange of a design, and keeps it in a file from the first reply on, if there is one.
+
+    A file is never overwritten: it must not be there when the first reply comes.
+    """
+
+    task: str
+    kind: Kind
+    temperature: float | None = None
+    path: Path | None = None
+    exchanges: list[Exchange] = field(default_factory=list)
+
+    def take(self, stage: Stage, messages: Sequence[Message], reply: str, model: str) -> None:
+        """Add a reply to a request; the same request again adds to its replies."""
+        if self.exchanges and (self.exchanges[-1].stage, self.exchanges[-1].messages) == (stage, list(messages)):
+            last = self.exchanges.pop()
+            replies = [*last.replies, reply]
+        else:
+            replies = [reply]
+        self.exchanges.append(Exchange(stage=stage, messages=list(messages), replies=replies))
+        if self.path is not None:
+            first = len(self.exchanges) == len(replies) == 1
+            self.write(self.path, model, new=first)
+
+    def write(self, path: Path, model: str, new: bool = True) -> None:
+        """Raises `LareError` where the file cannot be written, or is there and should be `new`."""
+        recording = Recording(
+            task=self.task,
+            kind=self.kind,
+            draw=0,
+            model=model,
+            recorded=datetime.date.today().isoformat(),
+            temperature=self.temperature,
+            exchanges=self.exchanges,
+        )
+        try:
+            with path.open("x" if new else "w", encoding="utf-8") as file:
+                file.write(recording.model_dump_json(indent=1) + "\n")
+        except FileExistsError:
+            raise LareError(f"{path} exists, and is not overwritten; choose another --record") from None
+        except OSError as error:
+            raise LareError(f"{path} cannot be written: {error.strerror}") from error

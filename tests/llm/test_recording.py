@@ -5,8 +5,8 @@ import json
 import pytest
 
 from lare.errors import LareError
-from lare.llm.client import RecordedModel, read_recording, shipped_recordings
 from lare.llm.prompts import candidate, combine
+from lare.llm.recording import RecordedModel, read_recording, shipped_recordings
 from lare.tasks.spec import read_task
 from toys import toy_spec
 
@@ -97,7 +97,7 @@ def test_an_unknown_draw_is_refused(kind, draw, message):
         (RECORDING | {"exchanges": 3}, "recording X.json: exchanges = 3: input should be a valid list"),
         (
             RECORDING | {"exchanges": [EXCHANGE | {"stage": "chat"}]},
-            "recording X.json: stage = 'chat': input should be 'candidate', 'combine' or 'correct'",
+            "recording X.json: stage = 'chat': input should be 'candidate', 'combine', 'correct' or 'reflect'",
         ),
         (
             RECORDING | {"exchanges": [EXCHANGE | {"replies": [None]}]},

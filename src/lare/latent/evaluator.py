@@ -1,0 +1,87 @@
+"""`phi` at work: a jailed program that is called again and again, and believed no more at the last call than at the first."""
+
+import numpy as np
+from jaxtyping import Float
+
+from lare.errors import LareError
+from lare.latent.checks import Failed, factors_of
+from lare.latent.jailed import ROWS, JailedProgram, WorkerFailed
+
+WITNESSES = 3
+"""Rows that a sentinel computes again: a batch of a size that was verified."""
+
+
+class LatentRewardError(LareError):
+    """A verified function gave something that cannot be used, or its process failed.
+
+    `observation` and `action` are the batch that it happened with.
+    """
+
+    def __init__(self, message: str, observation: np.ndarray, action: np.ndarray):
+        super().__init__(message)
+        self.observation, self.action = observation, action
+
+
+class Evaluator:
+    """A worker process for one latent function. Close it, or let it go."""
+
+    def __init__(self, source: str, names: list[str], observation_size: int, action_size: int):
+        """Raises `NoWorker` where no process is to be had."""
+        self.names = names
+        self.calls = 0
+        self.program = JailedProgram(source, observation_size, action_size)
+        if self.program.problems:
+            raise LareError(f"the latent function has no verdict: {self.program.problems[0]}")
+
+    @property
+    def isolation(self) -> str:
+        return self.program.isolation
+
+    def __call__(
+        self, observation: Float[np.ndarray, "batch observation"], action: Float[np.ndarray, "batch action"]
+    ) -> Float[np.ndarray, "batch factors"]:
+        """The factors of a batch.
+
+        At calls 1, 2, 4, 8, ... three rows are computed again alone, and must come out the same.
+
+        Raises:
+            LatentRewardError: something came that is no factor, or nothing did.
+        """
+        observation, action = np.asarray(observation, np.float32), np.asarray(action, np.float32)
+        try:
+            factors = self.factors(observation, action)
+            self.check_finite(factors, observation)
+            self.calls += 1
+            if self.calls & (self.calls - 1) == 0 and len(observation):
+                self.check_witnesses(factors, observation, action)
+        except Failed as error:
+            raise LatentRewardError(f"the latent function failed: {error}", observation, action) from error
+        except WorkerFailed as error:
+            raise LatentRewardError(str(error), observation, action) from error
+        return factors
+
+    def factors(self, observation: np.ndarray, action: np.ndarray) -> np.ndarray:
+        parts = []
+        for start in range(0, max(1, len(observation)), ROWS):
+            part = observation[start : start + ROWS], action[start : start + ROWS]
+            parts.append(factors_of(self.program.call(*part), len(part[0]), "factors"))
+        sizes = {part.shape[1] for part in parts}
+        if sizes != {len(self.names)}:
+            raise Failed(f"it gave {sizes.pop()} factors, not {len(self.names)}")
+        with np.errstate(over="ignore"):
+            return np.concatenate(parts).astype(np.float32)
+
+    def check_finite(self, factors: np.ndarray, observation: np.ndarray) -> None:
+        if not np.isfinite(factors).all():
+            row, column = np.argwhere(~np.isfinite(factors))[0]
+            where = np.array2string(observation[row], precision=3, threshold=6)
+            raise Failed(f"factor {self.names[column]!r} is {factors[row, column]} for the observation {where}")
+
+    def check_witnesses(self, factors: np.ndarray, observation: np.ndarray, action: np.ndarray) -> None:
+        rows = np.linspace(0, len(observation) - 1, WITNESSES).astype(int)
+        alone = self.factors(observation[rows], action[rows])
+        if not np.allclose(alone, factors[rows], rtol=1e-4, atol=1e-6 + 1e-5 * np.abs(factors).max()):
+            raise Failed("the same steps have other factors when they are judged again, in a smaller batch")
+
+    def close(self) -> None:
+        self.program.close()

@@ -1,0 +1,194 @@
+"""The jail: what a process gives up before it runs a program that nobody has read. Linux; plain ctypes, no privileges.
+
+    no_new_privs   nothing that is started later gains rights back
+    rlimits        address space, no files written, no open files, no processes, no core
+    Landlock       no file system, no TCP, no signals and no abstract sockets beyond this process
+    seccomp        two dozen system calls on memory, clocks and the two open pipes; all others fail
+
+What a kernel does not have is left out and named: `enter` returns what is in force. Layers stand on each other's
+ground on purpose; seccomp alone would hold.
+"""
+
+import ctypes
+import errno
+import os
+import platform
+import resource
+import struct
+import sys
+from collections.abc import Iterator
+
+MEMORY = 2 << 30
+"""Bytes of address space beyond what the process has when it enters."""
+
+PR_SET_NO_NEW_PRIVS = 38
+
+
+def enter(kill: bool = False) -> list[str]:
+    """Give up everything but computing. There is no way back.
+
+    Args:
+        kill: a refused system call ends the process, instead of failing. To prove that accepted programs make none.
+
+    Returns:
+        The layers in force, outermost first.
+    """
+    if sys.platform != "linux":
+        return list(limits())
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) != 0:
+        return list(limits())
+    layers = ["landlock"] if landlock(libc) else []  # a ruleset is a file, and limits allow no more of them
+    layers += limits()
+    return [*layers, "seccomp"] if seccomp(libc, kill) else layers
+
+
+# --- rlimits ---------------------------------------------------------------------------------------------------------
+
+
+def limits() -> Iterator[str]:
+    """Lower the limits that the system has; yields one name for all of them."""
+    wanted = {
+        "RLIMIT_AS": address_space() + MEMORY,
+        "RLIMIT_FSIZE": 0,
+        "RLIMIT_CORE": 0,
+        "RLIMIT_NOFILE": 0,
+        "RLIMIT_NPROC": 0,
+    }
+    for name, value in wanted.items():
+        number = getattr(resource, name, None)
+        if number is None:
+            continue
+        _, hard = resource.getrlimit(number)
+        least = value if hard == resource.RLIM_INFINITY else min(value, hard)
+        try:
+            resource.setrlimit(number, (least, least))
+        except (ValueError, OSError):
+            return  # as on macOS, which does not limit address space
+    yield "rlimits"
+
+
+def address_space() -> int:
+    """Bytes that this process has mapped."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[0]) * resource.getpagesize()
+    except OSError:
+        return 0
+
+
+# --- Landlock (Documentation/userspace-api/landlock.rst) -------------------------------------------------------------
+
+LANDLOCK_CREATE_RULESET, LANDLOCK_RESTRICT_SELF = 444, 446
+LANDLOCK_CREATE_RULESET_VERSION = 1
+
+FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
+"""How many rights on files each version of the interface knows; all of them are given up."""
+
+
+def landlock(libc: ctypes.CDLL) -> bool:
+    """Handle every right, and allow none: no rule is ever added."""
+    version = libc.syscall(LANDLOCK_CREATE_RULESET, None, ctypes.c_size_t(0), LANDLOCK_CREATE_RULESET_VERSION)
+    if version < 1:
+        return False
+    rights = [(1 << FILE_RIGHTS[min(version, max(FILE_RIGHTS))]) - 1]
+    if version >= 4:
+        rights.append(0b11)  # bind and connect
+    if version >= 6:
+        rights.append(0b11)  # abstract sockets and signals
+    attributes = struct.pack(f"={len(rights)}Q", *rights)
+    ruleset = libc.syscall(LANDLOCK_CREATE_RULESET, attributes, ctypes.c_size_t(len(attributes)), 0)
+    if ruleset < 0:
+        return False
+    try:
+        return libc.syscall(LANDLOCK_RESTRICT_SELF, ruleset, 0) == 0
+    finally:
+        os.close(ruleset)
+
+
+# --- seccomp (man 2 seccomp) -----------------------------------------------------------------------------------------
+
+SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC = 1, 1
+KILL_PROCESS, ERRNO, ALLOW = 0x80000000, 0x00050000, 0x7FFF0000
+PROT_EXEC, MADV_REMOVE = 4, 9
+
+MACHINES = {
+    "x86_64": (
+        0xC000003E,  # AUDIT_ARCH_X86_64
+        317,
+        {
+            "read": 0, "write": 1, "mmap": 9, "mprotect": 10, "munmap": 11, "brk": 12, "rt_sigaction": 13,
+            "rt_sigprocmask": 14, "rt_sigreturn": 15, "sched_yield": 24, "mremap": 25, "madvise": 28, "setitimer": 38, "exit": 60,
+            "gettimeofday": 96, "getrusage": 98, "sigaltstack": 131, "futex": 202, "restart_syscall": 219,
+            "clock_gettime": 228, "exit_group": 231,
+        },
+    ),
+    "aarch64": (
+        0xC00000B7,  # AUDIT_ARCH_AARCH64
+        277,
+        {
+            "read": 63, "write": 64, "mmap": 222, "mprotect": 226, "munmap": 215, "brk": 214, "rt_sigaction": 134,
+            "rt_sigprocmask": 135, "rt_sigreturn": 139, "sched_yield": 124, "mremap": 216, "madvise": 233, "exit": 93,
+            "setitimer": 103,
+            "gettimeofday": 169, "getrusage": 165, "sigaltstack": 132, "futex": 98, "restart_syscall": 128,
+            "clock_gettime": 113, "exit_group": 94,
+        },
+    ),
+}  # fmt: skip
+"""Of each processor: its number in the kernel's audit, the number of `seccomp`, and the system calls that are left."""
+
+ONLY = {"read": (0,), "write": (1, 2)}
+"""The file descriptors that calls on files may name: the pipes to the parent."""
+
+LOAD, EQUAL, SET, RETURN = 0x20, 0x15, 0x45, 0x06
+"""Instructions of the filter: load a word; jump where it equals; jump where it has a bit; end."""
+
+FORBIDDEN = {"mmap": (SET, PROT_EXEC), "mprotect": (SET, PROT_EXEC), "madvise": (EQUAL, MADV_REMOVE)}
+"""What the third argument of a call must not be: executable memory, or holes in memory that the parent reads."""
+
+NUMBER, ARCHITECTURE, FIRST, THIRD = 0, 4, 16, 32
+"""Where the call's number, the processor and (the low words of) the first and third argument stand."""
+
+
+def instructions(audit: int, calls: dict[str, int], refused: int) -> Iterator[tuple[int, int, int, int]]:
+    """The filter: (operation, jump if true, jump if false, value)."""
+    yield LOAD, 0, 0, ARCHITECTURE
+    yield EQUAL, 1, 0, audit
+    yield RETURN, 0, 0, KILL_PROCESS  # numbers of another processor mean other calls
+    yield LOAD, 0, 0, NUMBER
+    for name, number in calls.items():
+        if name in ONLY:
+            yield EQUAL, 0, 2 + 2 * len(ONLY[name]), number
+            yield LOAD, 0, 0, FIRST
+            for descriptor in ONLY[name]:
+                yield EQUAL, 0, 1, descriptor
+                yield RETURN, 0, 0, ALLOW
+            yield RETURN, 0, 0, refused
+        elif name in FORBIDDEN:
+            yield EQUAL, 0, 4, number
+            yield LOAD, 0, 0, THIRD
+            test, value = FORBIDDEN[name]
+            yield test, 1, 0, value
+            yield RETURN, 0, 0, ALLOW
+            yield RETURN, 0, 0, refused
+        else:
+            yield EQUAL, 0, 1, number
+            yield RETURN, 0, 0, ALLOW
+    yield RETURN, 0, 0, refused
+
+
+class Filter(ctypes.Structure):
+    """struct sock_fprog."""
+
+    _fields_ = (("length", ctypes.c_ushort), ("code", ctypes.c_char_p))
+
+
+def seccomp(libc: ctypes.CDLL, kill: bool) -> bool:
+    """Install the filter for every thread of the process."""
+    if platform.machine() not in MACHINES:
+        return False
+    audit, number, calls = MACHINES[platform.machine()]
+    refused = KILL_PROCESS if kill else ERRNO | errno.EPERM
+    packed = [struct.pack("=HBBI", *one) for one in instructions(audit, calls, refused)]
+    program = Filter(len(packed), b"".join(packed))
+    return libc.syscall(number, SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC, ctypes.byref(program)) == 0

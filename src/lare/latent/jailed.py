@@ -1,0 +1,315 @@
+"""A program in the worker's jail, as its parent sees it: called with arrays, and stopped if it does not answer.
+
+What comes out of the jail is taken for what it is: bytes from a process that runs somebody else's code. Answers are
+bounded, read as JSON and checked; numbers come through shared memory that the worker cannot resize.
+"""
+
+import contextlib
+import json
+import mmap
+import os
+import select
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Never
+
+import numpy as np
+from jaxtyping import Float
+
+from lare.errors import LareError
+from lare.latent.gate import guard
+from lare.latent.grammar import Problem
+from lare.latent.worker import MOST_FACTORS
+
+ROWS = 4096
+"""Rows of one call; a larger batch takes several."""
+
+TIME_LIMIT = 30.0
+"""Seconds for one answer."""
+
+LONGEST_ANSWER = 1 << 16
+"""Bytes."""
+
+Mode = Literal["plain", "oblivious", "strict", "traced"]
+"""A plain call; on arrays that refuse to be looked into; with floating-point errors raised; with memory traced."""
+
+START = "import sys; sys.path[:] = {path!r}; from lare.latent.worker import main; main({argument!r})"
+
+
+class NoWorker(LareError):
+    """There is no process to be had. Nothing is known of the program."""
+
+
+class WorkerFailed(LareError):
+    """The worker did not answer in time, or broke off: the program's doing, or somebody's who killed it."""
+
+
+@dataclass(frozen=True)
+class Returned:
+    """What one call gave."""
+
+    error: str | None
+    line: int | None
+    """Of the program, where the error came from."""
+    values: tuple[tuple[Any, ...], ...] | None
+    """Of each thing in the list: ("array", shape, type) or (kind,). None where no list came."""
+    instead: tuple[Any, ...]
+    """The same, of what came instead of a list."""
+    factors: Float[np.ndarray, "rows factors"] | None
+    """The numbers, where each thing was a real array (rows, 1)."""
+    steps: int
+    """Turns of loops and calls."""
+    peak: int
+    """Bytes, if they were traced."""
+    events: tuple[str, ...]
+    """Audit events, if they were watched."""
+
+
+class JailedProgram:
+    """A worker and the program that it has been given.
+
+    `problems` is what the gate found; where there are any, the worker has ended and nothing can be called.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        observation_size: int,
+        action_size: int,
+        *,
+        gated: bool = True,
+        kill: bool = False,
+        audit: bool = False,
+    ):
+        """Start a worker.
+
+        Args:
+            gated: whether the gate stands in front of the jail. Without it a program may be any Python.
+            kill: a refused system call ends the worker.
+            audit: note Python's audit events during calls.
+
+        Raises:
+            NoWorker: it cannot be started.
+            WorkerFailed: the program broke it.
+        """
+        self.sizes = observation_size, action_size
+        self.lock = threading.Lock()
+        self.layers: tuple[str, ...] = ()
+        self.problems: list[Problem] = list(guard(source)) if gated else []
+        self.failed: Returned | None = None
+        """What happened to a program that could not even be loaded."""
+        if self.problems:
+            return
+        given = ROWS * 8 * (observation_size + action_size)
+        text = source.encode(errors="replace")  # what cannot be encoded, the gate has refused
+        with shared(max(given, len(text))) as self.inputs, shared(ROWS * 8 * MOST_FACTORS) as self.outputs:
+            self.process = start([self.inputs, self.outputs], kill, audit)
+        weakref.finalize(self, shut, self.process)
+        os.set_blocking(self.process.stdin.fileno(), False)  # type: ignore[union-attr]
+        self.poll = select.poll()
+        self.poll.register(self.process.stdout, select.POLLIN)  # type: ignore[arg-type]
+        try:
+            self.layers = tuple(str(layer) for layer in self.ask(None)["layers"])
+        except (WorkerFailed, KeyError, TypeError) as error:
+            self.close()
+            raise NoWorker(f"the process for the latent function does not start: {error}") from error
+        try:
+            self.inputs.memory[: len(text)] = text
+            sizes = {"observation": observation_size, "action": action_size, "rows": ROWS}
+            answer = self.ask({"source": len(text), "gate": gated, **sizes})
+            self.problems = [Problem(plain(code), count(line), plain(said)) for code, line, said in answer["problems"]]
+            self.failed = self.read(answer, 0) if "error" in answer else None
+        except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+            self.broken(f"it said something that cannot be read ({error!r})")
+
+    @property
+    def isolation(self) -> str:
+        """What stands around the program, for a person."""
+        return f"a process of its own ({', '.join(self.layers) or 'without limits'})"
+
+    def call(self, observation: np.ndarray, action: np.ndarray, mode: Mode = "plain") -> Returned:
+        """Run the program on at most `ROWS` rows, float32 or float64.
+
+        Raises:
+            WorkerFailed: there was no answer.
+        """
+        rows, kind = len(observation), observation.dtype.str
+        place = 8 * ROWS * self.sizes[0]
+        with self.lock:
+            for array, offset in ((observation, 0), (action, place)):
+                target = np.frombuffer(self.inputs.memory, kind, array.size, offset)
+                target[:] = np.asarray(array, kind).ravel()
+            answer = self.ask({"mode": mode, "rows": rows, "type": kind, "seconds": TIME_LIMIT + 5})
+            try:
+                return self.read(answer, rows)
+            except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+                self.broken(f"it said something that cannot be read ({error!r})")
+
+    def read(self, answer: dict[str, Any], rows: int) -> Returned:
+        """An answer, checked as something that a stranger said."""
+        values = answer.get("values")
+        several = [described(value) for value in values] if isinstance(values, list) else None
+        instead = described(values["returned"]) if isinstance(values, dict) else ()
+        factors = None
+        if several and len(several) <= MOST_FACTORS and all(is_factor(value, rows) for value in several):
+            numbers = np.frombuffer(self.outputs.memory, np.float64, rows * len(several))
+            factors = numbers.reshape(rows, len(several)).copy()
+        line = answer.get("line")
+        return Returned(
+            error=plain(answer["error"]) if "error" in answer else None,
+            line=None if line is None else count(line),
+            values=None if several is None else tuple(several),
+            instead=instead,
+            factors=factors,
+            steps=count(answer.get("steps", 0)),
+            peak=count(answer.get("peak", 0)),
+            events=tuple(plain(event) for event in answer.get("events", ())),
+        )
+
+    def ask(self, request: dict[str, Any] | None) -> dict[str, Any]:
+        """Send a request, if there is one, and wait for the answer."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        deadline = time.monotonic() + TIME_LIMIT
+        try:
+            if request is not None:
+                # A request fits into the pipe whole, or the pipe is full because nobody reads it, and this fails.
+                os.write(self.process.stdin.fileno(), json.dumps(request).encode() + b"\n")
+            line = b""
+            while not line.endswith(b"\n"):
+                left = deadline - time.monotonic()
+                if left <= 0 or not self.poll.poll(1000 * left):
+                    self.broken(f"it did not answer within {TIME_LIMIT:.0f} s")
+                more = os.read(self.process.stdout.fileno(), LONGEST_ANSWER)
+                if not more:
+                    self.broken(f"it ended ({self.ending()})")
+                line += more
+                if len(line) > LONGEST_ANSWER:
+                    self.broken("it said more than it may")
+            answer = json.loads(line)
+        except (OSError, ValueError, RecursionError) as error:
+            self.broken(f"it broke off ({error}; {self.ending()})")
+        except BaseException:
+            self.close()  # its answer would be taken for that to the next request
+            raise
+        if not isinstance(answer, dict):
+            self.broken("it said something that is no answer")
+        return answer
+
+    def ending(self) -> str:
+        """How the worker ended, in a few words."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            code = self.process.wait(1)
+            if code < 0:
+                return f"signal {-code}"
+            said = os.read(self.process.stderr.fileno(), LONGEST_ANSWER) if self.process.stderr else b""
+            last = said.decode(errors="replace").strip().splitlines()[-1:]
+            return f"exit status {code}" + (f": {last[0][:200]}" if last else "")
+        return "still running"
+
+    def broken(self, how: str) -> Never:
+        self.close()
+        raise WorkerFailed(f"the process that runs the latent function failed: {how}")
+
+    def close(self) -> None:
+        """End the worker. Nothing can be called any more."""
+        if hasattr(self, "process"):
+            shut(self.process)
+
+
+REAL = frozenset("bool float16 float32 float64 int8 int16 int32 int64 uint8 uint16 uint32 uint64".split())
+"""Types of numbers that a factor may have."""
+
+MOST = 1 << 62
+
+
+def count(value: Any) -> int:
+    """A number that somebody counted. Raises `ValueError` where it is none."""
+    if type(value) is not int or not 0 <= value <= MOST:
+        raise ValueError("a number is out of range")
+    return value
+
+
+def plain(value: Any) -> str:
+    """A text in a line, without what a terminal would obey."""
+    return "".join(letter if letter.isprintable() else " " for letter in str(value)[:500])
+
+
+def described(value: Sequence[Any]) -> tuple[Any, ...]:
+    """A description from the worker: (kind,) or ("array", shape, type)."""
+    kind, *rest = value
+    if not rest:
+        return (plain(kind)[:40],)
+    shape, dtype = rest
+    return "array", tuple(count(size) for size in shape), plain(dtype)[:20]
+
+
+def is_factor(value: tuple[Any, ...], rows: int) -> bool:
+    return len(value) == 3 and value[1] == (rows, 1) and value[2] in REAL
+
+
+@dataclass
+class Shared:
+    """Memory that two processes see. The child's descriptor of it can be made one for reading only."""
+
+    memory: mmap.mmap
+    write: int
+    read: int
+
+
+@contextlib.contextmanager
+def shared(size: int) -> Any:
+    """Memory in an unnamed file; the descriptors are open only as long as a child is started."""
+    place = "/dev/shm" if Path("/dev/shm").is_dir() else None
+    try:
+        with tempfile.NamedTemporaryFile(dir=place, prefix="lare-") as file:
+            os.posix_fallocate(file.fileno(), 0, size) if hasattr(os, "posix_fallocate") else file.truncate(size)
+            read = os.open(file.name, os.O_RDONLY)
+            memory = mmap.mmap(file.fileno(), size)
+            try:
+                yield Shared(memory, file.fileno(), read)
+            finally:
+                os.close(read)
+    except OSError as error:
+        raise NoWorker(f"there is no shared memory for the latent function: {error.strerror or error}") from error
+
+
+def start(memory: Sequence[Shared], kill: bool, audit: bool) -> subprocess.Popen[bytes]:
+    """A new worker: isolated Python, nothing of this environment, no open files but the pipes and the memory."""
+    inputs, outputs = memory
+    argument = json.dumps({"input": inputs.read, "output": outputs.write, "kill": kill, "audit": audit})
+    path = [entry for entry in sys.path if entry and Path(entry).is_absolute()]
+    # Pythons of some clusters find their own libraries by this variable alone; it holds no secrets.
+    needed = {name: os.environ[name] for name in ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH") if name in os.environ}
+    one_thread = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-I", "-c", START.format(path=path, argument=argument)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            bufsize=0,
+            cwd="/",
+            env={**needed, **one_thread},
+            pass_fds=[inputs.read, outputs.write],
+            start_new_session=True,  # Ctrl-C is for the parent, which saves and leaves
+        )
+    except OSError as error:
+        raise WorkerFailed(
+            f"the process for the latent function cannot be started: {error.strerror or error}"
+        ) from error
+
+
+def shut(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+    for pipe in (process.stdin, process.stdout, process.stderr):
+        if pipe is not None:
+            pipe.close()

@@ -1,0 +1,282 @@
+"""A live language model behind any OpenAI-compatible endpoint: OpenAI, vLLM, Ollama, llama.cpp, gateways.
+
+    time-outs    120 s for a reply, all of it
+    retries      408, 409, 429, 5xx and broken connections, with back-off or as long as the server says
+    structure    asked for as a JSON schema; of servers that know none, as a JSON object; else only in words
+    budget       requests and tokens, counted before each request so that they are never passed
+    the key      from the environment, into the request, and nowhere else
+
+What a reply says is read by `reply`, whatever way it was asked for.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from lare.errors import LareError
+from lare.llm.prompts import Message
+
+TIMEOUT = 120.0
+"""Seconds for one reply."""
+
+TRIES = 6
+"""Of one request, the first included."""
+
+LONGEST_WAIT = 60.0
+"""Seconds between two tries, whatever the server asks for."""
+
+LARGEST_BODY = 8 << 20
+"""Bytes of an answer."""
+
+REPLY_TOKENS, SHORTEST_REPLY = 16_384, 1024
+"""The most that a reply may have; halved as long as the model allows less, down to the second."""
+
+RETRIED = {408, 409, 429}
+
+SCHEMA = {
+    "type": "object",
+    "properties": {key: {"type": "string"} for key in ("Understand", "Analyze", "Functions")},
+    "required": ["Understand", "Analyze", "Functions"],
+    "additionalProperties": False,
+}
+
+LADDER: tuple[dict[str, Any] | None, ...] = (
+    {"type": "json_schema", "json_schema": {"name": "evaluation_function", "strict": True, "schema": SCHEMA}},
+    {"type": "json_object"},
+    None,
+)
+"""Ways to ask for structure, the strictest first."""
+
+LIMITS = ("max_completion_tokens", "max_tokens")
+"""What the longest reply is called, by newer servers and by older ones."""
+
+
+class ModelFailed(LareError):
+    """The model could not be asked, or gave nothing that can be read as an answer."""
+
+
+class BudgetSpent(LareError):
+    """The next request might pass the budget."""
+
+
+@dataclass
+class Budget:
+    """What a design may cost, and what it has cost so far."""
+
+    requests: int = 60
+    tokens: int = 400_000
+    requests_made: int = 0
+    tokens_in: int = 0
+    tokens_out: int = 0
+    estimated: bool = False
+    """Whether a server said nothing of tokens, and they were counted as bytes."""
+
+    def allow(self, messages: Sequence[Message]) -> int:
+        """How many tokens the reply to a request may have. No token is shorter than a byte.
+
+        Raises:
+            BudgetSpent: there is no request, or no token, left.
+        """
+        if self.requests_made >= self.requests:
+            raise BudgetSpent(f"the budget of {self.requests} requests is spent")
+        left = self.tokens - self.tokens_in - self.tokens_out - most_tokens(messages)
+        if left < 1:
+            used = self.tokens_in + self.tokens_out
+            raise BudgetSpent(f"the next request might pass the budget of {self.tokens:,} tokens ({used:,} are used)")
+        return left
+
+    def count(self, usage: Any, messages: Sequence[Message], reply: str) -> None:
+        """Add what a reply cost, by the server's own count where it gives one."""
+        try:
+            tokens_in, tokens_out = int(usage["prompt_tokens"]), int(usage["completion_tokens"])
+        except (TypeError, KeyError, ValueError):
+            tokens_in, tokens_out = most_tokens(messages), len(reply.encode(errors="replace"))
+            self.estimated = True
+        self.tokens_in += max(0, tokens_in)
+        self.tokens_out += max(0, tokens_out)
+
+    def summary(self, prices: tuple[float, float] | None = None) -> str:
+        """What was used, in a line; `prices` are those of a million tokens in and out."""
+        counted = " (counted as bytes: the server gave no numbers)" if self.estimated else ""
+        text = f"{self.requests_made} requests, {self.tokens_in:,} tokens in, {self.tokens_out:,} out{counted}"
+        if prices is not None:
+            text += f", {(self.tokens_in * prices[0] + self.tokens_out * prices[1]) / 1e6:.4f} by the given prices"
+        return text
+
+
+def most_tokens(messages: Sequence[Message]) -> int:
+    """No request has more tokens than this: one for each byte, and a few around each message."""
+    return sum(len(message["content"].encode(errors="replace")) + 16 for message in messages)
+
+
+@dataclass
+class LiveModel:
+    """Asks an OpenAI-compatible endpoint.
+
+    `base_url` and the key are those of the environment (OPENAI_BASE_URL, OPENAI_API_KEY) unless given; a server of
+    one's own may need no key.
+    """
+
+    name: str
+    base_url: str | None = None
+    temperature: float | None = None
+    budget: Budget = field(default_factory=Budget)
+    said: Callable[[str], None] = lambda _: None
+    """Is told of retries."""
+    sleep: Callable[[float], None] = time.sleep
+    rung: int = 0
+    limit_name: int = 0
+    longest: int = REPLY_TOKENS
+
+    def __post_init__(self) -> None:
+        try:
+            import openai
+        except ImportError:
+            raise ModelFailed("a live model needs an extra: pip install 'lare-rl[llm]'") from None
+        self.key = os.environ.get("OPENAI_API_KEY", "").strip()
+        base_url = self.base_url or os.environ.get("OPENAI_BASE_URL")
+        if not self.key and base_url is None:
+            raise ModelFailed(
+                f"to ask {self.name!r}, put a key into the environment variable OPENAI_API_KEY, or name a server of "
+                "your own with --base-url (as http://localhost:11434/v1 for Ollama)"
+            )
+        try:
+            self.client = openai.OpenAI(api_key=self.key or "none", base_url=base_url, max_retries=0, timeout=TIMEOUT)
+        except Exception as error:
+            raise ModelFailed(f"the endpoint {base_url!r} cannot be used: {self.scrubbed(error)}") from None
+
+    def scrubbed(self, text: object) -> str:
+        """A message in one line, without the key."""
+        return self.without_key(" ".join(str(text).split()))[:500]
+
+    def without_key(self, text: str) -> str:
+        """A text without the key, whoever put it there. What is shorter is no secret, but a word like "none"."""
+        return text.replace(self.key, "[key]") if len(self.key) >= 8 else text
+
+    def reply(self, messages: Sequence[Message], sample: int) -> str:
+        """One reply. `sample` makes no difference here: a model says something new each time.
+
+        Raises:
+            ModelFailed: there was no reply, after all tries.
+            BudgetSpent: the budget does not allow another request.
+        """
+        failure, tries = Failure("nothing was tried", again=True), 0
+        while failure.again and tries < TRIES:
+            if failure.wait:
+                self.said(f"{self.name}: {failure.said}; trying again in {failure.wait:.1f} s")
+                self.sleep(failure.wait)
+            outcome = self.ask(messages)
+            if isinstance(outcome, str):
+                return self.without_key(outcome)
+            tries += outcome.wait is not None
+            failure = outcome
+            if failure.wait == 0:
+                failure = replace(failure, wait=0.5 * 2 ** (tries - 1))
+        raise ModelFailed(f"{self.name} did not answer: {failure.said}")
+
+    def ask(self, messages: Sequence[Message]) -> "str | Failure":
+        """One request: the reply, or why there is none."""
+        import openai
+
+        allowed = min(self.longest, self.budget.allow(messages))
+        options: dict[str, Any] = {LIMITS[self.limit_name]: allowed}
+        if LADDER[self.rung] is not None:
+            options["response_format"] = LADDER[self.rung]
+        if self.temperature is not None:
+            options["temperature"] = self.temperature
+        self.budget.requests_made += 1
+        create = self.client.chat.completions.with_streaming_response.create
+        try:
+            with create(model=self.name, messages=list(messages), **options) as response:  # type: ignore[arg-type]
+                body = bounded(response.iter_bytes())
+        except openai.APIStatusError as error:
+            return self.refused(error)
+        except (openai.OpenAIError, OSError) as error:
+            return Failure(self.scrubbed(f"{type(error).__name__}: {error}"), again=True)
+        except TooMuch as error:
+            self.budget.count(None, messages, "x" * LARGEST_BODY)
+            return Failure(str(error), again=False)
+        except Exception as error:  # what the transport raises while a body is read depends on the client's version
+            return Failure(self.scrubbed(f"the answer broke off ({type(error).__name__}: {error})"), again=True)
+        return self.read(body, messages)
+
+    def read(self, body: bytes, messages: Sequence[Message]) -> "str | Failure":
+        """The text of a chat completion. An answer that is none is tried again: something is wrong on the way."""
+        try:
+            answer = json.loads(body)
+            choice = answer["choices"][0]["message"]
+            text = choice.get("content") or choice.get("refusal") or ""
+            if not isinstance(text, str):
+                raise TypeError("the content is not a text")
+        except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+            self.budget.count(None, messages, body.decode(errors="replace"))
+            return Failure(
+                self.scrubbed(f"the answer is not a chat completion ({type(error).__name__}: {error})"), again=True
+            )
+        self.budget.count(answer.get("usage"), messages, text)
+        return text
+
+    def refused(self, error: Any) -> "Failure":
+        """An HTTP status that is no success: ask for less, wait, or give up."""
+        status, said = error.status_code, self.scrubbed(error)
+        if status in (400, 422) and self.step_down(said.lower()):
+            return Failure(said, again=True, wait=None)
+        again = (status in RETRIED or status >= 500) and "insufficient_quota" not in said
+        wait = min(LONGEST_WAIT, seconds(error.response.headers.get("retry-after")))
+        return Failure(f"HTTP {status}: {said}", again, wait)
+
+    def step_down(self, said: str) -> bool:
+        """Ask for less, of a server that knows or allows less. False where there is nothing less to ask for."""
+        too_long = "token" in said and any(
+            word in said for word in ("large", "at most", "maximum", "context", "exceed")
+        )
+        if too_long and self.longest > SHORTEST_REPLY:
+            self.longest //= 2
+        elif "max_completion_tokens" in said and self.limit_name == 0:
+            self.limit_name = 1
+        elif "temperature" in said and self.temperature is not None:
+            self.temperature = None
+        elif self.rung + 1 < len(LADDER):
+            self.rung += 1
+        elif self.limit_name == 0:
+            self.limit_name = 1
+        else:
+            return False
+        return True
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a request gave no reply, and whether it is worth another try."""
+
+    said: str
+    again: bool
+    wait: float | None = 0.0
+    """Seconds until the next try; 0 where nobody has said, None where something else is tried at once."""
+
+
+class TooMuch(Exception):
+    """An answer has no end."""
+
+
+def bounded(chunks: Any) -> bytes:
+    """A whole body, if it comes in time and is not too long."""
+    body, deadline = b"", time.monotonic() + TIMEOUT
+    for chunk in chunks:
+        body += chunk
+        if len(body) > LARGEST_BODY:
+            raise TooMuch(f"the answer has more than {LARGEST_BODY >> 20} MB")
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"the answer was not complete after {TIMEOUT:.0f} s")
+    return body
+
+
+def seconds(retry_after: str | None) -> float:
+    """The header Retry-After in seconds; 0 where it is not there, or is a date."""
+    try:
+        return max(0.0, float(retry_after or 0))
+    except ValueError:
+        return 0.0

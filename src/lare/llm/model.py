@@ -1,0 +1,39 @@
+"""Whom to ask: anything with a name and a reply. The design loop knows no more of a model."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from lare.errors import LareError
+from lare.llm.prompts import Kind, Message
+from lare.llm.recording import RecordedModel, read_recording, shipped_recordings
+
+
+@runtime_checkable
+class Model(Protocol):
+    """Whoever answers a request."""
+
+    name: str
+
+    def reply(self, messages: Sequence[Message], sample: int) -> str:
+        """The text of answer number `sample` (0, 1, ...) to the same request. Raises `LareError`."""
+        ...
+
+
+RECORDED = "recorded"
+"""The name of the model that answers from the shipped recordings."""
+
+
+def recorded_model(task: str, kind: Kind, draw: int = 0, path: Path | None = None) -> RecordedModel:
+    """A model that answers from a file, or from the shipped recordings of that kind and draw.
+
+    Raises:
+        LareError: there is no such file or draw, or it is not a recording.
+    """
+    if path is None:
+        return RecordedModel(shipped_recordings(kind, draw), task)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise LareError(f"the recording {path} cannot be read: {error}") from error
+    return RecordedModel([read_recording(text, str(path))], task)

@@ -1,0 +1,48 @@
+"""Spaces of every shape as rows of numbers: observations flattened, a choice among n as n numbers."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import FlattenObservation
+from jaxtyping import Float
+
+
+class Choice(Box):
+    """One of n actions, as a row with a single 1. Other rows stand for the action at their largest number."""
+
+    def __init__(self, n: int, seed: int | np.random.Generator | None = None):
+        super().__init__(0, 1, (n,), np.float32, seed)
+
+    def sample(self, *args: Any, **kwargs: Any) -> Float[np.ndarray, " n"]:
+        return self.chosen(super().sample(*args, **kwargs))
+
+    def chosen(self, row: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """The row with a single 1 that a row stands for."""
+        return np.eye(len(row), dtype=np.float32)[int(np.argmax(row))]
+
+
+class ChoiceAction(gymnasium.ActionWrapper, RecordConstructorArgs):
+    """Lets an environment of discrete actions take rows."""
+
+    def __init__(self, env: gymnasium.Env):
+        RecordConstructorArgs.__init__(self)  # without which Gymnasium could not make the same environment again
+        super().__init__(env)
+        assert isinstance(env.action_space, Discrete)
+        self.start = int(env.action_space.start)
+        self.action_space = Choice(int(env.action_space.n))
+
+    def action(self, action: Float[np.ndarray, " n"]) -> int:
+        return self.start + int(np.argmax(action))
+
+
+def as_rows(environment: gymnasium.Env) -> gymnasium.Env:
+    """The environment with observations and actions that are rows of numbers, where they can be."""
+    if isinstance(environment.action_space, Discrete):
+        environment = ChoiceAction(environment)
+    observations = environment.observation_space
+    if observations.is_np_flattenable and not (isinstance(observations, Box) and len(observations.shape) == 1):
+        environment = FlattenObservation(environment)
+    return environment

@@ -1,0 +1,244 @@
+"""Arrays that refuse to be looked into: who looks is found, with the line, and who does not gets the same numbers."""
+
+import json
+import traceback
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lare.latent import language
+from lare.latent.oblivious import Looked, Missing, Oblivious, careful_functions, hidden, shown
+from lare.latent.program import FILE, Program
+from toys import PHI, phi
+
+CASES = json.loads(Path(__file__).with_name("cases.json").read_text(encoding="utf-8"))
+BENIGN = {case["name"]: case["code"] for case in CASES["benign"]} | {"toy": PHI}
+FUNCTIONS = careful_functions()
+
+
+def batch() -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(5)
+    observation, action = random.standard_normal((8, 17)), random.uniform(-1, 1, (8, 6))
+    return observation.astype(np.float32), action.astype(np.float32)
+
+
+def run_hidden(source: str):
+    return Program(source, FUNCTIONS)(*hidden(batch()))
+
+
+DECISION = "a decision depends on values of the batch: use np.where instead of if, and, or, max, min"
+NUMBER = "a value of the batch is turned into one number: keep it an array"
+NO_MATH = f"{NUMBER}, and use np instead of math"
+LIST_INDEX = "a value of the batch is used as an index: use np.where or np.take_along_axis"
+INDEX = "an array is indexed by values of the batch: use np.where or np.take_along_axis"
+
+
+@pytest.mark.parametrize(
+    ("expression", "message"),
+    [
+        ("1 if x[0, 0] > 0 else 2", DECISION),
+        ("1 if x[0, 0] else 2", DECISION),
+        ("1 if np.any(x > 0) else 2", DECISION),
+        ("1 if np.sum(x) > 0 and True else 2", DECISION),
+        ("1 if (x > 0).all() else 2", DECISION),
+        ("1 if x.mean() > x.std() else 2", DECISION),
+        ("1 if np.linalg.norm(x) > 1 else 2", DECISION),
+        ("1 if np.median(x) > 1 else 2", DECISION),
+        ("1 if np.isclose(x[0, 0], 1) else 2", DECISION),
+        ("1 if np.array([1.0, x[0, 0]]).max() > 1 else 2", DECISION),
+        ("1 if np.concatenate([np.zeros(3), x[0]])[0] else 2", DECISION),
+        ("1 if np.full((8, 1), x[0, 0])[0, 0] else 2", DECISION),
+        ("1 if np.where(np.ones(8) > 0, x[:, 0], 1)[0] else 2", DECISION),
+        ("1 if x[0] @ x[0] > 1 else 2", DECISION),
+        ("1 if (x[0, 0] + 1) ** 2 * 3 % 2 // 1 > 0 else 2", DECISION),
+        ("1 if abs(-x[0, 0]) > 1 else 2", DECISION),
+        ("1 if x.copy().T.reshape(-1).astype(float)[0] > 1 else 2", DECISION),
+        ("1 if 0 < x[0, 0] < 1 else 2", DECISION),
+        ("1 if 0.5 in x[:, 0] else 2", DECISION),
+        ("1 if x[0, 0] in [0.5] else 2", DECISION),
+        ("1 if [x[0, 0]] == [0.5] else 2", DECISION),
+        ("1 if (x[0, 0],) < (0.5,) else 2", DECISION),
+        ("not x[0, 0]", DECISION),
+        ("x[0, 0] or 1", DECISION),
+        ("max(x[0, 0], 0.0)", DECISION),
+        ("min(x[0])", DECISION),
+        ("sorted(x[0])[0]", DECISION),
+        ("any(x[0] > 0)", DECISION),
+        ("all([x[0, 0] > 0, True])", DECISION),
+        ("bool(x[0, 0])", DECISION),
+        ("[v for v in x[0] if v > 0][0]", DECISION),
+        ("[k for k in range(3) if x[0, k] > 0][0]", DECISION),
+        ("1 if [w for w, v in zip(x[0], x[1])][0] else 2", DECISION),
+        ("1 if [v for k, v in enumerate(x[0])][0] else 2", DECISION),
+        ("1 if list(x[0])[0] else 2", DECISION),
+        ("1 if {'a': x[0, 0]}['a'] else 2", DECISION),
+        ("int(x[0, 0])", NUMBER),
+        ("list(range(9))[x[0, 0].astype(int)]", LIST_INDEX),
+        ("[1, 2][np.argmax(x[0])]", LIST_INDEX),
+        ("[1, 2, 3][: x[0, 0].astype(int)]", LIST_INDEX),
+        ("x[:, : x[0, 0].astype(int)]", LIST_INDEX),
+        ("float(x[0, 0])", NO_MATH),
+        ("math.sqrt(x[0, 0] ** 2)", NO_MATH),
+        ("math.floor(x[0, 0])", NO_MATH),
+        ("math.hypot(1, x[0, 0])", NO_MATH),
+        ("x[x > 0]", INDEX),
+        ("x[x[:, 0] > 0, 0]", INDEX),
+        ("x[np.argmax(x, axis=1)]", INDEX),
+        ("x[..., np.argmax(x[0])]", INDEX),
+    ],
+)
+def test_who_looks_is_found(expression, message):
+    with pytest.raises(Looked) as error:
+        run_hidden(phi(f"x = observation\ny = 1\nreturn [action * ({expression})]"))
+    assert str(error.value) == message
+    lines = [frame.lineno for frame in traceback.extract_tb(error.value.__traceback__) if frame.filename == FILE]
+    assert lines[-1] == 4
+
+
+@pytest.mark.parametrize(
+    ("index", "slice"),
+    [
+        (":, 99:100", "99:100"),
+        (":, 16:18", "16:18"),
+        (":, :18", "None:18"),
+        (":, -18:", "-18:None"),
+        (":, 18:None", "18:None"),
+        ("0:1, 20:", "20:None"),
+    ],
+)
+def test_who_reads_what_is_not_there_is_found(index, slice):  # noqa: A002
+    with pytest.raises(Missing) as error:
+        run_hidden(phi(f"return [observation[{index}].sum(axis=1, keepdims=True)]"))
+    assert str(error.value) == f"the slice {slice} reaches past the 17 entries that there are"
+
+
+@pytest.mark.parametrize(
+    "index", [":, 5:17", ":, -17:-1", ":, :", "99:", "-99:, 0:1", ":, None, 0:1", ":, 5", ":, 16:17:9"]
+)
+def test_who_reads_what_is_there_is_not(index):
+    assert run_hidden(phi(f"return [observation[{index}]]"))
+
+
+@pytest.mark.parametrize("source", BENIGN.values(), ids=BENIGN)
+def test_who_does_not_look_gets_the_same_numbers(source):
+    factors = run_hidden(source)
+    for factor, plain in zip(factors, Program(source)(*batch()), strict=True):
+        np.testing.assert_array_equal(shown(factor), plain)
+        assert factor.dtype == plain.dtype
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "if observation.shape[0] > 3 and observation.ndim == 2: pass",
+        "if len(action) == action.shape[0] and np.shape(action)[1] > 2 and np.size(action, 1): pass",
+        "if action.dtype == np.float32: pass",
+        "if np.finfo(action.dtype).eps < 1: pass",
+        "for column in range(action.shape[1]): pass",
+        "if np.zeros(3)[0] == 0 and np.arange(3).max() > 1 and float(np.sum(np.ones(3))) > 2: pass",
+        "weights = np.array([1.0, 2.0])\nif weights[weights > 1][0] > 1: pass",
+        "if action is None: pass",
+    ],
+)
+def test_to_look_at_shapes_and_constants_is_no_harm(body):
+    assert type(run_hidden(phi(f"{body}\nreturn [action]"))[0]) is Oblivious
+
+
+ARGUMENTS = {
+    "numpy.array": lambda x: ([x[0], x[1]],),
+    "numpy.average": lambda x: (x, 1, x),
+    "numpy.broadcast_to": lambda x: (x, (2, 8, 3)),
+    "numpy.concatenate": lambda x: ([np.zeros((1, 3)), x],),
+    "numpy.cross": lambda x: (x, x),
+    "numpy.einsum": lambda x: ("ij,ij->i", x, x),
+    "numpy.expand_dims": lambda x: (x, 0),
+    "numpy.full": lambda x: ((2, 2), x[0, 0]),
+    "numpy.full_like": lambda x: (np.zeros(3), x[0]),
+    "numpy.interp": lambda x: (x[:, 0], [0, 1], [0, 1]),
+    "numpy.inner": lambda x: (x[0], x[0]),
+    "numpy.invert": lambda x: (x > 0,),
+    "numpy.linalg.det": lambda x: (x[:3],),
+    "numpy.linspace": lambda x: (x[0], x[1]),
+    "numpy.moveaxis": lambda x: (x, 0, 1),
+    "numpy.dot": lambda x: (x[0], x[0]),
+    **{f"numpy.{name}()": (lambda x: (x,)) for name in language.DTYPES},
+    "numpy.matmul": lambda x: (x[0], x[0]),
+    "numpy.ones_like": lambda x: (x,),
+    "numpy.pad": lambda x: (x, 1),
+    "numpy.percentile": lambda x: (x, 50),
+    "numpy.quantile": lambda x: (x, 0.5),
+    "numpy.repeat": lambda x: (x, 2),
+    "numpy.reshape": lambda x: (x, -1),
+    "numpy.roll": lambda x: (x, 1),
+    "numpy.select": lambda x: ([x > 0], [x]),
+    "numpy.split": lambda x: (x, 2),
+    "numpy.swapaxes": lambda x: (x, 0, 1),
+    "numpy.squeeze": lambda x: (x,),
+    "numpy.take": lambda x: (x, [0, 1]),
+    "numpy.take_along_axis": lambda x: (x, np.zeros((8, 1), int), 1),
+    "numpy.tensordot": lambda x: (x, x.T, 1),
+    "numpy.tile": lambda x: (x, 2),
+    "numpy.vdot": lambda x: (x, x),
+    "numpy.where": lambda x: (x > 0, x, 1),
+    "numpy.zeros_like": lambda x: (x,),
+    "numpy.clip": lambda x: (x, 0, 1),
+    **{f"numpy.{name}": (lambda x: ([x, x],)) for name in ("stack", "hstack", "vstack", "dstack", "column_stack")},
+}
+"""For what cannot simply be called with one array or two."""
+TAKE_NO_ARRAY = {"numpy.arange", "numpy.eye", "numpy.identity", "numpy.ones", "numpy.zeros"}
+
+
+@pytest.mark.parametrize("name", sorted(FUNCTIONS.keys() - TAKE_NO_ARRAY))
+def test_no_function_of_numpy_forgets_whom_it_was_given(name):
+    x = np.abs(batch()[0][:, :3]) + 0.5
+    if name in ARGUMENTS:
+        given, plain = ARGUMENTS[name](hidden(x)), ARGUMENTS[name](x)
+    else:
+        given, plain = ((one,) * language.DOTTED[name].least for one in (hidden(x), x))
+    with np.errstate(all="ignore"):
+        found, expected = FUNCTIONS[name](*given), FUNCTIONS[name](*plain)
+    several = isinstance(found, list | tuple)
+    for one, other in zip(found if several else [found], expected if several else [expected], strict=True):
+        assert type(one) is Oblivious
+        np.testing.assert_array_equal(shown(one), other)
+
+
+def test_functions_of_what_is_not_hidden_hide_nothing():
+    assert type(FUNCTIONS["numpy.sum"](np.ones(3))) is np.float64
+    assert type(FUNCTIONS["numpy.zeros"]((2, 3))) is np.ndarray
+
+
+def test_a_keyword_is_an_argument_too():
+    x = hidden(np.ones((2, 3)))
+    assert type(FUNCTIONS["numpy.sum"](np.ones((2, 3)), where=x > 0)) is Oblivious
+    assert type(FUNCTIONS["numpy.full"]((2, 3), fill_value=x[0, 0])) is Oblivious
+
+
+METHODS = {
+    **dict.fromkeys(
+        "sum prod mean max min all any std var cumsum cumprod flatten ravel squeeze transpose copy".split(), ()
+    ),
+    "astype": ("f8",),
+    "clip": (0, 1),
+    "repeat": (2,),
+    "reshape": (-1,),
+    "swapaxes": (0, 1),
+}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_no_method_forgets_whom_it_belongs_to(name):
+    assert type(getattr(hidden(batch()[0]), name)(*METHODS[name])) is Oblivious
+
+
+@pytest.mark.parametrize("name", ["T", "shape", "dtype", "ndim", "size"])
+def test_attributes(name):
+    value = getattr(hidden(batch()[0]), name)
+    assert (type(value) is Oblivious) == (name == "T")
+
+
+def test_hidden_and_shown_again():
+    x, (y, z) = hidden((np.ones(3), [np.float32(2), "text"]))
+    assert [type(one) for one in (x, y, z)] == [Oblivious, Oblivious, str]
+    assert [type(one) for one in shown([x, (y, z)])] == [np.ndarray, tuple]

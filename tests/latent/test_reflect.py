@@ -1,0 +1,110 @@
+"""Reflection: what episodes say of a function, and that the better predictor of returns is kept."""
+
+import json
+
+import numpy as np
+import pytest
+
+from lare.latent.design import design
+from lare.latent.function import verified
+from lare.latent.reflect import episodes_of, gather, held_out_fit
+from lare.llm import prompts
+from toys import toy_spec
+
+
+def source(*factors: str) -> str:
+    names = [f"f_{number}" for number in range(len(factors))]
+    body = "".join(f"    {name} = {factor}\n" for name, factor in zip(names, factors, strict=True))
+    return f"def evaluation_func(observation, action):\n{body}    return [{', '.join(names)}]"
+
+
+RIGHT = source("np.square(action - observation[:, 0:1])", "action")
+WRONG = source("observation[:, 1:2]")
+CONSTANT = source("0 * action + 1", "observation[:, 1:2]", "2 * observation[:, 1:2]")
+
+
+class Says:
+    name = "says"
+
+    def __init__(self, *sources: str):
+        self.lines = [json.dumps({"Understand": "", "Analyze": "", "Functions": one}) for one in sources]
+        self.asked = []
+
+    def reply(self, messages, sample):
+        self.asked.append(messages)
+        return self.lines.pop(0)
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return episodes_of(toy_spec())
+
+
+def test_episodes_are_whole_and_always_the_same(episodes):
+    again = episodes_of(toy_spec())
+    assert len(episodes) == 40
+    for one, other in zip(episodes, again, strict=True):
+        assert (one.observation.shape, one.action.shape) == ((21, 2), (20, 1))
+        np.testing.assert_array_equal(one.observation, other.observation)
+        # The toy pays -(a - s_0)^2.
+        assert one.total == pytest.approx(-np.sum((one.action - one.observation[:-1, :1]) ** 2), rel=1e-5)
+        assert one.total == other.total
+
+
+def test_episodes_of_a_policy():
+    (perfect,) = episodes_of(toy_spec(), lambda observation: observation[:1], count=1)
+    assert perfect.total == pytest.approx(0, abs=1e-9)
+
+
+def test_the_fit_is_of_unseen_episodes():
+    random = np.random.default_rng(0)
+    means = random.normal(size=(40, 3))
+    assert held_out_fit(means, means @ [1.0, -2.0, 0.0] + 5) > 0.99
+    # Thirty useless factors would explain forty seen episodes well.
+    assert held_out_fit(random.normal(size=(40, 30)), random.normal(size=40)) < 0.2
+    assert held_out_fit(np.zeros((40, 1)), np.arange(40.0)) == pytest.approx(-0.04, abs=0.2)
+    assert held_out_fit(means, np.zeros(40)) == pytest.approx(1)
+
+
+def test_the_evidence_names_what_each_factor_did(episodes):
+    task = toy_spec()
+    right, wrong = (gather(verified(one, task), task, episodes) for one in (RIGHT, WRONG))
+    assert right.fit > 0.99
+    assert wrong.fit < 0.3
+    lines = right.text.splitlines()
+    assert lines[0].startswith("- f_0: from ")
+    assert "correlates -1.00 with the return per step" in lines[0]
+    assert "it correlates most" in lines[0]
+    dead, one, two = gather(verified(CONSTANT, task), task, episodes).text.splitlines()
+    assert "standard deviation 0;" in dead
+    assert "+1.00 with f_2" in one
+    assert "+1.00 with f_1" in two
+
+
+def test_both_observations_are_named_apart(episodes):
+    task = toy_spec(judges="both")
+    text = gather(verified(WRONG, task), task, episodes).text
+    assert [line.split(":")[0] for line in text.splitlines()] == ["- f_0, before the step", "- f_0, after the step"]
+
+
+def test_a_better_function_is_kept_and_a_worse_one_is_not():
+    task = toy_spec()
+    said = []
+    model = Says(WRONG, RIGHT, CONSTANT)
+    function = design(task, model=model, candidates=1, reflect=2, said=said.append)
+    assert function.source == RIGHT
+    assert [exchange["stage"] for exchange in function.exchanges] == ["candidate", "reflect", "reflect"]
+    assert said[-1].endswith("not better")
+    # The second round is about the best function so far.
+    assert "Functions" in model.asked[2][2]["content"]
+    assert json.loads(model.asked[2][2]["content"])["Functions"] == RIGHT
+    evidence = gather(verified(WRONG, task), task, episodes_of(task)).text
+    assert model.asked[1] == prompts.reflect(
+        task, json.dumps({"Understand": "", "Analyze": "", "Functions": WRONG}), evidence
+    )
+
+
+def test_a_round_that_fails_changes_nothing():
+    model = Says(RIGHT, *["def f(): ..."] * 5)
+    assert design(toy_spec(), model=model, candidates=1, reflect=1).source == RIGHT
+    assert model.lines == []

@@ -1,0 +1,255 @@
+"""The live client against a real server on loopback that misbehaves."""
+
+import json
+
+import pytest
+
+from lare.llm import live
+from lare.llm.live import LADDER, Budget, BudgetSpent, LiveModel, ModelFailed, most_tokens
+from servers import Server, completion, dribbles, floods, half, hangs_up, raw, refuses, resets, says
+
+KEY = "sk-secret-key-0123456789"
+ASKED = [{"role": "user", "content": "Write some."}]
+
+
+@pytest.fixture
+def served(monkeypatch):
+    """Starts a server with its answers; gives it, a model that asks it, and the seconds that the model waited."""
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
+    servers = []
+
+    def start(*answers, **changes):
+        servers.append(Server(*answers))
+        waited = []
+        model = LiveModel("m", servers[-1].url, sleep=waited.append, **changes)
+        return servers[-1], model, waited
+
+    yield start
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+def test_a_reply_and_what_was_asked(served):
+    server, model, waited = served(says("hello"), temperature=0.5)
+    assert model.reply(ASKED, 0) == "hello"
+    (request,) = server.requests
+    assert request["messages"] == ASKED
+    assert request["response_format"] == LADDER[0]
+    assert request["max_completion_tokens"] == live.REPLY_TOKENS
+    assert request["temperature"] == 0.5
+    assert "n" not in request
+    assert server.headers[0]["Authorization"] == f"Bearer {KEY}"
+    assert (model.budget.requests_made, model.budget.tokens_in, model.budget.tokens_out) == (1, 100, 10)
+    assert waited == []
+
+
+@pytest.mark.parametrize("status", [408, 409, 429, 500, 502, 503, 529])
+def test_what_may_pass_is_tried_again(served, status):
+    server, model, waited = served(refuses(status), refuses(status), says("hello"))
+    assert model.reply(ASKED, 0) == "hello"
+    assert len(server.requests) == model.budget.requests_made == 3
+    assert waited == [0.5, 1.0]
+
+
+def test_the_server_says_how_long_to_wait(served):
+    _, model, waited = served(
+        refuses(429, Retry_After="3"),
+        refuses(429, Retry_After="9999"),
+        refuses(429, Retry_After="Wed, 21 Oct 2015 07:28:00 GMT"),
+        says("hello"),
+    )
+    assert model.reply(ASKED, 0) == "hello"
+    assert waited == [3.0, live.LONGEST_WAIT, 2.0]
+
+
+@pytest.mark.parametrize("answer", [hangs_up, resets, half])
+def test_a_connection_that_breaks_is_tried_again(served, answer):
+    server, model, waited = served(answer, says("hello"))
+    assert model.reply(ASKED, 0) == "hello"
+    assert (len(server.requests), waited) == (2, [0.5])
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (b"", "JSONDecodeError"),
+        (b'{"choices": [', "JSONDecodeError"),
+        (b"<html>Bad gateway</html>", "JSONDecodeError"),
+        (b"null", "TypeError"),
+        (b"[]", "TypeError"),
+        (b"{}", "KeyError: 'choices'"),
+        (b'{"choices": []}', "IndexError"),
+        (b'{"choices": [{}]}', "KeyError: 'message'"),
+        (b'{"choices": [{"message": null}]}', "AttributeError"),
+        (b'{"choices": [{"message": {"content": ["x"]}}]}', "TypeError: the content is not a text"),
+        (b"[" * 5_000, "RecursionError"),
+    ],
+)
+def test_an_answer_that_is_none_is_tried_again_and_then_named(served, body, said):
+    server, model, _ = served(raw(body))
+    with pytest.raises(ModelFailed, match=r"\Am did not answer: the answer is not a chat completion \(") as error:
+        model.reply(ASKED, 0)
+    assert said in str(error.value)
+    assert len(server.requests) == live.TRIES
+    assert model.budget.estimated
+
+
+@pytest.mark.parametrize("status", [400, 401, 403, 404, 422])
+def test_what_will_not_pass_is_not_tried_for_ever(served, status):
+    server, model, waited = served(refuses(status, "you may not"))
+    with pytest.raises(ModelFailed, match=f"m did not answer: HTTP {status}: .*you may not"):
+        model.reply(ASKED, 0)
+    assert len(server.requests) == (4 if status in (400, 422) else 1)
+    assert waited == []
+
+
+def test_an_empty_purse_is_not_tried_again(served):
+    server, model, _ = served(refuses(429, "insufficient_quota: pay first"))
+    with pytest.raises(ModelFailed, match="pay first"):
+        model.reply(ASKED, 0)
+    assert len(server.requests) == 1
+
+
+def test_a_server_that_never_comes_back(served):
+    server, model, waited = served(refuses(503))
+    with pytest.raises(ModelFailed, match="m did not answer: HTTP 503"):
+        model.reply(ASKED, 0)
+    assert len(server.requests) == live.TRIES
+    assert waited == [0.5, 1, 2, 4, 8]
+
+
+def test_nobody_there(served):
+    server, model, waited = served(says("hello"))
+    server.shutdown()
+    server.server_close()
+    with pytest.raises(ModelFailed, match="m did not answer: APIConnectionError"):
+        model.reply(ASKED, 0)
+    assert len(waited) == live.TRIES - 1
+
+
+@pytest.mark.parametrize("answer", [dribbles, floods])
+def test_an_answer_without_end_is_cut_off(served, monkeypatch, answer):
+    monkeypatch.setattr(live, "TIMEOUT", 0.3)
+    monkeypatch.setattr(live, "TRIES", 1)
+    _, model, _ = served(answer)
+    with pytest.raises(ModelFailed, match=r"was not complete after|has more than 8 MB"):
+        model.reply(ASKED, 0)
+
+
+def test_the_ladder_goes_down_and_stays_down(served):
+    def picky(handler):
+        request = handler.server.requests[-1]
+        if "response_format" in request:
+            return refuses(400, "response_format is not supported")(handler)
+        if "max_completion_tokens" in request:
+            return refuses(422, "unknown field max_completion_tokens")(handler)
+        if request["max_tokens"] > 4096:
+            return refuses(400, "max_tokens is too large: at most 4096 completion tokens")(handler)
+        if "temperature" in request:
+            return refuses(400, "temperature is not supported by this model")(handler)
+        return says("hello")(handler)
+
+    server, model, waited = served(picky, temperature=1.0)
+    assert model.reply(ASKED, 0) == "hello"
+    assert model.reply(ASKED, 1) == "hello"
+    last = server.requests[-1]
+    assert last == {"model": "m", "messages": ASKED, "max_tokens": 4096}
+    assert server.requests[-2] == last
+    assert waited == []
+
+
+@pytest.mark.parametrize(
+    ("answer", "text"),
+    [
+        (says(""), ""),
+        (says(None), ""),
+        (says(None, refusal="I would rather not."), "I would rather not."),
+        (says("x" * 100_000), "x" * 100_000),
+    ],
+)
+def test_the_text_is_given_on_as_it_came(served, answer, text):
+    _, model, _ = served(answer)
+    assert model.reply(ASKED, 0) == text
+
+
+@pytest.mark.parametrize("usage", [{}, {"prompt_tokens": None}, {"prompt_tokens": "many", "completion_tokens": 1}])
+def test_a_server_that_counts_nothing_is_counted_by_bytes(served, usage):
+    _, model, _ = served(says("grüße", usage=usage))
+    model.reply(ASKED, 0)
+    assert (model.budget.tokens_in, model.budget.tokens_out) == (most_tokens(ASKED), 7)
+    assert "counted as bytes" in model.budget.summary()
+
+
+def test_the_budget_of_requests_is_never_passed(served):
+    server, model, _ = served(refuses(500), budget=Budget(requests=3))
+    with pytest.raises(BudgetSpent, match="the budget of 3 requests is spent"):
+        model.reply(ASKED, 0)
+    assert len(server.requests) == 3
+
+
+def test_the_budget_of_tokens_is_never_passed(served):
+    # The server takes everything that it is allowed.
+    def greedy(handler):
+        request = handler.server.requests[-1]
+        usage = {
+            "prompt_tokens": most_tokens(request["messages"]),
+            "completion_tokens": request["max_completion_tokens"],
+        }
+        handler.send(200, json.dumps(completion("x", usage)).encode())
+
+    server, model, _ = served(greedy, budget=Budget(tokens=40_000))
+    assert [model.reply(ASKED, number) for number in range(3)] == ["x"] * 3
+    with pytest.raises(BudgetSpent, match=r"might pass the budget of 40,000 tokens \(40,000 are used\)"):
+        model.reply(ASKED, 3)
+    assert model.budget.tokens_in + model.budget.tokens_out == 40_000
+    assert [request["max_completion_tokens"] for request in server.requests[:2]] == [live.REPLY_TOKENS] * 2
+
+
+def test_costs_are_reckoned_by_given_prices():
+    budget = Budget(requests_made=2, tokens_in=1_000_000, tokens_out=500_000)
+    assert budget.summary() == "2 requests, 1,000,000 tokens in, 500,000 out"
+    assert budget.summary((3.0, 15.0)) == "2 requests, 1,000,000 tokens in, 500,000 out, 10.5000 by the given prices"
+
+
+def test_a_server_that_tells_the_key_is_not_quoted(served):
+    def tells(handler):
+        refuses(401, f"Incorrect key provided: {handler.headers['Authorization']}")(handler)
+
+    _, model, _ = served(tells)
+    with pytest.raises(ModelFailed, match=r"Bearer \[key\]") as error:
+        model.reply(ASKED, 0)
+    assert KEY not in str(error.value)
+    assert error.value.__cause__ is None
+    assert error.value.__suppress_context__ or error.value.__context__ is None
+    _, model, _ = served(says(f"Your key is {KEY}."))
+    assert model.reply(ASKED, 0) == "Your key is [key]."
+    assert KEY not in repr(model)
+
+
+def test_without_key_and_server_it_says_what_to_do(monkeypatch):
+    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
+    with pytest.raises(ModelFailed, match="put a key into the environment variable OPENAI_API_KEY, or name a server"):
+        LiveModel("m")
+
+
+def test_a_server_of_ones_own_needs_no_key(monkeypatch):
+    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+    server = Server(says("hello"))
+    monkeypatch.setenv("OPENAI_BASE_URL", server.url)
+    try:
+        assert LiveModel("m").reply(ASKED, 0) == "hello"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.mark.parametrize("url", ["", "nowhere", "ftp://x/", "http://[", "http://127.0.0.1:99999/v1"])
+def test_an_endpoint_that_is_none(monkeypatch, url):
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+    monkeypatch.setattr(live, "TRIES", 1)
+    with pytest.raises(ModelFailed) as error:
+        LiveModel("m", url or " ").reply(ASKED, 0)
+    assert "\n" not in str(error.value)

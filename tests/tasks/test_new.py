@@ -1,0 +1,162 @@
+"""First drafts of task files, of Gymnasium's own environments and of toys that document themselves badly."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
+
+from lare.errors import LareError
+from lare.latent.function import verified
+from lare.llm.prompts import candidate
+from lare.tasks.new import draft
+from lare.tasks.spec import FILL_IN, load_task
+from toys import Chase
+
+CONTINUOUS = (
+    "MountainCarContinuous-v0",
+    "Pendulum-v1",
+    "Ant-v5",
+    "Hopper-v5",
+    "Pusher-v5",
+    "InvertedPendulum-v5",
+    "Swimmer-v5",
+)
+DISCRETE = ("CartPole-v1", "MountainCar-v0", "Acrobot-v1", "FrozenLake-v1", "CliffWalking-v1", "Blackjack-v1")
+SIZES = {
+    "Pendulum-v1": (3, 1),
+    "Ant-v5": (105, 8),
+    "CartPole-v1": (4, 2),
+    "FrozenLake-v1": (16, 4),
+    "Blackjack-v1": (45, 2),
+}
+
+CONSTANT = "def evaluation_func(observation, action):\n    return [observation[:, :1] + action[:, :1]]"
+
+
+def load(tmp_path, text: str):
+    (tmp_path / "task.toml").write_text(text)
+    return load_task(tmp_path / "task.toml")
+
+
+@pytest.mark.parametrize("name", CONTINUOUS + DISCRETE)
+def test_gymnasiums_own_environments(tmp_path, name):
+    drafted = draft(name)
+    assert drafted.missing == ()
+    task = load(tmp_path, drafted.toml)
+    assert (task.name, task.environment) == (name, name)
+    assert (task.observation_size, task.action_size) == SIZES.get(name, (task.observation_size, task.action_size))
+    request = " ".join(message["content"] for message in candidate(task)[1:]).lower()
+    assert "reward" not in request
+    assert "penalt" not in request
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1", "FrozenLake-v1"])
+def test_a_function_can_be_verified_on_a_draft(tmp_path, name):
+    assert verified(CONSTANT, load(tmp_path, draft(name).toml)).size == 1
+
+
+class Told(Chase):
+    """Tells of a chase.
+
+    The goal is to catch the *target*. You get a reward of 1 for each catch. See [the docs](https://x.y).
+
+    ## Action Space
+    | Num | Action | Reward |
+    |-----|--------|--------|
+    | 0   | guess `a` \\o/ ""\" | no cost |
+    | 1   | The second row | - |
+
+    ## Observation Space
+    A target. It returns nothing.
+
+    ## Rewards
+    Secret.
+
+    ## Episode End
+    1. Truncation: after 20 steps.
+    """
+
+
+class Silent(gymnasium.Env):
+    observation_space = Box(-1, 1, (2, 3), np.float32)
+    action_space = Box(np.array([-1, -2], np.float32), np.array([1, 2], np.float32))
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+gymnasium.register("toys/Told-v0", entry_point=Told, max_episode_steps=20)
+gymnasium.register("toys/Silent-v0", entry_point=Silent, disable_env_checker=True)
+
+
+def test_whatever_speaks_of_rewards_is_left_out(tmp_path):
+    drafted = draft("toys/Told-v0")
+    task = load(tmp_path, drafted.toml)
+    assert task.description == (
+        "Tells of a chase.\nThe goal is to catch the *target*.\nSee the docs.\n1. Truncation: after 20 steps."
+    )
+    assert task.observation == "2 entries.\nA target."
+    assert task.action == "1 entries, each between -2 and 2.\n1: The second row; -"
+    assert drafted.left_out == 4
+    assert "4 sentences or rows" in drafted.toml
+
+
+def test_what_is_not_documented_must_be_filled_in(tmp_path):
+    drafted = draft("toys/Silent-v0")
+    assert drafted.missing == ("description", "observation", "action")
+    with pytest.raises(LareError, match=f"description still says '{FILL_IN}'"):
+        load(tmp_path, drafted.toml)
+    task = load(tmp_path, drafted.toml.replace(FILL_IN, "Say"))
+    assert (task.observation_size, task.action_size, task.max_episode_steps) == (6, 2, 1000)
+    assert task.observation.startswith("6 entries, an array of shape (2, 3) row by row.")
+
+
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        ("Nowhere-v0", "environment 'Nowhere-v0' cannot be made: Environment `Nowhere` doesn't exist."),
+        ("a b", "environment 'a b' cannot be made: "),
+        ("toys/Told-v0:x", "environment 'toys/Told-v0:x' cannot be made: "),
+    ],
+)
+def test_an_environment_that_cannot_be_made(environment, message):
+    with pytest.raises(LareError) as error:
+        draft(environment)
+    assert str(error.value).startswith(message)
+
+
+class Odd(Silent):
+    def __init__(self, **spaces):
+        for name, space in spaces.items():
+            setattr(self, name, space)
+
+
+@pytest.mark.parametrize(
+    ("name", "spaces", "message"),
+    [
+        (
+            "toys/OddA-v0",
+            {"action_space": Tuple([Discrete(2)])},
+            "the action space of toys/OddA-v0 is Tuple(Discrete(2))",
+        ),
+        (
+            "toys/OddB-v0",
+            {"observation_space": gymnasium.spaces.Sequence(Discrete(2))},
+            "the observation space of toys/OddB-v0 is Sequence(Discrete(2), stack=False)",
+        ),
+    ],
+)
+def test_spaces_that_are_no_rows_of_numbers(name, spaces, message):
+    gymnasium.register(name, entry_point=lambda: Odd(**spaces), disable_env_checker=True)
+    with pytest.raises(LareError) as error:
+        draft(name)
+    assert str(error.value) == f"{message}, which is no row of numbers"
+
+
+def test_parts_of_an_observation_stand_behind_each_other():
+    parts = Dict({"place": Box(-1, 1, (2,), np.float32), "gear": Discrete(3)})
+    gymnasium.register("toys/Parts-v0", entry_point=lambda: Odd(observation_space=parts), disable_env_checker=True)
+    assert "5 entries, Dict('gear': Discrete(3), 'place': Box(" in draft("toys/Parts-v0").toml

@@ -1,0 +1,53 @@
+"""Choices as rows of numbers."""
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Discrete
+
+from lare.tasks.environment import make
+from lare.tasks.spaces import Choice, ChoiceAction
+from lare.training.environments import to_bounds
+
+
+class Three(gymnasium.Env):
+    """Remembers what was chosen; its actions are 5, 6 and 7."""
+
+    observation_space = Discrete(4)
+    action_space = Discrete(3, start=5)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        self.chosen = action
+        return int(action) - 4, 0.0, False, False, {}
+
+
+gymnasium.register("toys/Three-v0", entry_point=Three, max_episode_steps=10)
+
+
+def test_an_environment_of_choices_takes_rows_and_gives_rows():
+    environment = make("toys/Three-v0")
+    assert isinstance(environment.action_space, Choice)
+    observation, _ = environment.reset(seed=0)
+    np.testing.assert_array_equal(observation, [1, 0, 0, 0])
+    observation, *_ = environment.step(np.array([0.2, 0.1, 0.9], np.float32))
+    assert environment.unwrapped.chosen == 7
+    np.testing.assert_array_equal(observation, [0, 0, 0, 1])
+
+
+def test_a_sample_has_a_single_one_and_every_choice_comes():
+    space = Choice(3, seed=0)
+    rows = np.stack([space.sample() for _ in range(100)])
+    assert set(map(tuple, rows)) == {(1, 0, 0), (0, 1, 0), (0, 0, 1)}
+    assert all(space.contains(row) for row in rows)
+
+
+def test_an_algorithms_output_becomes_the_choice_of_its_largest_number():
+    np.testing.assert_array_equal(to_bounds(np.array([-1, 0.5, 0.4], np.float32), Choice(3)), [0, 1, 0])
+
+
+def test_what_is_a_row_already_stays_as_it_is():
+    assert not isinstance(make("Pendulum-v1").unwrapped, ChoiceAction)
+    assert make("Pendulum-v1").observation_space.shape == (3,)

@@ -1,0 +1,192 @@
+"""From a live model to a trained policy, without a network: a server on loopback speaks for the recorded model."""
+
+import json
+import sys
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lare import cli
+from lare.errors import LareError
+from lare.latent.design import design
+from lare.latent.function import load
+from lare.llm.live import Budget, LiveModel
+from lare.llm.recording import read_recording, shipped_recordings
+from lare.tasks.spec import read_task
+from servers import Server, refuses, says
+from toys import PHI, toy_spec
+
+KEY = "sk-a-key-that-nobody-may-see"
+
+
+def recorded_answers(handler) -> None:
+    """What was recorded for a request, each reply once."""
+    asked = handler.server.requests[-1]["messages"]
+    for recording in shipped_recordings("factors", 0):
+        for exchange in recording.exchanges:
+            if exchange.messages == asked:
+                times = sum(request["messages"] == asked for request in handler.server.requests)
+                return says(exchange.replies[times - 1])(handler)
+    return refuses(404, "nobody has asked this before")(handler)
+
+
+@pytest.fixture
+def serve(monkeypatch):
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+    servers = []
+
+    def start(*answers) -> Server:
+        servers.append(Server(*answers))
+        return servers[-1]
+
+    yield start
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.fixture
+def lare(monkeypatch, capsys, tmp_path):
+    """Runs `lare ARGUMENTS` in an empty directory; gives exit status, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["lare", *map(str, arguments)])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as left:
+            status = left.code
+        return status, *capsys.readouterr()
+
+    return run
+
+
+def everything_written(directory) -> bytes:
+    return b"".join(path.read_bytes() for path in directory.rglob("*") if path.is_file())
+
+
+def test_from_a_live_model_to_a_trained_policy(serve, lare, tmp_path):
+    server = serve(recorded_answers)
+    asked = ("--model", "m", "--base-url", server.url, "--record", "talk.json", "--price", 1, 2)
+    status, out, err = lare("design", "Reacher-v4", *asked, "--out", "phi.py")
+    assert status == 0
+    assert out.startswith("wrote phi.py: ")
+    assert err.splitlines()[-1] == "m: 6 requests, 600 tokens in, 60 out, 0.0007 by the given prices"
+    task = read_task("Reacher-v4")
+    live, recorded = load(tmp_path / "phi.py", task), design(task)
+    assert (live.source, live.model) == (recorded.source, "m")
+
+    # What was recorded answers again, exactly.
+    recording = read_recording((tmp_path / "talk.json").read_text(), "talk.json")
+    assert (recording.model, recording.task) == ("m", "Reacher-v4")
+    assert [exchange.model_dump() for exchange in recording.exchanges] == list(recorded.exchanges)
+    again, out, _ = lare("design", "Reacher-v4", "--model", "talk.json")
+    assert (again, out) == (0, recorded.source + "\n")
+    assert len(server.requests) == 6
+
+    length = "--steps 100 --chunk 50 --evaluate-every 100 --evaluation-episodes 1".split()
+    size = "--td3.warmup 50 --td3.hidden 8 8 --credit.hidden 8 8".split()
+    status, _, err = lare("train", "Reacher-v4", "--function", "phi.py", "--out", "run", *length, *size)
+    assert status == 0
+    assert "the latent function runs in a process of its own" in err
+    assert KEY.encode() not in everything_written(tmp_path)
+
+
+def test_a_recording_is_not_overwritten(serve, lare, tmp_path):
+    (tmp_path / "talk.json").write_text("mine")
+    server = serve(recorded_answers)
+    status, _, err = lare("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--record", "talk.json")
+    assert status == 2
+    assert "lare: talk.json exists, and is not overwritten; choose another --record" in err
+    assert (tmp_path / "talk.json").read_text() == "mine"
+
+
+def test_when_nothing_passes_every_attempt_is_kept(serve, lare, tmp_path):
+    server = serve(says("I would rather talk about something else."))
+    for name in ("Reacher-v4.attempts.json", "Reacher-v4.attempts-2.json"):
+        status, out, err = lare("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1)
+        assert (status, out) == (1, "")
+        assert "none of 5 attempts passed; the last one failed: the reply is not one JSON object" in err
+        assert f"every attempt is kept in {name}" in err
+        kept = read_recording((tmp_path / name).read_text(), name)
+        assert [exchange.stage for exchange in kept.exchanges] == ["candidate", *["correct"] * 4]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--requests", 2], "lare: the budget of 2 requests is spent"),
+        (["--budget", 100], "lare: the next request might pass the budget of 100 tokens (0 are used)"),
+    ],
+)
+def test_a_budget_ends_a_design(serve, lare, arguments, said):
+    server = serve(recorded_answers)
+    status, out, err = lare("design", "Reacher-v4", "--model", "m", "--base-url", server.url, *arguments)
+    assert (status, out) == (2, "")
+    assert said in err
+    assert len(server.requests) <= 2
+
+
+def test_a_reply_for_another_task_is_corrected(serve):
+    # The chase has observations of size 2; the recorded function of Reacher reads entry 10.
+    reacher = shipped_recordings("factors", 0)
+    other = next(one for one in reacher if one.task == "Reacher-v4").exchanges[-1].replies[0]
+    good = json.dumps({"Understand": "", "Analyze": "", "Functions": PHI})
+    server = serve(says(other), says(good))
+    assert design(toy_spec(), model=LiveModel("m", server.url), candidates=1).source == PHI.strip("\n")
+    assert server.requests[1]["messages"][-1]["content"].count("E-INDEX") == 1
+
+
+REPLIES = st.one_of(
+    st.text(max_size=200),
+    st.binary(max_size=50).map(lambda body: body.decode("latin-1")),
+    st.text(max_size=200).map(lambda code: json.dumps({"Understand": "", "Analyze": "", "Functions": code or "?"})),
+    st.integers(0, len(PHI)).map(
+        lambda cut: json.dumps({"Understand": "", "Analyze": "", "Functions": PHI[:cut] or "?"})
+    ),
+    st.sampled_from(
+        [
+            "",
+            "{}",
+            "null",
+            "```python\ndef evaluation_func(observation, action):\n    return [action]\n```",
+            json.dumps({"Understand": "", "Analyze": "", "Functions": PHI}),
+        ]
+    ),
+)
+
+
+class Says:
+    """A model that says whatever it is given, over and over."""
+
+    name = "says"
+
+    def __init__(self, replies):
+        self.replies, self.asked = replies, 0
+
+    def reply(self, messages, sample):
+        self.asked += 1
+        return self.replies[self.asked % len(self.replies)]
+
+
+@settings(max_examples=12, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@given(st.lists(REPLIES, min_size=1, max_size=3))
+def test_whatever_comes_back_the_loop_ends(replies):
+    model = Says(replies)
+    try:
+        function = design(toy_spec(), model=model, candidates=1)
+    except LareError:
+        assert model.asked == 5
+    else:
+        assert function.size >= 1
+        assert model.asked <= 5
+
+
+def test_a_flood_of_text_ends_within_the_budget(serve):
+    server = serve(says("{" * 2_000_000))
+    model = LiveModel("m", server.url, budget=Budget(tokens=100_000), sleep=lambda _: None)
+    with pytest.raises(LareError):
+        design(toy_spec(), model=model, candidates=1)
+    assert len(server.requests) <= 6
