@@ -1,22 +1,24 @@
 """Learning curves: 3 seeds, 100 thousand steps, the methods side by side.
 
     python benchmarks/learning.py run RUNS [TASK/LABEL ...]   train what is missing, go on with the rest
-    python benchmarks/learning.py table RUNS                  write results/learning.json and docs/pictures, print a table
+    python benchmarks/learning.py keep RUNS                   copy what is finished to results/learning
+    python benchmarks/learning.py table                       from there: results/learning.json, docs/pictures, a table
 
-Every experiment is a run directory RUNS/TASK/LABEL. Two processes on one core each train 1.1 times as much as one on two.
+Every experiment is a run directory RUNS/TASK/LABEL; its settings and metrics are kept as they are. The curve of SBX's TD3
+(`sbx_td3.py RUNS/TASK/sbx-dense`) is one of them. Two processes on one core each train 1.1 times as much as one on two.
 """
 
 import json
+import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import lare
 from lare.credit.decomposition import CreditSettings
 from lare.experiments import figures
-from lare.experiments.report import curve
-from lare.training.run import open_run
 
 PUBLISHED = {"credit": CreditSettings(normalise=False)}
 
@@ -41,6 +43,8 @@ EXPERIMENTS = {
     "HumanoidStandup-v4": OTHERS,
 }
 STEPS, SEEDS = 100_000, 3
+KEPT = Path(__file__).parent / "results" / "learning"
+PICTURED = ("lare-rrdu", "lare-rrdu-published", "rrdu", "rrdu-published", "dense", "episodic")
 
 
 def run(directory: Path, wanted: list[str]) -> None:
@@ -55,10 +59,25 @@ def run(directory: Path, wanted: list[str]) -> None:
             lare.train(task, settings, out=out)
 
 
-def row(directory: Path) -> dict:
+def keep(directory: Path) -> None:
+    """Settings and metrics of every run that has come to its end."""
+    for metrics in sorted(directory.glob("*/*/metrics.jsonl")):
+        place = KEPT / metrics.parent.relative_to(directory)
+        if read(metrics.parent)[1][-1]["step"] == STEPS:
+            place.mkdir(parents=True, exist_ok=True)
+            for name in ("config.json", "metrics.jsonl"):
+                shutil.copyfile(metrics.parent / name, place / name)
+
+
+def read(directory: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Settings and metrics."""
+    lines = (directory / "metrics.jsonl").read_text().splitlines()
+    return json.loads((directory / "config.json").read_text()), [json.loads(line) for line in lines]
+
+
+def row(directory: Path) -> dict[str, Any]:
     """Mean and standard deviation over the seeds, at the end and over the last quarter."""
-    run = open_run(directory)
-    lines = run.metrics()
+    config, lines = read(directory)
     last = lines[-1]["step"]
     end = [line for line in lines if line["step"] == last]
     late = [line for line in lines if line["step"] > 0.75 * last]
@@ -69,31 +88,28 @@ def row(directory: Path) -> dict:
         values = [line[key] for line in end if line.get(key) is not None]
         if values:
             found[key] = [np.mean(values), np.std(values, ddof=1)]
-    return {"machine": run.config.machine, "versions": run.config.versions, **found}
+    return {"machine": config["machine"], "versions": config["versions"], **found}
 
 
-def draw(directory: Path, labels: list[str]) -> None:
-    """The learning curves of a task, in the report's form."""
-    runs = {label: open_run(directory / label) for label in labels}
-    points = {label: curve(run, "evaluation/return") for label, run in runs.items()}
-    if points:
-        picture = Path(__file__).parents[1] / "docs" / "pictures" / f"{directory.name}.svg"
-        picture.parent.mkdir(exist_ok=True)
-        picture.write_text(figures.curves({k: v for k, v in points.items() if v is not None}, "true return") + "\n")
+def curve(directory: Path) -> figures.Curve:
+    """Steps, and the return of every seed at them."""
+    _, lines = read(directory)
+    steps, seeds = (sorted({line[key] for line in lines}) for key in ("step", "seed"))
+    returns = {(line["seed"], line["step"]): line["evaluation/return"] for line in lines}
+    return np.asarray(steps, float), np.asarray([[returns[seed, step] for step in steps] for seed in seeds], float)
 
 
-def table(directory: Path) -> None:
-    found = {
-        f"{task}/{label}": row(directory / task / label)
-        for task, labels in EXPERIMENTS.items()
-        for label in labels
-        if (directory / task / label / "metrics.jsonl").exists()
-    }
-    out = Path(__file__).parent / "results" / "learning.json"
-    out.parent.mkdir(exist_ok=True)
-    out.write_text(json.dumps(found, indent=1) + "\n")
-    for task, labels in EXPERIMENTS.items():
-        draw(directory / task, [label for label in labels if f"{task}/{label}" in found])
+def table() -> None:
+    found = {f"{directory.parent.name}/{directory.name}": row(directory) for directory in sorted(KEPT.glob("*/*"))}
+    (KEPT.parent / "learning.json").write_text(json.dumps(found, indent=1) + "\n")
+    for task in EXPERIMENTS:
+        labels = [label for label in PICTURED if f"{task}/{label}" in found]
+        if labels:
+            picture = Path(__file__).parents[1] / "docs" / "pictures" / f"{task}.svg"
+            picture.parent.mkdir(exist_ok=True)
+            picture.write_text(
+                figures.curves({label: curve(KEPT / task / label) for label in labels}, "true return") + "\n"
+            )
     for name, of_run in found.items():
         parts = [
             f"{key.split('/')[-1]} {value[0]:.3g} ± {value[1]:.2g}"
@@ -104,9 +120,12 @@ def table(directory: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 3 or sys.argv[1] not in ("run", "table"):
-        sys.exit(__doc__)
-    if sys.argv[1] == "run":
-        run(Path(sys.argv[2]), sys.argv[3:])
-    else:
-        table(Path(sys.argv[2]))
+    match sys.argv[1:]:
+        case ["run", runs, *wanted]:
+            run(Path(runs), wanted)
+        case ["keep", runs]:
+            keep(Path(runs))
+        case ["table"]:
+            table()
+        case _:
+            sys.exit(__doc__)

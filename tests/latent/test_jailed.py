@@ -1,6 +1,7 @@
 """A program in its worker, seen by the parent: what goes in and out, and how a worker ends."""
 
 import errno
+import functools
 import gc
 import os
 import signal
@@ -33,9 +34,12 @@ def batch(rows: int, dtype: type = np.float32) -> tuple[np.ndarray, np.ndarray]:
     return random.standard_normal((rows, 2)).astype(dtype), random.uniform(-1, 1, (rows, 1)).astype(dtype)
 
 
+compiled = functools.cache(Program)
+
+
 def expected(source: str, *inputs: np.ndarray) -> np.ndarray:
     """Factors as they come in this process."""
-    return np.concatenate(Program(source)(*inputs), axis=1).astype(np.float64)
+    return np.concatenate(compiled(source)(*inputs), axis=1).astype(np.float64)
 
 
 @pytest.fixture(scope="module")

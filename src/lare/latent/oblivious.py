@@ -108,7 +108,9 @@ TELLING = {"numpy.shape", "numpy.ndim", "numpy.size", "numpy.finfo"}
 SHAPING = {
     **dict.fromkeys("zeros ones full identity".split(), (0,)),
     **dict.fromkeys("repeat tile reshape broadcast_to split pad".split(), (1,)),
-    "arange": (0, 1, 2), "linspace": (2,), "eye": (0, 1),
+    "arange": (0, 1, 2),
+    "linspace": (2,),
+    "eye": (0, 1),
 }
 """Functions of NumPy some of whose arguments say what shape the result has, and which."""
 
