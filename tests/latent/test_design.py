@@ -8,7 +8,7 @@ from lare.errors import LareError
 from lare.latent import design as module
 from lare.latent.checks import Check
 from lare.latent.design import ATTEMPTS, LONGEST_QUOTE, DesignFailed, design
-from lare.latent.verify import Verdict
+from lare.latent.verify import Verdict, random_steps
 from lare.llm.prompts import candidate, combine, correct
 from lare.llm.recording import read_recording
 from lare.tasks.spec import read_task, shipped_tasks
@@ -45,6 +45,12 @@ class Scripted:
     def reply(self, messages, sample):
         self.asked.append((list(messages), sample))
         return self.lines.pop(0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def steps():
+    """The toy's steps, made before candidates ask for them in threads: its instances share one action space."""
+    random_steps(toy_spec())
 
 
 @pytest.fixture

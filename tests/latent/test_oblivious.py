@@ -189,7 +189,7 @@ ARGUMENTS = {
 TAKE_NO_ARRAY = {"numpy.arange", "numpy.eye", "numpy.identity", "numpy.ones", "numpy.zeros"}
 
 
-@pytest.mark.parametrize("name", sorted(FUNCTIONS.keys() - TAKE_NO_ARRAY))
+@pytest.mark.parametrize("name", sorted(name for name in FUNCTIONS.keys() - TAKE_NO_ARRAY if not name.startswith("$")))
 def test_no_function_of_numpy_forgets_whom_it_was_given(name):
     x = np.abs(batch()[0][:, :3]) + 0.5
     if name in ARGUMENTS:

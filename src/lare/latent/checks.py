@@ -96,6 +96,8 @@ def factors_of(returned: Returned, rows: int, kind: str) -> Float[np.ndarray, "r
     """A list of 1 to 32 real arrays (B, 1), side by side. Raises `Failed` where something else came."""
     if returned.error is not None:
         raise failed("E-RUN", returned.error, returned.line)
+    if returned.values is None and not returned.instead:
+        raise failed("E-FORM", "nothing came back")
     if returned.values is None:
         raise failed("E-FORM", f"{NAME} must return a list of arrays, but returned {shown(returned.instead)}")
     if kind == "reward" and len(returned.values) != 1:
@@ -146,8 +148,12 @@ def control_flow(trial: Trial) -> None:
     """Which way it takes through its code does not depend on values; and it reads only entries that there are."""
     returned = trial.program.call(trial.observation, trial.action, "oblivious")
     kind, _, said = (returned.error or "").partition(": ")
-    if kind in ("Looked", "Missing"):
-        raise failed("E-FLOW" if kind == "Looked" else "E-INDEX", said, returned.line)
+    if kind == "Missing":
+        raise failed("E-INDEX", said, returned.line)
+    if returned.error is not None:
+        raise failed(
+            "E-FLOW", said if kind == "Looked" else f"what it does depends on values: {returned.error}", returned.line
+        )
 
 
 def loops(trial: Trial) -> None:
@@ -204,8 +210,8 @@ def deterministic(trial: Trial) -> None:
 
 def rows_apart(trial: Trial) -> None:
     """A row's factors stay the same, bit for bit, whatever stands in the other rows."""
-    kept = np.arange(len(trial.observation)) % 2 == 0
-    for strength in (3, 1000):
+    even = np.arange(len(trial.observation)) % 2 == 0
+    for kept, strength in ((even, 3), (~even, 1000)):
         observation, action = (
             np.where(kept[:, None], ours, strength * other)
             for ours, other in zip((trial.observation, trial.action), trial.noise(len(kept)), strict=True)

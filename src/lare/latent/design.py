@@ -92,6 +92,7 @@ class Conversation:
         replies = [self.ask("candidate", request, sample) for sample in range(candidates)]
         if candidates == 1:
             return request, replies[0]
+        random_steps(self.task)  # once, before several want them at the same time
         with ThreadPoolExecutor() as pool:
             tried = list(pool.map(lambda reply: examine(reply, self.task, self.kind), replies))
         for number, attempt in enumerate(tried, start=1):

@@ -37,7 +37,7 @@ def inspect(source: str) -> list[Problem]:
     except SyntaxError as error:
         return [Problem("E-SYNTAX", error.lineno or 1, error.msg)]
     except (ValueError, MemoryError, RecursionError) as error:
-        return [Problem("E-SYNTAX", 1, f"this cannot be parsed: {error or type(error).__name__}")]
+        return [Problem("E-SYNTAX", 1, f"this cannot be parsed: {str(error) or type(error).__name__}")]
     if depth(tree) > DEEPEST:
         return [Problem("E-SIZE", 1, f"the expressions are nested more than {DEEPEST} deep")]
     gate = Gate(definitions(tree))

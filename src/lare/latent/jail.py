@@ -110,7 +110,7 @@ def landlock(libc: ctypes.CDLL) -> bool:
 
 SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC = 1, 1
 KILL_PROCESS, ERRNO, ALLOW = 0x80000000, 0x00050000, 0x7FFF0000
-PROT_EXEC, MADV_REMOVE = 4, 9
+PROT_EXEC = 4
 
 MACHINES = {
     "x86_64": (
@@ -137,17 +137,20 @@ MACHINES = {
 }  # fmt: skip
 """Of each processor: its number in the kernel's audit, the number of `seccomp`, and the system calls that are left."""
 
-ONLY = {"read": (0,), "write": (1, 2)}
-"""The file descriptors that calls on files may name: the pipes to the parent."""
 
 LOAD, EQUAL, SET, RETURN = 0x20, 0x15, 0x45, 0x06
 """Instructions of the filter: load a word; jump where it equals; jump where it has a bit; end."""
 
-FORBIDDEN = {"mmap": (SET, PROT_EXEC), "mprotect": (SET, PROT_EXEC), "madvise": (EQUAL, MADV_REMOVE)}
-"""What the third argument of a call must not be: executable memory, or holes in memory that the parent reads."""
-
 NUMBER, ARCHITECTURE, FIRST, THIRD = 0, 4, 16, 32
 """Where the call's number, the processor and (the low words of) the first and third argument stand."""
+
+
+ONLY = {
+    "read": (FIRST, (0,)),
+    "write": (FIRST, (1, 2)),
+    "madvise": (THIRD, (4, 8, 14, 15)),
+}
+"""What an argument must be: the pipes to the parent; pages that are given back, or may be huge (and no worse advice)."""
 
 
 def instructions(audit: int, calls: dict[str, int], refused: int) -> Iterator[tuple[int, int, int, int]]:
@@ -158,17 +161,17 @@ def instructions(audit: int, calls: dict[str, int], refused: int) -> Iterator[tu
     yield LOAD, 0, 0, NUMBER
     for name, number in calls.items():
         if name in ONLY:
-            yield EQUAL, 0, 2 + 2 * len(ONLY[name]), number
-            yield LOAD, 0, 0, FIRST
-            for descriptor in ONLY[name]:
-                yield EQUAL, 0, 1, descriptor
+            place, values = ONLY[name]
+            yield EQUAL, 0, 2 + 2 * len(values), number
+            yield LOAD, 0, 0, place
+            for value in values:
+                yield EQUAL, 0, 1, value
                 yield RETURN, 0, 0, ALLOW
             yield RETURN, 0, 0, refused
-        elif name in FORBIDDEN:
+        elif name in {"mmap", "mprotect"}:
             yield EQUAL, 0, 4, number
             yield LOAD, 0, 0, THIRD
-            test, value = FORBIDDEN[name]
-            yield test, 1, 0, value
+            yield SET, 1, 0, PROT_EXEC
             yield RETURN, 0, 0, ALLOW
             yield RETURN, 0, 0, refused
         else:

@@ -126,6 +126,8 @@ class JailedProgram:
             answer = self.ask({"source": len(text), "gate": gated, **sizes})
             self.problems = [Problem(plain(code), count(line), plain(said)) for code, line, said in answer["problems"]]
             self.failed = self.read(answer, 0) if "error" in answer else None
+            if self.problems:
+                self.close()
         except (KeyError, TypeError, ValueError, ArithmeticError) as error:
             self.broken(f"it said something that cannot be read ({error!r})")
 
@@ -205,7 +207,7 @@ class JailedProgram:
 
     def ending(self) -> str:
         """How the worker ended, in a few words."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
+        with contextlib.suppress(subprocess.TimeoutExpired, ValueError, OSError):
             code = self.process.wait(1)
             if code < 0:
                 return f"signal {-code}"
@@ -302,9 +304,7 @@ def start(memory: Sequence[Shared], kill: bool, audit: bool) -> subprocess.Popen
             start_new_session=True,  # Ctrl-C is for the parent, which saves and leaves
         )
     except OSError as error:
-        raise WorkerFailed(
-            f"the process for the latent function cannot be started: {error.strerror or error}"
-        ) from error
+        raise NoWorker(f"the process for the latent function cannot be started: {error.strerror or error}") from error
 
 
 def shut(process: subprocess.Popen[bytes]) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Never
 import numpy as np
 
 from lare.latent.language import DOTTED, METHODS
-from lare.latent.program import CALLED_TYPES, only_numbers, resolve
+from lare.latent.program import CALLED_TYPES, OPERATORS, namespace, only_numbers, resolve
 
 
 class Looked(Exception):
@@ -127,4 +127,6 @@ def careful_functions() -> Mapping[str, Callable[..., Any]]:
         for name in names
         if name.startswith("numpy.")
     }
-    return functions | {f"{name}()": careful(resolve(name)) for name in CALLED_TYPES}
+    functions |= {f"{name}()": careful(resolve(name)) for name in CALLED_TYPES}
+    # What takes a hidden array in is hidden from then on.
+    return functions | {f"$i{name}": careful(namespace()[f"$i{name}"]) for name in OPERATORS}

@@ -9,6 +9,7 @@ fuel, and what can grow without a loop (`*` and `**` on integers and sequences) 
 import ast
 import builtins
 import copy
+import functools
 import math
 import operator
 import sys
@@ -28,8 +29,6 @@ FUEL = 20_000
 
 LONGEST_SEQUENCE = 10_000
 LARGEST_BITS = 4096
-
-Factors = list[np.ndarray]
 
 CALLED_TYPES = frozenset(f"numpy.{name}" for name in DTYPES)
 """Types that are called as functions too: `np.float32(x)`."""
@@ -55,10 +54,10 @@ class Program:
         tree = ast.fix_missing_locations(Rewrite().program(ast.parse(source)))
         names = {**namespace(), **(functions or {}), "$burn": self.burn, "$range": self.range}
         exec(compile(tree, FILE, "exec", dont_inherit=True), names)
-        self.make: Callable[[], Callable[[np.ndarray, np.ndarray], Factors]] = names["$program"]
+        self.make: Callable[[], Callable[[np.ndarray, np.ndarray], Any]] = names["$program"]
         self.steps = 0
 
-    def __call__(self, observation: np.ndarray, action: np.ndarray) -> Factors:
+    def __call__(self, observation: np.ndarray, action: np.ndarray) -> Any:
         self.steps = 0
         return self.make()(observation, action)
 
@@ -74,6 +73,11 @@ class Program:
 
 def namespace() -> dict[str, Any]:
     """Everything that a program can name, and nothing that leads further."""
+    return dict(everything())
+
+
+@functools.cache
+def everything() -> dict[str, Any]:
     names: dict[str, Any] = {name: resolve(name) for name in DOTTED.keys() | CONSTANTS | {"numpy.errstate"}}
     names |= {name: only_numbers(names[name]) for name in DOTTED if name.startswith("numpy.") and name not in CONSTANTS}
     names |= {f"{name}()": only_numbers(names[name]) for name in CALLED_TYPES}
@@ -88,6 +92,7 @@ def namespace() -> dict[str, Any]:
         "round": rounded,
         "sum": total,
     }
+    names |= {name: at_once(getattr(builtins, name)) for name in ("enumerate", "reversed", "zip")}
     # NumPy imports parts of itself through its caller's __import__, which no program can name.
     return {**names, "__builtins__": {"__import__": already_loaded}}
 
