@@ -21,6 +21,19 @@ from lare.training.session import Session, begin, new_learner
 
 PACKAGES = ("lare-rl", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "stable-baselines3", "sbx-rl", "torch")
 
+TD3 = {
+    "learning_rate": 3e-4,
+    "buffer_size": 1_000_000,
+    "batch_size": 256,
+    "tau": 0.005,
+    "gamma": 0.99,
+    "train_freq": 1,
+    "gradient_steps": 1,
+    "policy_delay": 2,
+    "policy_kwargs": {"net_arch": [256, 256]},
+}
+"""Hyperparameters of the paper's TD3, as Stable-Baselines3 and SBX call them."""
+
 
 def interleave(contenders: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
     """Seconds that each contender took in each round: A B C A B C ..., after one round that compiles and is not counted."""

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import sbx
 import tyro
-from measure import provenance
+from measure import TD3, provenance
 from stable_baselines3.common.noise import NormalActionNoise
 
 
@@ -65,20 +65,12 @@ def main(
         model = sbx.TD3(
             "MlpPolicy",
             gymnasium.make(task),
-            learning_rate=3e-4,
-            buffer_size=1_000_000,
             learning_starts=warmup,
-            batch_size=256,
-            tau=0.005,
-            gamma=0.99,
-            train_freq=1,
-            gradient_steps=1,
-            policy_delay=2,
             target_policy_noise=0.2,
             target_noise_clip=0.5,
             action_noise=NormalActionNoise(np.zeros(actions), 0.1 * np.ones(actions)),
-            policy_kwargs={"net_arch": [256, 256]},
             seed=seed,
+            **TD3,
         )
         for step in range(evaluate_every, steps + 1, evaluate_every):
             model.learn(evaluate_every, reset_num_timesteps=False, log_interval=1_000_000)

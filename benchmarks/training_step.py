@@ -21,7 +21,7 @@ import sbx
 import stable_baselines3
 import tyro
 from jax import Array
-from measure import advance, interleave, new_session, ratio, show, summary, write
+from measure import TD3, advance, interleave, new_session, ratio, show, summary, write
 from stable_baselines3.common.noise import NormalActionNoise
 
 import lare
@@ -47,18 +47,10 @@ def theirs(algorithm: Callable[..., Any]) -> Any:
     model = algorithm(
         "MlpPolicy",
         TASK,
-        learning_rate=3e-4,
-        buffer_size=1_000_000,
         learning_starts=BEFORE,
-        batch_size=256,
-        tau=0.005,
-        gamma=0.99,
-        train_freq=1,
-        gradient_steps=1,
-        policy_delay=2,
         action_noise=NormalActionNoise(np.zeros(6), 0.1 * np.ones(6)),
-        policy_kwargs={"net_arch": [256, 256]},
         seed=SEED,
+        **TD3,
         device="cpu",
     )
     return model.learn(BEFORE, log_interval=1_000_000)

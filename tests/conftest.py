@@ -2,12 +2,14 @@
 
 import json
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import pytest
 
+from lare import cli
 from lare.tasks.spec import TaskSpec
 from toys import PHI, Chase, toy_spec
 
@@ -45,3 +47,21 @@ def spec_file(tmp_path) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Runs `lare ARGUMENTS` in an empty directory; gives exit status, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["lare", *map(str, arguments)])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as left:
+            status = left.code
+        return status, *capsys.readouterr()
+
+    return run

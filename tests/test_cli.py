@@ -1,6 +1,5 @@
 """The command line, in this process: what it prints, and that a mistake is one line and exit status 2."""
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,24 +14,6 @@ TINY = (
     "--steps 200 --chunk 50 --evaluate-every 100 --evaluation-episodes 1 "
     "--td3.warmup 100 --td3.hidden 8 8 --credit.hidden 8 8"
 ).split()
-
-
-@pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Runs `lare ARGUMENTS` in an empty directory; gives exit status, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "120")
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["lare", *map(str, arguments)])
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as left:
-            status = left.code
-        return status, *capsys.readouterr()
-
-    return run
 
 
 @pytest.fixture

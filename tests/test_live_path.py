@@ -1,13 +1,11 @@
 """From a live model to a trained policy, without a network: a server on loopback speaks for the recorded model."""
 
 import json
-import sys
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lare import cli
 from lare.errors import LareError
 from lare.latent.design import design
 from lare.latent.function import load
@@ -46,31 +44,14 @@ def serve(monkeypatch):
         server.server_close()
 
 
-@pytest.fixture
-def lare(monkeypatch, capsys, tmp_path):
-    """Runs `lare ARGUMENTS` in an empty directory; gives exit status, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["lare", *map(str, arguments)])
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as left:
-            status = left.code
-        return status, *capsys.readouterr()
-
-    return run
-
-
 def everything_written(directory) -> bytes:
     return b"".join(path.read_bytes() for path in directory.rglob("*") if path.is_file())
 
 
-def test_from_a_live_model_to_a_trained_policy(serve, lare, tmp_path):
+def test_from_a_live_model_to_a_trained_policy(serve, command, tmp_path):
     server = serve(recorded_answers)
     asked = ("--model", "m", "--base-url", server.url, "--record", "talk.json", "--price", 1, 2)
-    status, out, err = lare("design", "Reacher-v4", *asked, "--out", "phi.py")
+    status, out, err = command("design", "Reacher-v4", *asked, "--out", "phi.py")
     assert status == 0
     assert out.startswith("wrote phi.py: ")
     assert err.splitlines()[-1] == "m: 6 requests, 600 tokens in, 60 out, 0.0007 by the given prices"
@@ -82,31 +63,31 @@ def test_from_a_live_model_to_a_trained_policy(serve, lare, tmp_path):
     recording = read_recording((tmp_path / "talk.json").read_text(), "talk.json")
     assert (recording.model, recording.task) == ("m", "Reacher-v4")
     assert [exchange.model_dump() for exchange in recording.exchanges] == list(recorded.exchanges)
-    again, out, _ = lare("design", "Reacher-v4", "--model", "talk.json")
+    again, out, _ = command("design", "Reacher-v4", "--model", "talk.json")
     assert (again, out) == (0, recorded.source + "\n")
     assert len(server.requests) == 6
 
     length = "--steps 100 --chunk 50 --evaluate-every 100 --evaluation-episodes 1".split()
     size = "--td3.warmup 50 --td3.hidden 8 8 --credit.hidden 8 8".split()
-    status, _, err = lare("train", "Reacher-v4", "--function", "phi.py", "--out", "run", *length, *size)
+    status, _, err = command("train", "Reacher-v4", "--function", "phi.py", "--out", "run", *length, *size)
     assert status == 0
     assert "the latent function runs in a process of its own" in err
     assert KEY.encode() not in everything_written(tmp_path)
 
 
-def test_a_recording_is_not_overwritten(serve, lare, tmp_path):
+def test_a_recording_is_not_overwritten(serve, command, tmp_path):
     (tmp_path / "talk.json").write_text("mine")
     server = serve(recorded_answers)
-    status, _, err = lare("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--record", "talk.json")
+    status, _, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--record", "talk.json")
     assert status == 2
     assert "lare: talk.json exists, and is not overwritten; choose another --record" in err
     assert (tmp_path / "talk.json").read_text() == "mine"
 
 
-def test_when_nothing_passes_every_attempt_is_kept(serve, lare, tmp_path):
+def test_when_nothing_passes_every_attempt_is_kept(serve, command, tmp_path):
     server = serve(says("I would rather talk about something else."))
     for name in ("Reacher-v4.attempts.json", "Reacher-v4.attempts-2.json"):
-        status, out, err = lare("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1)
+        status, out, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1)
         assert (status, out) == (1, "")
         assert "none of 5 attempts passed; the last one failed: the reply is not one JSON object" in err
         assert f"every attempt is kept in {name}" in err
@@ -121,9 +102,9 @@ def test_when_nothing_passes_every_attempt_is_kept(serve, lare, tmp_path):
         (["--budget", 100], "lare: the next request might pass the budget of 100 tokens (0 are used)"),
     ],
 )
-def test_a_budget_ends_a_design(serve, lare, arguments, said):
+def test_a_budget_ends_a_design(serve, command, arguments, said):
     server = serve(recorded_answers)
-    status, out, err = lare("design", "Reacher-v4", "--model", "m", "--base-url", server.url, *arguments)
+    status, out, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, *arguments)
     assert (status, out) == (2, "")
     assert said in err
     assert len(server.requests) <= 2

@@ -202,21 +202,22 @@ def finite(trial: Trial) -> None:
 
 def deterministic(trial: Trial) -> None:
     """The same steps have the same factors, here and in another process."""
+    known = trial.known
     for program, where in ((trial.program, "at a second call"), (trial.again, "in another process")):
         found = factors_of(program.call(trial.observation, trial.action), len(trial.observation), trial.kind)
-        if not np.array_equal(found, trial.known):
+        if not np.array_equal(found, known):
             raise failed("E-CHANCE", f"the same steps have other factors {where}: a factor must not depend on chance")
 
 
 def rows_apart(trial: Trial) -> None:
     """A row's factors stay the same, bit for bit, whatever stands in the other rows."""
-    even = np.arange(len(trial.observation)) % 2 == 0
+    known, even = trial.known, np.arange(len(trial.observation)) % 2 == 0
     for kept, strength in ((even, 3), (~even, 1000)):
         observation, action = (
             np.where(kept[:, None], ours, strength * other)
             for ours, other in zip((trial.observation, trial.action), trial.noise(len(kept)), strict=True)
         )
-        changed = trial.factors(observation, action)[kept] != trial.known[kept]
+        changed = trial.factors(observation, action)[kept] != known[kept]
         if not changed.any():
             continue
         number = int(changed.any(axis=0).argmax()) + 1

@@ -17,7 +17,7 @@ from lare.latent.evaluator import Evaluator
 from lare.latent.names import factor_meanings, names_of
 from lare.latent.verify import verify
 from lare.llm.prompts import Kind
-from lare.tasks.spec import TaskSpec, read_text
+from lare.tasks.spec import Judges, TaskSpec, read_text
 
 HEADER = "# lare: "
 """Marks the lines that `save` puts on top of the source."""
@@ -81,6 +81,21 @@ class LatentFunction:
             LatentRewardError: the function failed, or gave the wrong shape or a number that is not finite.
         """
         return self.evaluator(observation.shape[1], action.shape[1])(observation, action)
+
+    def of_steps(
+        self,
+        before: Float[np.ndarray, "batch observation"],
+        action: Float[np.ndarray, "batch action"],
+        after: Float[np.ndarray, "batch observation"],
+        judges: Judges,
+    ) -> Float[np.ndarray, "batch factors"]:
+        """The factors of steps by the observations that are judged; by both, one behind the other.
+
+        Raises:
+            LatentRewardError: as when called.
+        """
+        judged = {"before": [before], "after": [after], "both": [before, after]}[judges]
+        return np.concatenate([self(observation, action) for observation in judged], axis=1)
 
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: everything but the workers, which start there anew."""

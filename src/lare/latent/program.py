@@ -82,8 +82,8 @@ def everything() -> dict[str, Any]:
     names |= {name: only_numbers(names[name]) for name in DOTTED if name.startswith("numpy.") and name not in CONSTANTS}
     names |= {f"{name}()": only_numbers(names[name]) for name in CALLED_TYPES}
     names |= {name: getattr(builtins, name) for name in BUILTINS if name != "range"}  # which counts its turns
-    names |= {f"${name}": guarded(name, *functions) for name, functions in OPERATORS.items()}
-    names |= {f"$i{name}": guarded(name, functions[1]) for name, functions in OPERATORS.items()}
+    for name, (plain, in_place) in OPERATORS.items():
+        names |= {f"${name}": guarded(name, plain), f"$i{name}": guarded(name, in_place)}
     names |= {
         "$list": list,
         "$array": array_only,
@@ -227,7 +227,7 @@ OPERATORS: dict[str, tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]
 """Each operator, and what it does in place."""
 
 
-def guarded(name: str, function: Callable[[Any, Any], Any], *_: Any) -> Callable[[Any, Any], Any]:
+def guarded(name: str, function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """An operator that lets nothing grow without bound."""
     check = CHECKED.get(name, lambda left, right: None)
 

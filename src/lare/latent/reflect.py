@@ -56,9 +56,7 @@ def episodes_of(task: TaskSpec, policy: Policy | None = None, count: int = EPISO
 
 def factors_of(function: LatentFunction, task: TaskSpec, episode: Episode) -> Float[np.ndarray, "steps factors"]:
     """The factors of an episode's steps, by the observations that the task says are judged."""
-    before, after = episode.observation[:-1], episode.observation[1:]
-    judged = {"before": [before], "after": [after], "both": [before, after]}[task.judges]
-    return np.concatenate([function(observation, episode.action) for observation in judged], axis=1)
+    return function.of_steps(episode.observation[:-1], episode.action, episode.observation[1:], task.judges)
 
 
 def held_out_fit(means: Float[np.ndarray, "episodes factors"], targets: Float[np.ndarray, " episodes"]) -> float:

@@ -50,7 +50,6 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors") -> Verdict:
     sizes = observation.shape[1], action.shape[1]
     try:
         with contextlib.ExitStack() as stack:
-            # The second one only has to answer once; both start at the same time.
             program = stack.enter_context(contextlib.closing(JailedProgram(source, *sizes)))
             if program.problems:
                 return Verdict((Check("gate", False, "\n".join(map(str, program.problems))),), 0)

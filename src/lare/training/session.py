@@ -86,13 +86,12 @@ class Session:
         if self.run.function is None:
             return np.zeros((*action.shape[:2], 0), np.float32)
         before, after = np.asarray(collected.steps.observation), np.asarray(collected.steps.next_observation)
-        judged = {"before": [before], "after": [after], "both": [before, after]}[self.run.judges]
         try:
-            rows = [self.run.function(flat(observation), flat(action)) for observation in judged]
+            rows = self.run.function.of_steps(flat(before), flat(action), flat(after), self.run.judges)
         except LatentRewardError as error:
             place = self.run.keep_batch(error.observation, error.action)
             raise LareError(f"{error}; it was given the batch in {place}; the last checkpoint is whole") from error
-        return np.concatenate(rows, axis=1).reshape(*action.shape[:2], -1)
+        return rows.reshape(*action.shape[:2], -1)
 
     def report(self, rate: float) -> list[dict[str, Any]]:
         """Evaluate; one line of metrics.jsonl for each seed."""
