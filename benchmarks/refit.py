@@ -18,7 +18,7 @@ from measure import write
 from lare.credit import accuracy, decomposition
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Fit
-from lare.credit.normalise import Scale
+from lare.normalise import Scale
 from lare.training import off_policy, replay
 from lare.training.off_policy import RECENT, Learner, Recipe
 from lare.training.run import open_run
@@ -33,7 +33,7 @@ def updates(credit: Decomposition, held: replay.Replay, key: jax.Array, fit: Fit
         features = off_policy.features(replay.read(held, drawn.steps), recipe.method)
         chosen = drawn.episodes
         episodes = Episodes(features, drawn.episode, chosen.length, chosen.mean_reward, chosen.counts)
-        return decomposition.update(credit, episodes, fit, recipe.credit)[0], None
+        return decomposition.update(credit, episodes, key, fit, recipe.credit)[0], None
 
     return jax.lax.scan(one, credit, off_policy.draw_parts_of_episodes(held, key, STRETCH, recipe))[0]
 
@@ -43,7 +43,7 @@ def refit(learner: Learner, recipe: Recipe, fit: Fit, scale: Scale) -> list[dict
     assert known is not None
     recent = replay.read(held, held.transitions - 1 - jnp.arange(RECENT))
     features, every = off_policy.features(recent, recipe.method), jnp.ones(RECENT, bool)
-    credit = decomposition.init(jax.random.key(0), recipe.features, recipe.credit)
+    credit = decomposition.init(jax.random.key(0), recipe.features, recipe.method, recipe.credit, steps=1, agents=1)
     credit = credit._replace(moments=known.moments, scale=scale)
     found = []
     for number in range(UPDATES // STRETCH):

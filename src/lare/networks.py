@@ -1,9 +1,11 @@
 """The one network shape that actors, critics and decoders share, and the steps that change its parameters."""
 
+from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -25,7 +27,7 @@ class Linear(eqx.Module):
 
 
 class MLP(eqx.Module):
-    """Linear layers with ReLU between them.
+    """Linear layers with an activation between them, ReLU unless another is given.
 
     `MLP(3, (256, 256), 1, key=key)` is `Linear(3, 256)`, ReLU, `Linear(256, 256)`, ReLU, `Linear(256, 1)`.
     Weights and biases start uniform in ±1/sqrt(fan-in). Every leaf is an array, so that a whole training state can
@@ -33,19 +35,44 @@ class MLP(eqx.Module):
     """
 
     layers: tuple[Linear, ...]
+    activation: Callable[[Array], Array] = eqx.field(static=True)
 
-    def __init__(self, in_size: int, hidden: tuple[int, ...], out_size: int, *, key: PRNGKeyArray):
+    def __init__(
+        self,
+        in_size: int,
+        hidden: tuple[int, ...],
+        out_size: int,
+        *,
+        key: PRNGKeyArray,
+        activation: Callable[[Array], Array] = jax.nn.relu,
+    ):
         sizes = (in_size, *hidden, out_size)
         keys = jax.random.split(key, len(sizes) - 1)
         self.layers = tuple(
             Linear(fan_in, fan_out, key=layer_key)
             for fan_in, fan_out, layer_key in zip(sizes[:-1], sizes[1:], keys, strict=True)
         )
+        self.activation = activation
 
     def __call__(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
         for layer in self.layers[:-1]:
-            x = jax.nn.relu(layer(x))
+            x = self.activation(layer(x))
         return self.layers[-1](x)
+
+
+def orthogonal(network: MLP, last_gain: float, *, key: PRNGKeyArray) -> MLP:
+    """The same network with orthogonal weights (Saxe et al., 2014), of gain 1 and at last `last_gain`, and no biases."""
+    keys = jax.random.split(key, len(network.layers))
+    gains = (1.0,) * (len(network.layers) - 1) + (last_gain,)
+    started = tuple(
+        eqx.tree_at(
+            lambda layer: (layer.weight, layer.bias),
+            layer,
+            (jax.nn.initializers.orthogonal(gain)(layer_key, layer.weight.shape), jnp.zeros_like(layer.bias)),
+        )
+        for layer, gain, layer_key in zip(network.layers, gains, keys, strict=True)
+    )
+    return eqx.tree_at(lambda network: network.layers, network, started)
 
 
 Parameters = TypeVar("Parameters")
@@ -57,10 +84,10 @@ def start_adam(parameters: Any, learning_rate: float) -> optax.OptState:
 
 
 def descend(
-    parameters: Parameters, gradient: Parameters, state: optax.OptState, learning_rate: float
+    parameters: Parameters, gradient: Parameters, state: optax.OptState, learning_rate: float | Array
 ) -> tuple[Parameters, optax.OptState]:
     """One step of Adam (Kingma and Ba, 2015) against the gradient."""
-    change, state = optax.adam(learning_rate).update(cast(Any, gradient), state)
+    change, state = optax.adam(cast(float, learning_rate)).update(cast(Any, gradient), state)
     return cast(Parameters, optax.apply_updates(cast(Any, parameters), change)), state
 
 

@@ -7,9 +7,10 @@ import pytest
 
 from lare.credit import decomposition
 from lare.credit.decomposition import CreditSettings, Episodes
-from lare.credit.methods import Fit
+from lare.credit.methods import METHODS, Fit
 
 EPISODES, LENGTH, FEATURES = 64, 10, 3
+KEY = jax.random.key(3)
 
 
 def data(scale=1.0, feature_scale=1.0, seed=0):
@@ -22,12 +23,12 @@ def data(scale=1.0, feature_scale=1.0, seed=0):
 
 def train(fit, settings, scale=1.0, feature_scale=1.0, updates=600):
     features, reward = data(scale, feature_scale)
-    state = decomposition.init(jax.random.key(0), FEATURES, settings)
+    state = decomposition.init(jax.random.key(0), FEATURES, METHODS["rd"], settings, LENGTH, 1)
     state = decomposition.observe_steps(state, jnp.asarray(features.reshape(-1, FEATURES)))
     state = decomposition.observe_returns(state, jnp.asarray(reward.mean(axis=1)), jnp.ones(EPISODES, bool))
     steps = LENGTH if fit is Fit.ALL_STEPS else 5
     rng = np.random.default_rng(1)
-    update = jax.jit(lambda state, episodes: decomposition.update(state, episodes, fit, settings))
+    update = jax.jit(lambda state, episodes: decomposition.update(state, episodes, KEY, fit, settings))
     losses = []
     for _ in range(updates):
         chosen = rng.choice(EPISODES, 16, replace=False)
@@ -69,8 +70,8 @@ def test_scaled_returns_and_features_train_the_same(what, factor):
 
 def test_without_an_episode_nothing_is_learned():
     settings = CreditSettings(hidden=(8,), sum_form=True)
-    state = decomposition.init(jax.random.key(0), FEATURES, settings)
+    state = decomposition.init(jax.random.key(0), FEATURES, METHODS["rd"], settings, LENGTH, 1)
     episodes = Episodes(jnp.ones((4, FEATURES)), jnp.zeros(4, int), jnp.ones(1, int), jnp.zeros(1), jnp.zeros(1))
-    after, metrics = decomposition.update(state, episodes, Fit.ALL_STEPS, settings)
+    after, metrics = decomposition.update(state, episodes, KEY, Fit.ALL_STEPS, settings)
     assert float(metrics["credit/loss"]) == 0.0
     assert jax.tree.all(jax.tree.map(jnp.array_equal, state.decoder, after.decoder))

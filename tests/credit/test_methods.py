@@ -27,8 +27,9 @@ def test_published_rows():
     ("name", "message"),
     [
         ("lare_rrdu", "no method 'lare_rrdu' (did you mean 'lare-rrdu'?); the methods are dense, episodic, rd, rrd, "
-         "rrdu, lare-rd, lare-rrdu"),
-        ("", "no method ''; the methods are dense, episodic, rd, rrd, rrdu, lare-rd, lare-rrdu"),
+         "rrdu, vib-rd, vib-rrdu, arel, stas, lare-rd, lare-rrdu, lare-rd-shared"),
+        ("", "no method ''; the methods are dense, episodic, rd, rrd, rrdu, vib-rd, vib-rrdu, arel, stas, "
+         "lare-rd, lare-rrdu, lare-rd-shared"),
     ],
 )  # fmt: skip
 def test_unknown_method(name, message):

@@ -2,9 +2,12 @@
 
     r_hat = scale * f_psi(normalise(x)),    psi <- descend loss(r_hat / scale, R / (T * scale))
 
-x is what the method's encoder gives (the factors z = phi(s, a), or the raw [s, a, s - s']), `scale` the running root
-mean square of R/T. Since features and targets are normalised by statistics in the state, scaling the return, or any
-factor, changes nothing but the scale of r_hat. `normalise = false` is the published form: raw features, raw targets.
+x is what the method's encoder gives (the factors z = phi(s, a), or raw features), `scale` the running root mean square of
+R/T. Where there are many agents, every one has proxy rewards of its own, R is the mean over the agents of their returns,
+and what is fitted to it is the mean over the agents of r_hat: the same equations, credit over time and among agents.
+
+Since features and targets are normalised by statistics in the state, scaling the return, or any factor, changes nothing
+but the scale of r_hat. `normalise = false` is the published form: raw features, raw targets.
 """
 
 from typing import Annotated, NamedTuple
@@ -16,10 +19,16 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from pydantic import Field
 
 from lare.credit import losses
-from lare.credit.methods import Fit
-from lare.credit.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe, observe_scale, standardise
+from lare.credit.arel import AREL
+from lare.credit.decoders import Bottleneck, Decoded, StepDecoder
+from lare.credit.methods import Decoder, Fit, Method
+from lare.credit.stas import STAS
 from lare.errors import Checked
-from lare.networks import MLP, descend, start_adam
+from lare.networks import descend, start_adam
+from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe, observe_scale, standardise
+
+Network = StepDecoder | Bottleneck | AREL | STAS
+"""A decoder of any kind."""
 
 
 class CreditSettings(Checked):
@@ -29,6 +38,8 @@ class CreditSettings(Checked):
     """Widths of the decoder's hidden layers."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Adam's step size."""
+    weight_decay: Annotated[float, Field(ge=0)] = 0.0
+    """Times the weights, added to their gradient."""
     normalise: bool = True
     """Normalise features and returns by running statistics. The published form does not."""
     sum_form: bool = False
@@ -37,12 +48,14 @@ class CreditSettings(Checked):
     """K: steps drawn from an episode by RRD and its kin."""
     steps: Annotated[int, Field(ge=2)] = 256
     """Steps in one update of the decoder: K steps of 256 // K episodes, or whole episodes that make up about 256."""
+    bottleneck: Annotated[int, Field(ge=1)] = 4
+    """Size of the code in the middle of VIB."""
 
 
 class Episodes(NamedTuple):
     """Steps of some episodes, and what those episodes returned. For K drawn steps, rows = episodes * K, in order."""
 
-    features: Float[Array, "rows features"]
+    features: Float[Array, "rows *agents features"]
     episode: Int[Array, " rows"]
     """Which of the episodes a row belongs to; a number outside 0..episodes-1 where the row is padding."""
     length: Int[Array, " episodes"]
@@ -53,20 +66,33 @@ class Episodes(NamedTuple):
 
 
 class Decomposition(NamedTuple):
-    decoder: MLP
+    """Everything that is learned about credit."""
+
+    decoder: Network
     optimizer: optax.OptState
     moments: Moments
     scale: Scale
 
 
-def init(key: PRNGKeyArray, features: int, settings: CreditSettings) -> Decomposition:
-    decoder = MLP(features, settings.hidden, 1, key=key)
+def init(
+    key: PRNGKeyArray, features: int, method: Method, settings: CreditSettings, steps: int, agents: int
+) -> Decomposition:
+    """An untrained decoder of the method's kind, for episodes of `steps` steps of `agents` agents."""
+    match method.decoder:
+        case Decoder.STEP:
+            decoder = StepDecoder(features, settings.hidden, key=key)
+        case Decoder.BOTTLENECK:
+            decoder = Bottleneck(features, settings.hidden, settings.bottleneck, key=key)
+        case Decoder.AREL:
+            decoder = AREL(features, steps, key=key)
+        case Decoder.STAS:
+            decoder = STAS(features, steps, agents, key=key)
     return Decomposition(decoder, start_adam(decoder, settings.learning_rate), no_moments(features), no_scale())
 
 
-def observe_steps(state: Decomposition, features: Float[Array, "batch features"]) -> Decomposition:
+def observe_steps(state: Decomposition, features: Float[Array, "*batch features"]) -> Decomposition:
     """Take newly stored steps into the statistics."""
-    return state._replace(moments=observe(state.moments, features))
+    return state._replace(moments=observe(state.moments, features.reshape(-1, features.shape[-1])))
 
 
 def observe_returns(
@@ -77,30 +103,37 @@ def observe_returns(
 
 
 def decode(
-    decoder: MLP, state: Decomposition, features: Float[Array, "batch features"], settings: CreditSettings
-) -> Float[Array, " batch"]:
+    decoder: Network,
+    state: Decomposition,
+    features: Float[Array, "rows *agents features"],
+    settings: CreditSettings,
+    key: PRNGKeyArray | None = None,
+) -> Decoded:
     """f_psi in units of the scale."""
-    rows = standardise(state.moments, features) if settings.normalise else features
-    return decoder(rows)[:, 0]
+    return decoder(standardise(state.moments, features) if settings.normalise else features, key)
 
 
 def proxy_rewards(
-    state: Decomposition, features: Float[Array, "batch features"], settings: CreditSettings
-) -> Float[Array, " batch"]:
-    """r_hat of a batch of steps, by the decoder as it stands."""
-    r_hat = decode(state.decoder, state, features, settings)
+    state: Decomposition, features: Float[Array, "rows *agents features"], settings: CreditSettings
+) -> Float[Array, "rows *agents"]:
+    """r_hat of some steps, by the decoder as it stands."""
+    r_hat = decode(state.decoder, state, features, settings).r_hat
     return magnitude(state.scale) * r_hat if settings.normalise else r_hat
 
 
 def update(
-    state: Decomposition, episodes: Episodes, fit: Fit, settings: CreditSettings
+    state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
     """One step of gradient descent on the loss that `fit` names."""
     target = episodes.mean_reward / magnitude(state.scale) if settings.normalise else episodes.mean_reward
     weight = losses.episode_weight(episodes.length, episodes.counts, settings.sum_form)
 
-    def loss_of(decoder: MLP) -> Float[Array, ""]:
-        r_hat = decode(decoder, state, episodes.features, settings)
+    def loss_of(decoder: Network) -> Float[Array, ""]:
+        decoded = decode(decoder, state, episodes.features, settings, key)
+        r_hat = jnp.mean(decoded.r_hat.reshape(len(episodes.features), -1), axis=1)
+        return losses_of(r_hat) + decoded.penalty
+
+    def losses_of(r_hat: Float[Array, " rows"]) -> Float[Array, ""]:
         if fit is Fit.ALL_STEPS:
             mean = losses.episode_means(r_hat, episodes.episode, episodes.length)
             return losses.squared_error(mean, target, weight)
@@ -110,5 +143,6 @@ def update(
         return losses.unbiased_squared_error(drawn, target, episodes.length, weight)
 
     loss, gradient = jax.value_and_grad(loss_of)(state.decoder)
+    gradient = jax.tree.map(lambda slope, weight: slope + settings.weight_decay * weight, gradient, state.decoder)
     decoder, optimizer = descend(state.decoder, gradient, state.optimizer, settings.learning_rate)
     return state._replace(decoder=decoder, optimizer=optimizer), {"credit/loss": loss}

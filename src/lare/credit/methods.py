@@ -1,8 +1,8 @@
-"""THE table: every published way to assign credit, as encoder + fit.
+"""THE table: every published way to assign credit, as encoder + fit + decoder.
 
 A *method* says what the algorithm is trained on. `encoder` is what the decoder sees of a step, `fit` how it is fitted to
-returns. The two ends of the table fit nothing: `dense` trains on the true rewards, `episodic` on the return, paid at the
-last step.
+returns, `decoder` what it is. The two ends of the table fit nothing: `dense` trains on the true rewards, `episodic` on the
+return, paid at the last step. The rows serve one agent and many; those that need several agents say so.
 """
 
 import difflib
@@ -16,7 +16,9 @@ class Encoder(StrEnum):
     """What the decoder sees of a step."""
 
     RAW = "raw"
-    """[s, a, s - s'], as published for RD and RRD."""
+    """As published for RD and RRD: [s, a, s - s'] of a single agent, the next observation of each of many."""
+    TAKEN = "taken"
+    """[s, a]."""
     LATENT = "latent"
     """The factors z = phi(s, a), and nothing else."""
 
@@ -30,6 +32,19 @@ class Fit(StrEnum):
     """RRD: K steps drawn from each episode."""
     DRAWN_STEPS_UNBIASED = "drawn steps, unbiased"
     """RRD-unbiased: the same, less the variance that the drawing adds."""
+
+
+class Decoder(StrEnum):
+    """From what the encoder gives to proxy rewards."""
+
+    STEP = "step"
+    """An MLP on each step of each agent."""
+    BOTTLENECK = "bottleneck"
+    """The same behind a variational information bottleneck."""
+    AREL = "arel"
+    """Attention over time and agents; one reward a step for all agents."""
+    STAS = "stas"
+    """Attention over time, then over random coalitions of agents."""
 
 
 class Reward(StrEnum):
@@ -50,11 +65,20 @@ class Method:
     fit: Fit | None
     summary: str
     source: str
+    decoder: Decoder = Decoder.STEP
+    shared: bool = False
+    """Whether every agent gets the mean of all agents' proxy rewards: credit over time alone."""
+
+    @property
+    def for_many_only(self) -> bool:
+        """Whether it says nothing where there is a single agent."""
+        return self.shared or self.decoder in (Decoder.AREL, Decoder.STAS)
 
 
 LARE = "Qu et al., LaRe, AAAI 2025"
 RD = "Efroni et al., AAAI 2021; Arjona-Medina et al., RUDDER, 2019"
 RRD = "Ren et al., RRD, ICLR 2022"
+VIB = "Alemi et al., ICLR 2017; LaRe, appendix F.2"
 
 TABLE = (
     Method("dense", Reward.TRUE, None, None, "the true reward of every step: the upper end", "-"),
@@ -62,8 +86,47 @@ TABLE = (
     Method("rd", Reward.PROXY, Encoder.RAW, Fit.ALL_STEPS, "return decomposition on raw features", RD),
     Method("rrd", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS, "randomized return decomposition", RRD),
     Method("rrdu", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS_UNBIASED, "RRD without the bias of the drawing", RRD),
+    Method(
+        "vib-rd", Reward.PROXY, Encoder.RAW, Fit.ALL_STEPS, "RD behind a bottleneck of its own", VIB, Decoder.BOTTLENECK
+    ),
+    Method(
+        "vib-rrdu",
+        Reward.PROXY,
+        Encoder.RAW,
+        Fit.DRAWN_STEPS_UNBIASED,
+        "RRD-unbiased behind a bottleneck of its own",
+        VIB,
+        Decoder.BOTTLENECK,
+    ),
+    Method(
+        "arel",
+        Reward.PROXY,
+        Encoder.RAW,
+        Fit.ALL_STEPS,
+        "attention over time and agents, one reward a step",
+        "Xiao et al., AREL, AAMAS 2022",
+        Decoder.AREL,
+    ),
+    Method(
+        "stas",
+        Reward.PROXY,
+        Encoder.TAKEN,
+        Fit.ALL_STEPS,
+        "attention over time, Shapley values over agents",
+        "Chen et al., STAS, AAAI 2024",
+        Decoder.STAS,
+    ),
     Method("lare-rd", Reward.PROXY, Encoder.LATENT, Fit.ALL_STEPS, "return decomposition on latent rewards", LARE),
     Method("lare-rrdu", Reward.PROXY, Encoder.LATENT, Fit.DRAWN_STEPS_UNBIASED, "RRD-unbiased on latent rewards", LARE),
+    Method(
+        "lare-rd-shared",
+        Reward.PROXY,
+        Encoder.LATENT,
+        Fit.ALL_STEPS,
+        "lare-rd without credit among agents: all get their mean",
+        LARE,
+        shared=True,
+    ),
 )
 
 METHODS = {method.name: method for method in TABLE}

@@ -19,7 +19,7 @@ from lare.algorithms import td3
 from lare.credit import accuracy, decomposition
 from lare.credit.decomposition import CreditSettings, Decomposition, Episodes
 from lare.credit.methods import Encoder, Fit, Method, Reward
-from lare.credit.normalise import Scale, magnitude, no_scale, observe_scale
+from lare.normalise import Scale, magnitude, no_scale, observe_scale
 from lare.training import replay
 from lare.training.replay import Draw, Replay, Step
 
@@ -61,7 +61,11 @@ def init(key: PRNGKeyArray, recipe: Recipe) -> Learner:
     algorithm_key, credit_key = jax.random.split(key)
     return Learner(
         td3.init(algorithm_key, recipe.observation_size, recipe.action_size, recipe.td3),
-        decomposition.init(credit_key, recipe.features, recipe.credit) if recipe.method.encoder else None,
+        None
+        if recipe.method.encoder is None
+        else decomposition.init(
+            credit_key, recipe.features, recipe.method, recipe.credit, steps=recipe.longest_episode, agents=1
+        ),
         no_scale(),
         replay.empty(recipe.capacity, recipe.observation_size, recipe.action_size, recipe.factors),
     )
@@ -176,7 +180,8 @@ def improve(
             seen = features(replay.read(held, draws.credit.steps), recipe.method)
             chosen = draws.credit.episodes
             episodes = Episodes(seen, draws.credit.episode, chosen.length, chosen.mean_reward, chosen.counts)
-            credit, measured = decomposition.update(credit, episodes, recipe.method.fit, recipe.credit)
+            credit_key = jax.random.fold_in(key, 1)
+            credit, measured = decomposition.update(credit, episodes, credit_key, recipe.method.fit, recipe.credit)
         batch = replay.read(held, draws.batch)
         reward = rewards(batch, learner._replace(credit=credit), recipe)
         batch = td3.Transitions(batch.observation, batch.action, reward, batch.next_observation, batch.continues)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lare.credit import normalise
+from lare import normalise
 
 
 def observe_all(batches):

@@ -32,13 +32,18 @@ def observe(moments: Moments, rows: Float[Array, "batch features"]) -> Moments:
     return Moments(count, moments.mean + gap * share, squares)
 
 
+def deviation(moments: Moments) -> Float[Array, " features"]:
+    """Standard deviations; 0 for a feature that never varied."""
+    found = jnp.sqrt(moments.squares / jnp.maximum(moments.seen, 1))
+    # A deviation within float32's rounding of the mean is noise, whatever its absolute size.
+    return jnp.where(found > 1e-6 * jnp.abs(moments.mean), found, 0)
+
+
 def standardise(moments: Moments, rows: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
     """(x - mean) / std, cut off at ±10. A feature that never varied becomes 0."""
-    deviation = jnp.sqrt(moments.squares / jnp.maximum(moments.seen, 1))
-    # A deviation within float32's rounding of the mean is noise, whatever its absolute size.
-    varies = deviation > 1e-6 * jnp.abs(moments.mean)
-    scaled = (rows - moments.mean) / jnp.where(varies, deviation, 1)
-    return jnp.where(varies, jnp.clip(scaled, -CLIP, CLIP), 0)
+    spread = deviation(moments)
+    scaled = (rows - moments.mean) / jnp.where(spread > 0, spread, 1)
+    return jnp.where(spread > 0, jnp.clip(scaled, -CLIP, CLIP), 0)
 
 
 class Scale(NamedTuple):

@@ -1,0 +1,48 @@
+"""What AREL and STAS are made of: attention over an axis, and layer normalisation."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+class LayerNorm(eqx.Module):
+    """(x - mean) / std of each row, then scaled and shifted (Ba, Kiros and Hinton, 2016)."""
+
+    weight: Float[Array, " size"]
+    bias: Float[Array, " size"]
+    epsilon: float = eqx.field(static=True)
+
+    def __init__(self, size: int, epsilon: float = 1e-5):
+        self.weight, self.bias, self.epsilon = jnp.ones(size), jnp.zeros(size), epsilon
+
+    def __call__(self, x: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
+        centred = x - jnp.mean(x, axis=-1, keepdims=True)
+        variance = jnp.mean(centred**2, axis=-1, keepdims=True)
+        return self.weight * centred * jax.lax.rsqrt(variance + self.epsilon) + self.bias
+
+
+def attend(
+    query: Float[Array, "*batch tokens heads size"],
+    key: Float[Array, "*batch tokens heads size"],
+    value: Float[Array, "*batch tokens heads size"],
+    mask: Bool[Array, "tokens tokens"] | None = None,
+    drop: Float[Array, "..."] | None = None,
+) -> Float[Array, "*batch tokens joined"]:
+    """softmax(Q K^T / sqrt(size)) V of each head, heads side by side (Vaswani et al., 2017, Eq. 1).
+
+    Where `mask` is false a token is not looked at. `drop` multiplies the attention, for dropout.
+    """
+    scores = jnp.einsum("...ihd,...jhd->...hij", query, key) / jnp.sqrt(query.shape[-1])
+    if mask is not None:
+        scores = jnp.where(mask, scores, -1e9)
+    weights = jax.nn.softmax(scores)
+    if drop is not None:
+        weights = weights * drop
+    found = jnp.einsum("...hij,...jhd->...ihd", weights, value)
+    return found.reshape(*found.shape[:-2], -1)
+
+
+def causal(length: int) -> Bool[Array, "length length"]:
+    """A step sees itself and what came before."""
+    return jnp.tril(jnp.ones((length, length), bool))

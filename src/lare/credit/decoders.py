@@ -1,0 +1,63 @@
+"""From what a method's encoder gives to proxy rewards, step by step.
+
+Every decoder is called with rows of features, in one shape:
+
+    decoder(features [rows *agents features], key) -> Decoded(r_hat [rows *agents], penalty)
+
+`penalty` is added to the loss of the return decomposition. `key` is for decoders that draw while they learn; without one
+they give what the algorithm is to be trained on. Those that look across steps and agents have files of their own,
+`arel.py` and `stas.py`; their rows must be whole episodes, one behind the other.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare.networks import MLP
+
+
+class Decoded(NamedTuple):
+    """What a decoder says of some steps."""
+
+    r_hat: Float[Array, "rows *agents"]
+    penalty: Float[Array, ""]
+
+
+class StepDecoder(eqx.Module):
+    """f_psi: one MLP for every step of every agent."""
+
+    network: MLP
+
+    def __init__(self, features: int, hidden: tuple[int, ...], *, key: PRNGKeyArray):
+        self.network = MLP(features, hidden, 1, key=key)
+
+    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
+        return Decoded(self.network(features)[..., 0], jnp.zeros(()))
+
+
+class Bottleneck(eqx.Module):
+    """VIB: a variational information bottleneck (Alemi et al., 2017) before the decoder; LaRe, appendix F.2.
+
+    z ~ N(mu(x), sigma(x)^2),    r_hat = f_psi(z),    penalty = E KL(N(mu, sigma^2) || N(0, 1))
+
+    At use z is mu(x).
+    """
+
+    encoder: MLP
+    network: MLP
+
+    def __init__(self, features: int, hidden: tuple[int, ...], size: int, *, key: PRNGKeyArray):
+        encoder_key, network_key = jax.random.split(key)
+        self.encoder = MLP(features, (256,), 2 * size, key=encoder_key)
+        self.network = MLP(size, hidden, 1, key=network_key)
+
+    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
+        mean, log_variance = jnp.split(self.encoder(features), 2, axis=-1)
+        z = mean
+        if key is not None:
+            z = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
+        divergence = 0.5 * jnp.sum(jnp.exp(log_variance) + mean**2 - 1 - log_variance, axis=-1)
+        return Decoded(self.network(z)[..., 0], jnp.mean(divergence))

@@ -1,0 +1,114 @@
+"""STAS: spatial-temporal return decomposition (Chen et al., AAAI 2024), its first and default version.
+
+Causal attention over the steps of each agent, then attention over the agents of each step under random coalitions, whose
+mean approximates the Shapley value of an agent:
+
+    r_hat_{i,t} = w . mean_k attention(h_t, mask_k)_i,    mask_k ~ Bernoulli(1/2)^{n x n}, 1 on the diagonal
+
+Learning draws coalitions, agent numbers and dropout anew at each update. At use the published code goes on drawing; here
+the coalitions are the same at every call, and so are the rewards that it gives.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare.credit.attention import LayerNorm, attend, causal
+from lare.credit.decoders import Decoded
+from lare.networks import MLP, Linear
+
+SIZE, HEADS, LAYERS, COALITIONS, DROPOUT = 128, 4, 3, 5, 0.5
+
+
+def dropout(x: Float[Array, "..."], key: PRNGKeyArray | None) -> Float[Array, "..."]:
+    """Some entries 0, the others larger; x itself without a key."""
+    if key is None:
+        return x
+    return x * jax.random.bernoulli(key, 1 - DROPOUT, x.shape) / (1 - DROPOUT)
+
+
+def heads(x: Float[Array, "*batch size"]) -> Float[Array, "*batch heads part"]:
+    return x.reshape(*x.shape[:-1], HEADS, SIZE // HEADS)
+
+
+class TimeLayer(eqx.Module):
+    """a = attention(x), out = LN(FF(LN(x + a)) + 2 a): as published, x itself is not added again."""
+
+    query: Linear
+    key: Linear
+    value: Linear
+    merge: Linear
+    feed_forward: MLP
+    norms: tuple[LayerNorm, LayerNorm]
+
+    def __init__(self, *, key: PRNGKeyArray):
+        *keys, last = jax.random.split(key, 5)
+        self.query, self.key, self.value, self.merge = (Linear(SIZE, SIZE, key=key) for key in keys)
+        self.feed_forward = MLP(SIZE, (SIZE,), SIZE, key=last, activation=jax.nn.gelu)
+        self.norms = LayerNorm(SIZE, 1e-12), LayerNorm(SIZE, 1e-12)
+
+    def __call__(
+        self, x: Float[Array, "*batch steps size"], key: PRNGKeyArray | None
+    ) -> Float[Array, "*batch steps size"]:
+        keys = (None, None) if key is None else jax.random.split(key)
+        found = attend(heads(self.query(x)), heads(self.key(x)), heads(self.value(x)), causal(x.shape[-2]))
+        a = dropout(self.merge(found), keys[0])
+        hidden = self.norms[0](x + a)
+        return self.norms[1](dropout(self.feed_forward(hidden), keys[1]) + 2 * a)
+
+
+class Coalitions(eqx.Module):
+    """Attention over agents, each with queries of its own, as the mean over random coalitions."""
+
+    query: Float[Array, "agents size size"]
+    key: Linear
+    value: Linear
+    merge: Linear
+
+    def __init__(self, agents: int, *, key: PRNGKeyArray):
+        query_key, *keys = jax.random.split(key, 4)
+        bound = SIZE**-0.5
+        self.query = jax.random.uniform(query_key, (agents, SIZE, SIZE), minval=-bound, maxval=bound)
+        self.key, self.value, self.merge = (Linear(SIZE, SIZE, key=key) for key in keys)
+
+    def __call__(self, x: Float[Array, "*batch agents size"], key: PRNGKeyArray) -> Float[Array, "*batch agents size"]:
+        agents = x.shape[-2]
+        query = heads(jnp.einsum("...ad,ade->...ae", x, self.query))
+        keys, values = heads(self.key(x)), heads(self.value(x))
+        joined = jax.random.bernoulli(key, 0.5, (COALITIONS, agents, agents)) | jnp.eye(agents, dtype=bool)
+        found = jnp.stack([attend(query, keys, values, mask) for mask in joined])
+        return self.merge(jnp.mean(found, axis=0))
+
+
+class STAS(eqx.Module):
+    """The published network, layer by layer."""
+
+    embed: Linear
+    """Of the observation and of the action, which is a row with a single 1."""
+    step: Float[Array, "steps size"]
+    number: Float[Array, "agents size"]
+    """Embedding of agent numbers, given out at random."""
+    layers: tuple[TimeLayer, ...]
+    coalitions: Coalitions
+    last: Linear
+
+    def __init__(self, features: int, steps: int, agents: int, *, key: PRNGKeyArray):
+        embed_key, step_key, number_key, layers_key, coalitions_key, last_key = jax.random.split(key, 6)
+        self.embed = Linear(features, SIZE, key=embed_key)
+        self.step = jax.random.normal(step_key, (steps, SIZE))
+        self.number = jax.random.normal(number_key, (agents, SIZE))
+        self.layers = tuple(TimeLayer(key=key) for key in jax.random.split(layers_key, LAYERS))
+        self.coalitions = Coalitions(agents, key=coalitions_key)
+        self.last = Linear(SIZE, 1, key=last_key)
+
+    def __call__(self, features: Float[Array, "rows agents features"], key: PRNGKeyArray | None) -> Decoded:
+        rows, agents = features.shape[:2]
+        x = self.embed(features).reshape(-1, len(self.step), agents, SIZE)
+        x = jnp.swapaxes(x, 1, 2) + self.step
+        drawn_key, order_key, *keys = jax.random.split(jax.random.key(0) if key is None else key, 2 + LAYERS)
+        for layer, layer_key in zip(self.layers, keys, strict=True):
+            x = layer(x, None if key is None else layer_key)
+        order = jnp.arange(agents) if key is None else jax.random.permutation(order_key, agents)
+        x = self.coalitions(jnp.swapaxes(x, 1, 2) + self.number[order], drawn_key)
+        return Decoded(self.last(x)[..., 0].reshape(rows, agents), jnp.zeros(()))

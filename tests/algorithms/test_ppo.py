@@ -1,0 +1,158 @@
+"""PPO's update against plain NumPy, its rules one by one, and a toy that it must learn."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lare.algorithms import ppo
+from lare.algorithms.ppo import PPOSettings, Rollout
+
+SETTINGS = PPOSettings(hidden=(16,), minibatch=8, epochs=3)
+
+
+def state_of(discrete=True, settings=SETTINGS):
+    return ppo.init(jax.random.key(0), 3, 2, discrete, settings)
+
+
+def rollout_of(time=6, lanes=4, discrete=True, seed=0, ended=None):
+    rng = np.random.default_rng(seed)
+    observation = rng.normal(size=(time + 1, lanes, 3)).astype(np.float32)
+    action = rng.normal(size=(time, lanes, 2)).astype(np.float32)
+    if discrete:
+        action = np.eye(2, dtype=np.float32)[action.argmax(axis=-1)]
+    ended = np.zeros((time, lanes), np.float32) if ended is None else ended
+    reward = rng.normal(size=(time, lanes)).astype(np.float32)
+    return Rollout(*map(jnp.asarray, (observation[:-1], action, reward, observation[1:], 1 - ended, ended)))
+
+
+def test_advantages_against_a_slow_sum():
+    ended = np.zeros((6, 4), np.float32)
+    ended[2, 1] = ended[4, 2] = 1
+    rollout, rng = rollout_of(ended=ended), np.random.default_rng(1)
+    value, following = rng.normal(size=(2, 6, 4)).astype(np.float32)
+    got = ppo.advantages(rollout, jnp.asarray(value), jnp.asarray(following), SETTINGS)
+    for lane in range(4):
+        for t in range(6):
+            want, weight = 0.0, 1.0
+            for later in range(t, 6):
+                goes_on = float(rollout.continues[later, lane])
+                delta = rollout.reward[later, lane] + 0.99 * goes_on * following[later, lane] - value[later, lane]
+                want += weight * float(delta)
+                weight *= 0.99 * 0.95
+                if ended[later, lane]:
+                    break
+            assert float(got[t, lane]) == pytest.approx(want, rel=1e-4, abs=1e-5)
+
+
+def test_out_of_time_bootstraps_and_a_termination_does_not():
+    """Both end the trace; only the termination takes the value of what follows away."""
+    ended = np.ones((1, 2), np.float32)
+    rollout = rollout_of(1, 2, ended=ended)._replace(continues=jnp.array([[1.0, 0.0]]))
+    got = ppo.advantages(rollout, jnp.zeros((1, 2)), jnp.full((1, 2), 10.0), SETTINGS)
+    np.testing.assert_allclose(got - rollout.reward, [[9.9, 0.0]], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "want"),
+    [(1.0, 2.0, 2.0), (1.5, 2.0, 2.4), (0.5, 2.0, 1.0), (1.5, -2.0, -3.0), (0.5, -2.0, -1.6)],
+)
+def test_policy_objective_is_pessimistic(ratio, advantage, want):
+    got = ppo.policy_objective(jnp.array([ratio]), jnp.array([advantage]), 0.2)
+    assert float(got) == pytest.approx(want, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("value", "old", "target", "want"),
+    [
+        (1.0, 1.0, 3.0, 2.0),  # half the square
+        (2.0, 0.0, 3.0, 3.125),  # kept at 0.5, so 2.5 away: the worse of the two
+        (30.0, 30.0, 0.0, 250.0),  # linear beyond 10
+    ],
+)
+def test_value_loss_is_clipped_and_huber(value, old, target, want):
+    got = ppo.value_loss(jnp.array([value]), jnp.array([old]), jnp.array([target]), SETTINGS)
+    assert float(got) == pytest.approx(want, rel=1e-5)
+
+
+def test_a_choice_has_the_probabilities_of_its_softmax():
+    policy = state_of().online.actor
+    observation = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3)), jnp.float32)
+    both = jnp.stack([policy.log_probability(observation, jnp.tile(jnp.eye(2)[i], (5, 1))) for i in range(2)])
+    np.testing.assert_allclose(np.exp(both).sum(axis=0), 1, rtol=1e-5)
+    np.testing.assert_allclose(policy.entropy(observation), -(np.exp(both) * both).sum(axis=0), rtol=1e-4)
+    drawn = policy.sample(jnp.tile(observation[:1], (4000, 1)), jax.random.key(1))
+    np.testing.assert_allclose(drawn.mean(axis=0), np.exp(both[:, 0]), atol=0.03)
+
+
+def test_a_gaussian_has_the_density_of_a_gaussian():
+    policy = state_of(discrete=False).online.actor
+    observation, action = jnp.ones((1, 3)), jnp.array([[0.3, -1.2]])
+    z = np.asarray(action - policy.network(observation))
+    want = (-0.5 * z**2 - 0.5 * np.log(2 * np.pi)).sum()
+    assert float(policy.log_probability(observation, action)[0]) == pytest.approx(want, rel=1e-5)
+    assert float(policy.entropy(observation)[0]) == pytest.approx(2 * 0.5 * np.log(2 * np.pi * np.e), rel=1e-5)
+
+
+def test_every_epoch_reads_every_step_once():
+    order = np.asarray(ppo.minibatches(jax.random.key(0), 24, SETTINGS))
+    assert order.shape == (9, 8)
+    for epoch in order.reshape(3, 24):
+        assert sorted(epoch) == list(range(24))
+
+
+@pytest.mark.parametrize("discrete", [True, False])
+def test_rewards_of_any_scale_and_offset_train_alike(discrete):
+    """Undiscounted episodes of one length: an offset is the same for all, a scale leaves the advantages as they are."""
+    ended = np.zeros((6, 4), np.float32)
+    ended[-1] = 1
+    settings = PPOSettings(hidden=(16,), minibatch=24, epochs=2, gamma=1.0, trace=1.0)
+    rollout = rollout_of(ended=ended, discrete=discrete)._replace(continues=jnp.asarray(1 - ended))
+    state = state_of(discrete, settings)
+    quiet = state._replace(online=state.online._replace(critic=jax.tree.map(jnp.zeros_like, state.online.critic)))
+    actors = [
+        ppo.update(quiet, rollout._replace(reward=scale * rollout.reward), jax.random.key(1), jnp.array(1.0), settings)[
+            0
+        ].online.actor
+        for scale in (1.0, 1e-3, 1e3)
+    ]
+    for other in actors[1:]:
+        for a, b in zip(jax.tree.leaves(actors[0]), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
+
+
+def test_annealing_ends_at_rest():
+    settings = PPOSettings(hidden=(16,), minibatch=8, epochs=1, anneal=True)
+    state = state_of(settings=settings)
+    after, _ = ppo.update(state, rollout_of(), jax.random.key(1), jnp.array(0.0), settings)
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, after.online, state.online))
+    after, _ = ppo.update(state, rollout_of(), jax.random.key(1), jnp.array(1.0), settings)
+    assert not jax.tree.all(jax.tree.map(jnp.array_equal, after.online, state.online))
+
+
+@pytest.mark.parametrize("discrete", [True, False])
+def test_must_learn_to_follow(discrete):
+    """r = 1 where the choice is the sign of s_0; or -(a_0 - s_0)^2. The policy must find out by trying."""
+    settings = PPOSettings(hidden=(32,), minibatch=64, epochs=4, gamma=0.0, learning_rate=3e-3, entropy=0.0)
+    state = state_of(discrete, settings)
+
+    @jax.jit
+    def turn(state, key):
+        keys = jax.random.split(key, 3)
+        observation = jax.random.uniform(keys[0], (1, 256, 3), minval=-1, maxval=1)
+        action = state.online.actor.sample(observation, keys[1])
+        reward = reward_of(observation, action)
+        ends = jnp.ones((1, 256))
+        rollout = Rollout(observation, action, reward, observation, 1 - ends, ends)
+        return ppo.update(state, rollout, keys[2], jnp.array(1.0), settings)[0]
+
+    def reward_of(observation, action):
+        if discrete:
+            return (action[..., 0] == (observation[..., 0] > 0)).astype(jnp.float32)
+        return -((action[..., 0] - observation[..., 0]) ** 2)
+
+    for number in range(80):
+        state = turn(state, jax.random.key(number))
+    observation = jax.random.uniform(jax.random.key(5), (1, 256, 3), minval=-1, maxval=1)
+    learned = float(jnp.mean(reward_of(observation, state.online.actor.mode(observation))))
+    assert learned > (0.93 if discrete else -0.03)

@@ -1,0 +1,136 @@
+"""What every decoder keeps: shapes, causality, what it draws and when; and the equations of its own."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lare.credit import decomposition
+from lare.credit.arel import AREL
+from lare.credit.attention import LayerNorm, attend, causal
+from lare.credit.decoders import Bottleneck, StepDecoder
+from lare.credit.decomposition import CreditSettings, Episodes
+from lare.credit.methods import TABLE, Decoder, Fit
+from lare.credit.stas import STAS
+
+EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
+KEY = jax.random.key(1)
+DECODERS = {
+    "step": StepDecoder(FEATURES, (8,), key=KEY),
+    "bottleneck": Bottleneck(FEATURES, (8,), 2, key=KEY),
+    "arel": AREL(FEATURES, STEPS, key=KEY),
+    "stas": STAS(FEATURES, STEPS, AGENTS, key=KEY),
+}
+
+
+@pytest.fixture(params=DECODERS)
+def decoder(request):
+    return DECODERS[request.param]
+
+
+def features(seed=0):
+    rows = np.random.default_rng(seed).normal(size=(EPISODES, STEPS, AGENTS, FEATURES))
+    return jnp.asarray(rows, jnp.float32).reshape(-1, AGENTS, FEATURES)
+
+
+def by_episode(r_hat):
+    return np.asarray(r_hat).reshape(EPISODES, STEPS, AGENTS)
+
+
+def test_one_proxy_reward_for_each_agent_at_each_step(decoder):
+    for key in (None, KEY):
+        decoded = decoder(features(), key)
+        assert decoded.r_hat.shape == (EPISODES * STEPS, AGENTS)
+        assert np.isfinite(decoded.r_hat).all()
+        assert float(decoded.penalty) >= 0
+
+
+def test_at_use_nothing_is_drawn(decoder):
+    np.testing.assert_array_equal(decoder(features(), None).r_hat, decoder(features(), None).r_hat)
+
+
+@pytest.mark.parametrize(("name", "draws"), [("step", False), ("bottleneck", True), ("arel", False), ("stas", True)])
+def test_who_draws_while_learning(name, draws):
+    one, other = (DECODERS[name](features(), jax.random.key(number)).r_hat for number in (1, 2))
+    assert (np.abs(one - other).max() > 1e-6) == draws
+
+
+def test_what_comes_later_changes_nothing(decoder):
+    """Credit is causal: neither the next steps nor other episodes matter."""
+    given = features().reshape(EPISODES, STEPS, AGENTS, FEATURES)
+    changed = given.at[:, 3:].set(7.0).at[1].set(-7.0)
+    before, after = (by_episode(decoder(rows.reshape(-1, AGENTS, FEATURES), None).r_hat) for rows in (given, changed))
+    np.testing.assert_allclose(before[0, :3], after[0, :3], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(before[2:, :3], after[2:, :3], rtol=1e-4, atol=1e-5)
+    assert np.abs(before[1] - after[1]).max() > 1e-4
+
+
+def test_a_bottleneck_costs_its_divergence():
+    bottleneck = DECODERS["bottleneck"]
+    mean, log_variance = np.split(np.asarray(bottleneck.encoder(features())), 2, axis=-1)
+    want = 0.5 * (np.exp(log_variance) + mean**2 - 1 - log_variance).sum(axis=-1).mean()
+    assert float(bottleneck(features(), KEY).penalty) == pytest.approx(want, rel=1e-5)
+
+
+def test_arel_gives_every_agent_the_same_and_costs_its_variance():
+    decoded = DECODERS["arel"](features(), None)
+    given = by_episode(decoded.r_hat)
+    np.testing.assert_array_equal(given, np.broadcast_to(given[..., :1], given.shape))
+    want = 20 * given[..., 0].var(axis=1, ddof=1).mean()
+    assert float(decoded.penalty) == pytest.approx(want, rel=1e-4)
+
+
+def test_arel_cares_not_which_agent_is_which():
+    given = DECODERS["arel"](features(), None).r_hat
+    np.testing.assert_allclose(given, DECODERS["arel"](features()[:, ::-1], None).r_hat, rtol=1e-4, atol=1e-5)
+
+
+def test_attention_against_plain_sums():
+    rng = np.random.default_rng(0)
+    query, key, value = (rng.normal(size=(4, 2, 3)).astype(np.float32) for _ in range(3))
+    got = attend(jnp.asarray(query), jnp.asarray(key), jnp.asarray(value), causal(4))
+    for token in range(4):
+        for head in range(2):
+            scores = key[: token + 1, head] @ query[token, head] / np.sqrt(3)
+            weights = np.exp(scores) / np.exp(scores).sum()
+            want = weights @ value[: token + 1, head]
+            np.testing.assert_allclose(got[token, 3 * head : 3 * head + 3], want, rtol=1e-4, atol=1e-6)
+
+
+def test_layer_norm():
+    rows = np.random.default_rng(0).normal(3, 2, (5, 8)).astype(np.float32)
+    want = (rows - rows.mean(axis=1, keepdims=True)) / np.sqrt(rows.var(axis=1, keepdims=True) + 1e-5)
+    np.testing.assert_allclose(LayerNorm(8)(jnp.asarray(rows)), want, rtol=1e-4, atol=1e-5)
+
+
+DISTINCT = {(method.fit, method.decoder): method for method in TABLE if method.fit}
+
+
+@pytest.mark.parametrize("method", DISTINCT.values(), ids=lambda method: method.name)
+def test_must_learn_credit_among_agents_from_the_mean_return(method):
+    """Every agent's reward is the first feature. Only the return of all of them is known."""
+    settings = CreditSettings(hidden=(16,), learning_rate=3e-3)
+    attends = method.decoder in (Decoder.AREL, Decoder.STAS)
+    episodes, updates = 64, 20 if attends else 300
+    rows = np.random.default_rng(0).normal(size=(episodes, STEPS, AGENTS, 2)).astype(np.float32)
+    reward = rows[..., 0]
+    returns = jnp.asarray(reward.mean(axis=(1, 2)))
+    state = decomposition.init(KEY, 2, method, settings, STEPS, AGENTS)
+    state = decomposition.observe_steps(state, jnp.asarray(rows))
+    state = decomposition.observe_returns(state, returns, jnp.ones(episodes, bool))
+    drawn = STEPS if method.fit is Fit.ALL_STEPS else 3
+
+    def one(state, key):
+        order = jax.vmap(lambda key: jax.random.permutation(key, STEPS)[:drawn])(jax.random.split(key, episodes))
+        seen = jnp.asarray(rows)[jnp.arange(episodes)[:, None], jnp.sort(order, axis=1)].reshape(-1, AGENTS, 2)
+        episode, length = jnp.repeat(jnp.arange(episodes), drawn), jnp.full(episodes, STEPS)
+        batch = Episodes(seen, episode, length, returns, jnp.ones(episodes))
+        state, measured = decomposition.update(state, batch, key, method.fit, settings)
+        return state, measured["credit/loss"]
+
+    keys = jax.random.split(jax.random.key(0), updates)
+    state, losses = jax.jit(lambda state: jax.lax.scan(one, state, keys))(state)
+    assert float(losses[-5:].mean()) < float(losses[:5].mean())
+    if method.decoder is Decoder.STEP:
+        r_hat = decomposition.proxy_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), settings)
+        assert np.corrcoef(np.ravel(r_hat), reward.ravel())[0, 1] > 0.9
