@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-Layers = tuple[tuple[Float[np.ndarray, "in out"], Float[np.ndarray, " out"]], ...]
+Layers = tuple[tuple[Float[np.ndarray | Array, "_in _out"], Float[np.ndarray | Array, " _out"]], ...]
 """Weight and bias of each layer."""
 
 
