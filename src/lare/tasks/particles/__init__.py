@@ -1,0 +1,1 @@
+"""Multi-agent tasks in the plane, as pure functions that JAX compiles: `table.py` lists them."""

@@ -1,0 +1,31 @@
+"""The particle tasks, by name."""
+
+import difflib
+
+from lare.errors import LareError
+from lare.tasks.particles import navigation, predator_prey
+from lare.tasks.particles.task import ParticleTask
+from lare.tasks.particles.triangle_area import triangle_area
+
+TASKS: dict[str, ParticleTask] = {
+    task.name: task
+    for task in (
+        *map(navigation.navigation, navigation.SIZES),
+        *map(predator_prey.predator_prey, predator_prey.SIZES),
+        predator_prey.competitive(),
+        triangle_area(),
+    )
+}
+
+
+def find_particle_task(name: str) -> ParticleTask:
+    """The task of that name.
+
+    Raises:
+        LareError: there is none; the message lists those there are.
+    """
+    if name in TASKS:
+        return TASKS[name]
+    close = difflib.get_close_matches(name, TASKS, n=1)
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    raise LareError(f"no particle task {name!r}{hint}; the particle tasks are {', '.join(TASKS)}")

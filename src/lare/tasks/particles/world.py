@@ -1,0 +1,84 @@
+"""The physics of the particle tasks: discs of mass 1 in a plane without walls (Lowe et al., MADDPG, 2017).
+
+    F = sensitivity * direction + sum of contact forces
+    v <- (1 - DAMPING) v + TIME_STEP * F                  then shortened to max_speed
+    x <- x + TIME_STEP * v                                with the new velocity
+
+and, for two discs that collide, d apart, x_a - x_b = d * n,
+
+    contact force on a = CONTACT_FORCE * CONTACT_MARGIN * log(1 + exp((d_min - d) / CONTACT_MARGIN)) * n
+
+which is CONTACT_FORCE * (d_min - d) where d < d_min, and next to nothing where they do not touch.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+TIME_STEP = 0.1
+DAMPING = 0.25
+"""The share of its velocity that everything loses in a step."""
+CONTACT_FORCE = 100.0
+"""Force for each unit of length by which two discs overlap."""
+CONTACT_MARGIN = 1e-3
+"""How softly contact sets in, as a length."""
+
+DIRECTIONS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)], np.float32)
+"""What the five actions push towards: nowhere, left, right, down, up."""
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What never changes. The first `moving` entities are agents and preys, the others landmarks, which stay."""
+
+    size: Float[np.ndarray, " entities"]
+    """Radii."""
+    moving: int
+    colliding: int
+    """The first so many entities push each other away: those that move, or all."""
+    sensitivity: Float[np.ndarray, " moving"]
+    """The force of an action."""
+    max_speed: Float[np.ndarray, " moving"]
+    """`inf` where there is no limit."""
+    contact: Float[np.ndarray, "colliding colliding"]
+    """d_min: the distance of two centres below which they push."""
+
+
+class State(NamedTuple):
+    """What a step changes."""
+
+    position: Float[Array, "entities 2"]
+    velocity: Float[Array, "entities 2"]
+
+
+def at_rest(position: Float[Array, "entities 2"]) -> State:
+    return State(position, jnp.zeros_like(position))
+
+
+def push(world: World, action: Int[Array, " moving"]) -> Float[Array, "moving 2"]:
+    """The force by which each entity moves itself."""
+    return jnp.asarray(world.sensitivity)[:, None] * jnp.asarray(DIRECTIONS)[action]
+
+
+def contact_force(world: World, position: Float[Array, "entities 2"]) -> Float[Array, "moving 2"]:
+    """What all others push each moving entity with. Two centres in one place have no direction to part in: no force."""
+    bodies = position[: world.colliding]
+    offset = bodies[: world.moving, None] - bodies
+    distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
+    overlap = (world.contact[: world.moving] - distance) / CONTACT_MARGIN
+    force = CONTACT_FORCE * CONTACT_MARGIN * jnp.logaddexp(overlap, 0)
+    # An entity's distance to itself is 0 too.
+    return jnp.sum((force / jnp.where(distance > 0, distance, jnp.inf))[..., None] * offset, axis=1)
+
+
+def move(world: World, state: State, force: Float[Array, "moving 2"]) -> State:
+    """One step of TIME_STEP. The contact forces are those of the positions before it."""
+    force = force + contact_force(world, state.position)
+    velocity = (1 - DAMPING) * state.velocity[: world.moving] + TIME_STEP * force
+    speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1))
+    velocity = jnp.where(speed > world.max_speed, world.max_speed / speed, 1)[:, None] * velocity
+    moved = state.position[: world.moving] + TIME_STEP * velocity
+    return State(state.position.at[: world.moving].set(moved), state.velocity.at[: world.moving].set(velocity))
