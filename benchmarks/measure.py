@@ -6,7 +6,6 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
@@ -15,9 +14,10 @@ from typing import Any
 import jax
 
 import lare
-from lare.credit.methods import Encoder, find_method
 from lare.training.run import create
-from lare.training.session import Session, begin, new_learner
+from lare.training.settings import decide
+from lare.training.single_agent import Session, start
+from lare.training.train import chosen_functions
 
 PACKAGES = ("lare-rl", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "stable-baselines3", "sbx-rl", "torch")
 
@@ -105,9 +105,8 @@ def machine() -> dict[str, Any]:
 def new_session(directory: Path, task_name: str, settings: lare.Settings) -> Session:
     """What `lare.train` starts, without the loop around it."""
     task = lare.load_task(task_name)
-    latent = find_method(settings.method).encoder is Encoder.LATENT
-    run = create(directory, task, settings, lare.design(task, draw=settings.draw) if latent else None)
-    return begin(run, partial(new_learner, run))
+    plan = decide(settings, task)
+    return start(create(directory, task, plan, chosen_functions(task, plan, None)))
 
 
 def advance(session: Session, steps: int) -> None:

@@ -22,7 +22,7 @@ from lare.normalise import Scale
 from lare.training import off_policy, replay
 from lare.training.off_policy import RECENT, Learner, Recipe
 from lare.training.run import open_run
-from lare.training.session import load_learner
+from lare.training.single_agent import load_learner
 
 UPDATES, STRETCH = 20_000, 5_000
 

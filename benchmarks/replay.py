@@ -31,7 +31,7 @@ from lare.credit.methods import find_method
 from lare.training import off_policy, replay
 from lare.training.off_policy import Recipe
 from lare.training.replay import Replay, Step
-from lare.training.session import Session
+from lare.training.single_agent import Session
 
 SEED, EPISODE, UPDATES = 0, 1000, 50
 STORED = (10_000, 100_000, 1_000_000)

@@ -26,7 +26,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 import lare
 from lare.algorithms.td3 import TD3Settings
-from lare.training.session import Session
+from lare.training.single_agent import Session
 
 TASK, SEED = "HalfCheetah-v4", 0
 BEFORE = 2000

@@ -279,7 +279,7 @@ def test_tensorboard_events(small, tmp_path):
 def test_config_says_what_the_run_depends_on(small, phi, tmp_path):
     run = lare.train(toy_spec(), small(steps=60), function=phi, out=tmp_path / "run", listeners=[])
     config = json.loads((run.directory / "config.json").read_text())
-    assert config["function_sha256"] == phi.digest
+    assert config["function_sha256"] == [phi.digest]
     assert config["task_sha256"] == toy_spec().digest
     assert config["lare"] == lare.__version__
     assert config["settings"]["td3"]["hidden"] == [8]

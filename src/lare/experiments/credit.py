@@ -11,7 +11,7 @@ from lare.credit import decomposition
 from lare.training import off_policy, replay
 from lare.training.off_policy import RECENT, Learner, Recipe
 from lare.training.run import Run
-from lare.training.session import load_learner
+from lare.training.single_agent import load_learner
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from lare.errors import LareError
 from lare.tasks.spec import check_against_environment
 from lare.training.environments import Policy, Stream, episode_seed, evaluate, make_episodic, to_bounds
 from lare.training.run import Run, open_run
-from lare.training.session import load_learner
+from lare.training.single_agent import load_learner
 
 
 def load_policy(run: Run) -> Policy:

@@ -15,7 +15,7 @@ from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.credit import credit_of, factor_labels
 from lare.training.run import Run, open_run
-from lare.training.settings import Settings
+from lare.training.settings import Settings, decide
 
 PAGE = """<!doctype html>
 <html lang="en">
@@ -191,7 +191,8 @@ def judged(run: Run) -> str:
 
 def settings_table(run: Run) -> str:
     """What differs from the defaults in sight, everything else folded away."""
-    chosen, defaults = (flatten(settings.model_dump()) for settings in (run.config.settings, Settings()))
+    usual = decide(Settings(), run.config.task)
+    chosen, defaults = (flatten(plan.model_dump()) for plan in (run.config.settings, usual))
     rows = [(key, json.dumps(value)) for key, value in chosen.items() if value != defaults[key] or key == "method"]
     config = run.config
     rows.append(("LaRe", f"{config.lare}; {', '.join(f'{name} {number}' for name, number in config.versions.items())}"))

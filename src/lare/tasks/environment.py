@@ -7,10 +7,11 @@ from typing import Any
 import gymnasium
 
 from lare.errors import LareError
-from lare.tasks import mujoco
+from lare.tasks import mujoco, particles
 from lare.tasks.spaces import as_rows
 
 mujoco.register()
+particles.register()
 
 
 def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) -> gymnasium.Env:

@@ -13,6 +13,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from lare.errors import Checked, LareError
 from lare.tasks.environment import make
+from lare.tasks.particles import NAMES, NAMESPACE
 
 Judges = Literal["before", "after", "both"]
 """Which observation `phi` judges a step by: that before the action, that which the action led to, or both, one after
@@ -46,6 +47,8 @@ class TaskSpec(Checked):
     """Time limit, for an environment that has none of its own."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` that are averaged and reported beside the return."""
+    teams: tuple["TaskSpec", ...] = ()
+    """Where several teams learn, each for itself: a spec for each, with texts of its own. In TOML, their names."""
 
     @model_validator(mode="after")
     def is_filled_in(self) -> "TaskSpec":
@@ -53,6 +56,17 @@ class TaskSpec(Checked):
             if FILL_IN in getattr(self, key):
                 raise ValueError(f"{key} still says {FILL_IN!r}: say there what a language model must know")
         return self
+
+    @property
+    def particles(self) -> str | None:
+        """Which particle task this is (`particles/table.py`), for those that many agents learn together."""
+        name = self.environment.removeprefix(NAMESPACE)
+        return name if name != self.environment and name in NAMES else None
+
+    @property
+    def roles(self) -> tuple["TaskSpec", ...]:
+        """The specs that latent functions are designed for: those of the teams, or this one."""
+        return self.teams or (self,)
 
     @property
     def digest(self) -> str:
@@ -107,12 +121,15 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise LareError(f"task {task!r} is not valid TOML: {error}") from error
+    for key in ("like", "teams"):
+        named = values.get(key, [])
+        for other in [named] if isinstance(named, str) else named:
+            if not isinstance(other, str) or other in (*seen, task):
+                raise LareError(f"task {task!r}: {key} = {named!r} must name other tasks, without a circle")
+    if "teams" in values:
+        values["teams"] = [read_values(team, (*seen, task)) for team in values["teams"]]
     parent = values.pop("like", None)
-    if parent is None:
-        return values
-    if not isinstance(parent, str) or parent in seen or parent == task:
-        raise LareError(f"task {task!r}: like = {parent!r} must name another task, without a circle")
-    return read_values(parent, (*seen, task)) | values
+    return values if parent is None else read_values(parent, (*seen, task)) | values
 
 
 def is_file(name: str) -> bool:

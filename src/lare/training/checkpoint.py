@@ -10,22 +10,32 @@ A row file is only ever added; `state.npz` is written beside the old one and ren
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lare.errors import LareError
-from lare.training.off_policy import Learner
-from lare.training.replay import capacity
-
-ROWS = ("observation", "action", "factors", "reward", "terminated")
-"""Fields of the replay that are saved by row."""
 
 STATE = "state.npz"
+
+
+class Learner(Protocol):
+    """Any training state with a replay: arrays with a seed axis first and, if they are saved by row, rows behind it.
+
+    `replay.next_row` is the number of rows ever written; they stand at their number modulo the capacity.
+    """
+
+    @property
+    def replay(self) -> Any: ...
+
+    def _replace(self, **changes: Any) -> Self: ...
+
+
+Some = TypeVar("Some", bound=Learner)
 
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
@@ -42,11 +52,11 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
         raise LareError(f"{path} cannot be written ({error.strerror or error}); what was there is as it was") from error
 
 
-def named_leaves(learner: Learner) -> dict[str, Any]:
+def named_leaves(learner: Any, by_row: Sequence[str]) -> dict[str, Any]:
     """Every array of the state by its place, but for those that are saved by row."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(learner)
     named = {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
-    return {name: leaf for name, leaf in named.items() if name not in {f".replay.{field}" for field in ROWS}}
+    return {name: leaf for name, leaf in named.items() if name not in {f".replay.{field}" for field in by_row}}
 
 
 @jax.jit
@@ -54,15 +64,22 @@ def take(buffer: jax.Array, index: jax.Array) -> jax.Array:
     return jax.vmap(lambda rows, where: rows[where])(buffer, index)
 
 
-def save(directory: Path, learner: Learner, host: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+def save(
+    directory: Path,
+    learner: Learner,
+    by_row: Sequence[str],
+    host: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+) -> None:
     """Write a checkpoint.
 
     Args:
+        by_row: the fields of the replay whose rows are written as they come.
         host: what else is to be remembered, as JSON.
         arrays: the same, as arrays.
     """
     directory.mkdir(exist_ok=True)
-    held, rows = learner.replay, capacity(learner.replay)
+    held, rows = learner.replay, learner.replay.reward.shape[1]
     end = np.asarray(held.next_row)
     start, segments = np.zeros_like(end), []
     if (directory / STATE).exists():
@@ -74,19 +91,19 @@ def save(directory: Path, learner: Learner, host: Mapping[str, Any], arrays: Map
     count = end - start + 1
     width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations
     index = jnp.asarray((start[:, None] + np.arange(width)) % rows)
-    segment = {field: np.asarray(take(getattr(held, field), index))[:, : count.max()] for field in ROWS}
+    segment = {field: np.asarray(take(getattr(held, field), index))[:, : count.max()] for field in by_row}
     number = segments[-1]["number"] + 1 if segments else 0
     write_atomically(directory / f"rows-{number}.npz", lambda file: np.savez(file, allow_pickle=False, **segment))
     segments.append({"number": number, "start": start.tolist(), "count": count.tolist()})
     alive = [old for old in segments if any(np.add(old["start"], old["count"]) > end - rows)]
-    state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner).items()} | dict(arrays)
+    state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner, by_row).items()} | dict(arrays)
     state |= {"host": np.array(json.dumps(host)), "segments": np.array(json.dumps(alive))}
     write_atomically(directory / STATE, lambda file: np.savez(file, allow_pickle=False, **state))
     for old in segments[: len(segments) - len(alive)]:
         (directory / f"rows-{old['number']}.npz").unlink(missing_ok=True)
 
 
-def load(directory: Path, template: Learner) -> tuple[Learner, dict[str, Any], dict[str, np.ndarray]]:
+def load(directory: Path, template: Some, by_row: Sequence[str]) -> tuple[Some, dict[str, Any], dict[str, np.ndarray]]:
     """Read a checkpoint into a learner of the structure of `template` (whose leaves may be only shapes).
 
     Returns it, and `host` and `arrays` as saved.
@@ -101,14 +118,14 @@ def load(directory: Path, template: Learner) -> tuple[Learner, dict[str, Any], d
         with np.load(path, allow_pickle=False) as saved:
             state = {name: saved[name] for name in saved.files}
         host, segments = json.loads(str(state.pop("host"))), json.loads(str(state.pop("segments")))
-        learner = with_rows(fill(template, state), directory, segments)
+        learner = with_rows(fill(template, state, by_row), by_row, directory, segments)
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise LareError(f"the checkpoint {path} cannot be read: {error}") from error
     return learner, host, {name: array for name, array in state.items() if not name.startswith(".")}
 
 
-def fill(template: Learner, state: Mapping[str, np.ndarray]) -> Learner:
-    known = named_leaves(template)
+def fill(template: Some, state: Mapping[str, np.ndarray], by_row: Sequence[str]) -> Some:
+    known = named_leaves(template, by_row)
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     filled = []
     for path, leaf in leaves:
@@ -119,9 +136,9 @@ def fill(template: Learner, state: Mapping[str, np.ndarray]) -> Learner:
     return jax.tree.unflatten(structure, filled)
 
 
-def with_rows(learner: Learner, directory: Path, segments: list[dict[str, Any]]) -> Learner:
-    held, rows = learner.replay, capacity(learner.replay)
-    for field in ROWS:  # one after the other, so that only one of them is in memory twice
+def with_rows(learner: Some, by_row: Sequence[str], directory: Path, segments: list[dict[str, Any]]) -> Some:
+    held, rows = learner.replay, learner.replay.reward.shape[1]
+    for field in by_row:  # one after the other, so that only one of them is in memory twice
         buffer = np.zeros(getattr(held, field).shape, getattr(held, field).dtype)
         for segment in segments:
             with np.load(directory / f"rows-{segment['number']}.npz", allow_pickle=False) as saved:

@@ -26,6 +26,8 @@ class Stream(IntEnum):
     TRAINING_EPISODES = 0
     EXPLORATION = 1
     EVALUATION_EPISODES = 2
+    FIT = 3
+    UPDATE = 4
 
 
 class EnvironmentFault(LareError):

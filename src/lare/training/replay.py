@@ -20,6 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
 
+ROWS = ("observation", "action", "factors", "reward", "terminated")
+"""Fields that a checkpoint saves by row."""
+
 Rows = Array | np.ndarray
 """What comes from the host may still be there."""
 

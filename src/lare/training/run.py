@@ -1,7 +1,7 @@
 """The run directory: what a run leaves on the disk, and reading it again.
 
 config.json          every setting, the package version, the spec's and the function's hash
-latent_function.py   the phi in use, and .json: replies, checks
+latent_function.py   the phi in use, and .json: replies, checks; where teams learn, latent_function_TEAM.py
 metrics.jsonl        one JSON object a line, for each seed and evaluation
 checkpoint/          see checkpoint.py
 failed_batch.npz     what the latent function was given, if it failed
@@ -19,13 +19,15 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 import lare
 from lare.errors import Checked, LareError
+from lare.latent.evaluator import LatentRewardError
 from lare.latent.function import LatentFunction, load
 from lare.tasks.spec import Judges, TaskSpec, time_limit
 from lare.training.checkpoint import STATE, write_atomically
-from lare.training.settings import Settings
+from lare.training.settings import Plan
 
 CONFIG, METRICS, FUNCTION, CHECKPOINT = "config.json", "metrics.jsonl", "latent_function.py", "checkpoint"
 FAILED_BATCH = "failed_batch.npz"
@@ -39,39 +41,45 @@ class Config(Checked):
 
     lare: str
     """Version of the package."""
-    settings: Settings
+    settings: Plan
     task: TaskSpec
     task_sha256: str
     longest_episode: int
     """The environment's time limit."""
-    function_sha256: str | None
+    function_sha256: tuple[str, ...]
+    """Of the latent functions in use: one for each team, none for a method that needs none."""
     isolation: str | None
     """What stands around the latent function while training."""
     versions: dict[str, str]
     machine: str
 
 
-def describe(task: TaskSpec, settings: Settings, function: LatentFunction | None) -> Config:
+def describe(task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) -> Config:
     """Everything that the run depends on. Raises `LareError` where the replay could not hold a single episode."""
     longest = time_limit(task)
-    if settings.rows < longest + 2:
-        raise LareError(f"capacity = {settings.rows} is too small: an episode of {task.name} takes up to {longest + 1}")
+    if plan.algorithm == "td3" and plan.rows < longest + 2:
+        raise LareError(f"capacity = {plan.rows} is too small: an episode of {task.name} takes up to {longest + 1}")
     return Config(
         lare=lare.__version__,
-        settings=settings,
+        settings=plan,
         task=task,
         task_sha256=task.digest,
         longest_episode=longest,
-        function_sha256=function.digest if function else None,
-        isolation=isolation(task, function) if function else None,
+        function_sha256=tuple(function.digest for function in functions),
+        isolation=isolation(task, functions[0]) if functions else None,
         versions={name: version(name) for name in VERSIONS} | {"python": platform.python_version()},
         machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}",
     )
 
 
 def isolation(task: TaskSpec, function: LatentFunction) -> str:
-    """What stands around a task's latent function on this machine."""
+    """What stands around a task's latent functions on this machine."""
     return function.evaluator(task.observation_size, task.action_size).isolation
+
+
+def function_file(task: TaskSpec, role: TaskSpec) -> str:
+    """Where the latent function of a role is kept."""
+    return FUNCTION if role is task else f"latent_function_{role.name.removeprefix(f'{task.name}-')}.py"
 
 
 @dataclass(frozen=True)
@@ -80,7 +88,13 @@ class Run:
 
     directory: Path
     config: Config
-    function: LatentFunction | None
+    functions: tuple[LatentFunction, ...]
+    """One for each role of the task; none for a method that needs none."""
+
+    @property
+    def function(self) -> LatentFunction | None:
+        """The only one, or the first."""
+        return self.functions[0] if self.functions else None
 
     @property
     def checkpoint(self) -> Path:
@@ -119,6 +133,20 @@ class Run:
                 f"{path} cannot be written: {error.strerror or error}; the last checkpoint is whole"
             ) from error
 
+    def factors(
+        self, function: LatentFunction, before: np.ndarray, action: np.ndarray, after: np.ndarray
+    ) -> Float[np.ndarray, "batch factors"]:
+        """Z of some steps, by the observations that are judged.
+
+        Raises:
+            LareError: the function failed; what it was given is kept in the run directory.
+        """
+        try:
+            return function.of_steps(before, action, after, self.judges)
+        except LatentRewardError as error:
+            place = self.keep_batch(error.observation, error.action)
+            raise LareError(f"{error}; it was given the batch in {place}; the last checkpoint is whole") from error
+
     def keep_batch(self, observation: np.ndarray, action: np.ndarray) -> Path:
         """Put the batch that a latent function failed with beside the run, to be looked at."""
         path = self.directory / FAILED_BATCH
@@ -133,9 +161,9 @@ class Run:
                 file.truncate(length)
 
 
-def create(directory: Path, task: TaskSpec, settings: Settings, function: LatentFunction | None) -> Run:
+def create(directory: Path, task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) -> Run:
     """A new run directory. Raises `LareError` where there is something of that name."""
-    config = describe(task, settings, function)
+    config = describe(task, plan, functions)
     try:
         directory.mkdir(parents=True)
     except FileExistsError:
@@ -145,19 +173,19 @@ def create(directory: Path, task: TaskSpec, settings: Settings, function: Latent
     except OSError as error:
         raise LareError(f"the run directory {directory} cannot be made: {error.strerror}") from error
     try:
-        if function is not None:
-            function.save(directory / FUNCTION)
+        for role, function in zip(task.roles, functions, strict=bool(functions)):
+            function.save(directory / function_file(task, role))
         # Last, and whole or not at all: what has a config.json is a run.
         text = config.model_dump_json(indent=1) + "\n"
         write_atomically(directory / CONFIG, lambda file: file.write(text.encode()))
     except OSError as error:
         raise LareError(f"{directory} cannot be written: {error.strerror}") from error
-    return Run(directory, config, function)
+    return Run(directory, config, tuple(functions))
 
 
-def default_directory(task: TaskSpec, settings: Settings) -> Path:
+def default_directory(task: TaskSpec, plan: Plan) -> Path:
     """runs/TASK-METHOD-ALGORITHM-sSEED, with a number behind it as long as that is taken."""
-    name = f"{task.name}-{settings.method}-{settings.algorithm}-s{settings.seed}"
+    name = f"{task.name}-{plan.method}-{plan.algorithm}-s{plan.seed}"
     number = 1
     while (directory := Path("runs") / (name if number == 1 else f"{name}-{number}")).exists():
         number += 1
@@ -178,10 +206,14 @@ def open_run(directory: str | Path) -> Run:
         config = Config(**json.loads(path.read_text(encoding="utf-8")))
     except (LareError, OSError, ValueError, TypeError) as error:
         raise LareError(f"{path}: {error}") from error
-    function = load(directory / FUNCTION, config.task) if config.function_sha256 else None
-    if function is not None and function.digest != config.function_sha256:
-        raise LareError(f"{directory / FUNCTION} is not the function that this run was trained with: its hash changed")
-    return Run(directory, config, function)
+    functions = []
+    for role, digest in zip(config.task.roles, config.function_sha256, strict=bool(config.function_sha256)):
+        place = directory / function_file(config.task, role)
+        function = load(place, role)
+        if function.digest != digest:
+            raise LareError(f"{place} is not the function that this run was trained with: its hash changed")
+        functions.append(function)
+    return Run(directory, config, tuple(functions))
 
 
 @contextlib.contextmanager

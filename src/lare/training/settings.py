@@ -1,27 +1,58 @@
-"""Every setting of a run. Together with the task and the latent function they say all that a run depends on."""
+"""Every setting of a run. Together with the task and the latent functions they say all that a run depends on."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from lare.algorithms.ppo import PPOSettings
 from lare.algorithms.td3 import TD3Settings
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
-from lare.errors import Checked
-from lare.tasks.spec import Judges
+from lare.errors import Checked, LareError
+from lare.tasks.spec import Judges, TaskSpec
 
 LARGEST_SEED = 2**31 - 1
 
+Algorithm = Literal["td3", "ippo"]
+
+
+class AgentSettings(Checked):
+    """What is particular to many agents. The figures are the paper's."""
+
+    episodes: Annotated[int, Field(ge=1)] = 82
+    """Episodes that are played between two updates of the policy."""
+    fit_every: Annotated[int, Field(ge=1)] = 10
+    """Updates of the policy for each time that the decoder is fitted."""
+    fit_updates: Annotated[int, Field(ge=1)] = 50
+    """Gradient steps of the decoder then."""
+    capacity: Annotated[int, Field(ge=1)] = 15_000
+    """Episodes that the replay of a seed holds, for the decoder."""
+    credit: CreditSettings = CreditSettings(
+        hidden=(64, 64, 64, 64), learning_rate=5e-4, weight_decay=1e-5, drawn_steps=10, steps=6400
+    )
+
+
+IPPO = PPOSettings(
+    learning_rate=1e-4,
+    gamma=1.0,
+    minibatch=128,
+    clip=0.5,
+    entropy=0.01,
+    gradient_norm=10.0,
+    anneal=True,
+)
+"""The paper's figures for the particle tasks."""
+
 
 class Settings(Checked):
-    """What `lare train` and `lare.train` are given."""
+    """What `lare train` and `lare.train` are given. What is None is decided by the task and the algorithm."""
 
-    method: str = "lare-rrdu"
-    """How credit is assigned: dense, episodic, rd, rrd, rrdu, lare-rd or lare-rrdu."""
-    algorithm: Literal["td3"] = "td3"
-    """The reinforcement learning algorithm."""
-    steps: Annotated[int, Field(ge=1)] = 1_000_000
-    """Environment steps of each seed."""
+    method: str | None = None
+    """How credit is assigned (see `lare methods`); lare-rrdu for td3, lare-rd for ippo, unless given."""
+    algorithm: Algorithm | None = None
+    """The reinforcement learning algorithm: ippo for tasks of many agents, td3 for all others."""
+    steps: Annotated[int | None, Field(ge=1)] = None
+    """Environment steps of each seed (all agents act in one): 1,000,000 for td3, 2,050,000 for ippo."""
     seeds: Annotated[int, Field(ge=1)] = 1
     """How many seeds to train, in lockstep in one process."""
     seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 0
@@ -31,39 +62,91 @@ class Settings(Checked):
     draw: Annotated[int, Field(ge=0)] = 0
     """Which recorded reply of the language model to take phi from (0 to 4); independent of the seed."""
     chunk: Annotated[int, Field(ge=1)] = 50
-    """Environment steps, and then as many updates, between two calls of the compiled training step."""
-    evaluate_every: Annotated[int, Field(ge=1)] = 5000
-    """Environment steps between two evaluations; a checkpoint is written at each of them."""
-    evaluation_episodes: Annotated[int, Field(ge=1)] = 10
-    """Episodes of the deterministic policy in one evaluation."""
+    """td3: environment steps, and then as many updates, between two calls of the compiled training step."""
+    evaluate_every: Annotated[int | None, Field(ge=1)] = None
+    """Environment steps between two evaluations; a checkpoint is written at each: 5000 for td3, 10 updates for ippo."""
+    evaluation_episodes: Annotated[int | None, Field(ge=1)] = None
+    """Episodes in one evaluation: 10 for td3, 50 for ippo."""
     capacity: Annotated[int, Field(ge=4)] = 1_000_000
-    """Observations that the replay of a seed holds; an episode of T steps takes T + 1."""
+    """td3: observations that the replay of a seed holds; an episode of T steps takes T + 1."""
     scale_rewards: bool = False
-    """Divide the rewards that the algorithm sees by the running root mean square of R/T."""
+    """td3: divide the rewards that the algorithm sees by the running root mean square of R/T."""
     td3: TD3Settings = TD3Settings()
     credit: CreditSettings = CreditSettings()
+    ippo: PPOSettings = IPPO
+    agents: AgentSettings = AgentSettings()
 
     @field_validator("method")
     @classmethod
-    def known_method(cls, method: str) -> str:
-        return find_method(method).name
-
-    @model_validator(mode="after")
-    def whole_chunks(self) -> "Settings":
-        for name, steps in (
-            ("steps", self.steps),
-            ("evaluate_every", self.evaluate_every),
-            ("td3.warmup", self.td3.warmup),
-        ):
-            if steps % self.chunk:
-                raise ValueError(f"{name} = {steps} is not a multiple of chunk = {self.chunk}")
-        return self
+    def known_method(cls, method: str | None) -> str | None:
+        return None if method is None else find_method(method).name
 
     @property
     def all_seeds(self) -> list[int]:
         return [self.seed + i for i in range(self.seeds)]
 
+
+class Plan(Settings):
+    """Settings with everything decided: what a run goes by. Narrower than what was given; and frozen, so that is sound."""
+
+    method: str = "lare-rrdu"  # pyright: ignore[reportIncompatibleVariableOverride]
+    algorithm: Algorithm = "td3"  # pyright: ignore[reportIncompatibleVariableOverride]
+    steps: int = 1_000_000  # pyright: ignore[reportIncompatibleVariableOverride]
+    evaluate_every: int = 5000  # pyright: ignore[reportIncompatibleVariableOverride]
+    evaluation_episodes: int = 10  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    @model_validator(mode="after")
+    def whole_chunks(self) -> "Plan":
+        for name, steps in (
+            ("steps", self.steps),
+            ("evaluate_every", self.evaluate_every),
+            ("td3.warmup", self.td3.warmup if self.algorithm == "td3" else 0),
+        ):
+            if steps % self.turn:
+                raise ValueError(f"{name} = {steps} is not a multiple of {self.what_a_turn_is}")
+        return self
+
+    @property
+    def turn(self) -> int:
+        """Environment steps of a seed between two calls of the compiled training step."""
+        return self.chunk if self.algorithm == "td3" else self.agents.episodes * EPISODE
+
+    @property
+    def what_a_turn_is(self) -> str:
+        episodes = self.agents.episodes
+        return f"chunk = {self.chunk}" if self.algorithm == "td3" else f"{episodes} episodes of {EPISODE} steps"
+
     @property
     def rows(self) -> int:
         """Observations to make room for: no more than the run can fill."""
         return min(self.capacity, 2 * self.steps + 2)
+
+
+EPISODE = 25
+"""Steps in an episode of every particle task."""
+
+
+def decide(settings: Settings, task: TaskSpec) -> Plan:
+    """Fill in what was left open, by the task.
+
+    Raises:
+        LareError: method, algorithm and task do not go together, or the steps are no whole number of turns.
+    """
+    many = task.particles is not None
+    algorithm = settings.algorithm or ("ippo" if many else "td3")
+    if many != (algorithm == "ippo"):
+        raise LareError(
+            f"{algorithm} is for {'many agents' if algorithm == 'ippo' else 'a single agent'}, and {task.name} is a task "
+            f"of {'many' if many else 'one'}"
+        )
+    episodes = settings.agents.episodes
+    usual: dict[str, Any] = {"algorithm": algorithm}
+    if many:
+        turn = episodes * EPISODE
+        usual |= {"method": "lare-rd", "steps": 1000 * turn, "evaluate_every": 10 * turn, "evaluation_episodes": 50}
+    given = {name: getattr(settings, name) for name in type(settings).model_fields}
+    plan = Plan(**usual | {name: value for name, value in given.items() if value is not None})
+    method = find_method(plan.method)
+    if method.for_many_only and not many:
+        raise LareError(f"{method.name} assigns credit among agents, and {task.name} is a task of one")
+    return plan

@@ -4,18 +4,18 @@ import contextlib
 import signal
 import threading
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 from lare.credit.methods import Encoder, find_method
 from lare.errors import LareError
 from lare.latent.design import design
 from lare.latent.function import LatentFunction
 from lare.tasks.spec import TaskSpec, load_task
+from lare.training import many_agents, single_agent
 from lare.training.progress import Clock, Listener, TensorBoard, Terminal
 from lare.training.run import Run, create, default_directory, isolation, locked, open_run
-from lare.training.session import Session, begin, load_learner, new_learner
-from lare.training.settings import Settings
+from lare.training.settings import Plan, Settings, decide
 
 
 class Interrupted(LareError):
@@ -26,7 +26,7 @@ def train(
     task: str | Path | TaskSpec,
     settings: Settings | None = None,
     *,
-    function: LatentFunction | None = None,
+    function: LatentFunction | Sequence[LatentFunction] | None = None,
     out: str | Path | None = None,
     tensorboard: bool = False,
     listeners: Sequence[Listener] | None = None,
@@ -36,7 +36,8 @@ def train(
     Args:
         task: a shipped name, the path of a TOML file, or a spec.
         settings: method, algorithm, steps, seeds and all the rest.
-        function: `phi`, for the methods that need one; without it, it is designed from the shipped recordings.
+        function: `phi`, for the methods that need one; one for each team where several learn. Without it, it is designed
+            from the shipped recordings.
         out: the run directory, which must not exist; `runs/...` unless given.
         listeners: who is told of the progress; the terminal, unless given.
 
@@ -45,14 +46,26 @@ def train(
             then is whole, and `resume` goes on from there.
     """
     task = task if isinstance(task, TaskSpec) else load_task(task)
-    settings = settings or Settings()
-    if find_method(settings.method).encoder is not Encoder.LATENT:
-        function = None
-    elif function is None:
-        function = design(task, draw=settings.draw)
-    run = create(Path(out) if out is not None else default_directory(task, settings), task, settings, function)
+    plan = decide(settings or Settings(), task)
+    functions = chosen_functions(task, plan, function)
+    run = create(Path(out) if out is not None else default_directory(task, plan), task, plan, functions)
     with locked(run):
-        return start(run, tensorboard, listeners)
+        return begin(run, tensorboard, listeners)
+
+
+def chosen_functions(
+    task: TaskSpec, plan: Plan, given: LatentFunction | Sequence[LatentFunction] | None
+) -> tuple[LatentFunction, ...]:
+    """One for each role of the task, designed where none was given; none for a method that needs none."""
+    if find_method(plan.method).encoder is not Encoder.LATENT:
+        return ()
+    if given is None:
+        return tuple(design(role, draw=plan.draw) for role in task.roles)
+    functions = (given,) if isinstance(given, LatentFunction) else tuple(given)
+    if len(functions) != len(task.roles):
+        names = ", ".join(role.name for role in task.roles)
+        raise LareError(f"{task.name} needs a latent function for each of {names}, and {len(functions)} are given")
+    return functions
 
 
 def resume(directory: str | Path, *, tensorboard: bool = False, listeners: Sequence[Listener] | None = None) -> Run:
@@ -64,21 +77,30 @@ def resume(directory: str | Path, *, tensorboard: bool = False, listeners: Seque
     with locked(run):
         if not run.has_checkpoint():
             run.truncate(0)
-            return start(run, tensorboard, listeners)
-        _, learner, host, arrays = load_learner(run)
-        run.truncate(host["metrics_length"])
-        session = begin(run, lambda: learner)
-        return finish(session, tensorboard, listeners, *session.return_to(host, arrays))
+            return begin(run, tensorboard, listeners)
+        restored, messages = kind_of(run).restore(run)
+        run.truncate(restored.metrics_length)
+        return finish(restored, tensorboard, listeners, *messages)
 
 
-def start(run: Run, tensorboard: bool, listeners: Sequence[Listener] | None) -> Run:
+def begin(run: Run, tensorboard: bool, listeners: Sequence[Listener] | None) -> Run:
     """From the first step on. The untrained learner is saved, so that there is a checkpoint whatever happens."""
-    session = begin(run, partial(new_learner, run))
-    session.save()
-    return finish(session, tensorboard, listeners)
+    started = kind_of(run).start(run)
+    started.save()
+    return finish(started, tensorboard, listeners)
 
 
-def finish(session: Session, tensorboard: bool, listeners: Sequence[Listener] | None, *messages: str) -> Run:
+def kind_of(run: Run) -> Any:
+    """The module whose sessions train such a run: `start` and `restore`."""
+    return many_agents if run.config.task.particles else single_agent
+
+
+def finish(
+    session: single_agent.Session | many_agents.Session,
+    tensorboard: bool,
+    listeners: Sequence[Listener] | None,
+    *messages: str,
+) -> Run:
     """Run a session to its end, or until the user stops it."""
     run, settings = session.run, session.settings
     told: list[Listener] = [Terminal()] if listeners is None else list(listeners)
@@ -99,7 +121,7 @@ def finish(session: Session, tensorboard: bool, listeners: Sequence[Listener] | 
                     listener.stepped(session.step)
                 if session.step % settings.evaluate_every == 0 or session.step == settings.steps:
                     lines = session.report(clock.rate(session.step))
-                    session.check_diverged(lines)
+                    check_diverged(run, lines)
                     session.metrics_length = run.append(lines)
                     session.save()
                     for listener in told:
@@ -114,6 +136,16 @@ def finish(session: Session, tensorboard: bool, listeners: Sequence[Listener] | 
             listener.stopped()
         session.close()
     return run
+
+
+def check_diverged(run: Run, lines: Sequence[dict[str, Any]]) -> None:
+    for line in lines:
+        for name in ("critic/loss", "credit/loss"):
+            if name in line and line[name] is None:
+                raise LareError(
+                    f"training diverged: {name} of seed {line['seed']} is not finite at step {line['step']}; "
+                    f"the last checkpoint in {run.checkpoint} is whole"
+                )
 
 
 @contextlib.contextmanager

@@ -1,11 +1,10 @@
-"""A run under way: the training state, the environments around it, and one chunk of the work at a time."""
+"""A run of a single agent under way: the training state, the environments around it, one chunk of the work at a time."""
 
 import contextlib
 import ctypes
 import gc
 import itertools
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -13,11 +12,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Key
 
 from lare.credit.methods import find_method
-from lare.errors import LareError
-from lare.latent.evaluator import LatentRewardError
 from lare.tasks.episodic import EpisodicReward
 from lare.training import checkpoint, replay
 from lare.training.environments import (
@@ -32,7 +29,8 @@ from lare.training.environments import (
 )
 from lare.training.off_policy import Compiled, Learner, Recipe, compiled, init
 from lare.training.run import Run
-from lare.training.settings import Settings
+from lare.training.seeds import lines, seed_keys
+from lare.training.settings import Plan
 
 
 @dataclass
@@ -53,7 +51,7 @@ class Session:
     """What the last chunk of updates measured."""
 
     @property
-    def settings(self) -> Settings:
+    def settings(self) -> Plan:
         return self.run.config.settings
 
     def policy(self, observation: np.ndarray) -> np.ndarray:
@@ -86,11 +84,7 @@ class Session:
         if self.run.function is None:
             return np.zeros((*action.shape[:2], 0), np.float32)
         before, after = np.asarray(collected.steps.observation), np.asarray(collected.steps.next_observation)
-        try:
-            rows = self.run.function.of_steps(flat(before), flat(action), flat(after), self.run.judges)
-        except LatentRewardError as error:
-            place = self.run.keep_batch(error.observation, error.action)
-            raise LareError(f"{error}; it was given the batch in {place}; the last checkpoint is whole") from error
+        rows = self.run.factors(self.run.function, flat(before), flat(action), flat(after))
         return rows.reshape(*action.shape[:2], -1)
 
     def report(self, rate: float) -> list[dict[str, Any]]:
@@ -99,24 +93,8 @@ class Session:
         evaluation = evaluate(self.evaluation, self.policy, self.run.seeds, config.task.measures)
         measured = {"evaluation/return": evaluation.returns.mean(axis=1)}
         measured |= {f"evaluation/{name}": values.mean(axis=1) for name, values in evaluation.measures.items()}
-        measured |= {name: np.asarray(value) for name, value in self.functions.assess(self.learner).items()}
-        measured |= {name: np.asarray(value) for name, value in self.latest.items()}
-        lines = []
-        for place, seed in enumerate(self.run.seeds):
-            numbers = {name: float(values[place]) for name, values in measured.items()}
-            # JSON knows no NaN: a correlation with something that never varies is null.
-            known = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-            lines.append({"step": self.step, "seed": seed, **known, "time/steps_per_second": round(rate, 1)})
-        return lines
-
-    def check_diverged(self, lines: Sequence[dict[str, Any]]) -> None:
-        for line in lines:
-            for name in ("critic/loss", "credit/loss"):
-                if name in line and line[name] is None:
-                    raise LareError(
-                        f"training diverged: {name} of seed {line['seed']} is not finite at step {self.step}; "
-                        f"the last checkpoint in {self.run.checkpoint} is whole"
-                    )
+        measured |= self.functions.assess(self.learner) | self.latest
+        return lines(self.run.seeds, self.step, measured, rate)
 
     def save(self) -> None:
         host = {
@@ -128,7 +106,7 @@ class Session:
         for place, lane in enumerate(self.lanes):
             arrays[f"lane{place}/actions"] = np.reshape(lane.actions, (-1, self.recipe.action_size))
             arrays[f"lane{place}/observation"] = lane.observation
-        checkpoint.save(self.run.checkpoint, self.learner, host, arrays)
+        checkpoint.save(self.run.checkpoint, self.learner, replay.ROWS, host, arrays)
 
     def return_to(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[str]:
         """Put everything around the learner back to a checkpoint; returns what is to be said about it."""
@@ -169,12 +147,6 @@ def drop(held: replay.Replay, dropped: Array) -> replay.Replay:
     return jax.tree.map(choose, jax.vmap(replay.drop_running)(held), held)
 
 
-@jax.jit
-def seed_keys(seeds: Int[Array, " seeds"], number: int | Array) -> Key[Array, " seeds"]:
-    """A key for each seed that depends on the seed and `number` alone: there is no state to save."""
-    return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), number))(seeds)
-
-
 def recipe_for(run: Run) -> Recipe:
     task, settings = run.config.task, run.config.settings
     factors = run.function.size if run.function else 0
@@ -194,7 +166,7 @@ def recipe_for(run: Run) -> Recipe:
 def load_learner(run: Run) -> tuple[Recipe, Learner, dict[str, Any], dict[str, np.ndarray]]:
     """The training state of a run's last checkpoint, and what stood with it."""
     recipe = recipe_for(run)
-    return recipe, *checkpoint.load(run.checkpoint, learner_shape(run))
+    return recipe, *checkpoint.load(run.checkpoint, learner_shape(run), replay.ROWS)
 
 
 def learner_shape(run: Run) -> Learner:
@@ -212,6 +184,18 @@ def new_learner(run: Run) -> Learner:
 
 def new_learners(keys: Key[Array, " seeds"], recipe: Recipe) -> Learner:
     return jax.vmap(partial(init, recipe=recipe))(keys)
+
+
+def start(run: Run) -> Session:
+    """A session before its first step."""
+    return begin(run, partial(new_learner, run))
+
+
+def restore(run: Run) -> tuple[Session, list[str]]:
+    """A session as of the last checkpoint, and what is to be said about it."""
+    _, learner, host, arrays = load_learner(run)
+    session = begin(run, lambda: learner)
+    return session, session.return_to(host, arrays)
 
 
 def begin(run: Run, make_learner: Callable[[], Learner]) -> Session:
