@@ -19,7 +19,19 @@ from lare.credit.methods import Encoder, find_method
 from lare.training.run import create
 from lare.training.session import Session, begin, new_learner
 
-PACKAGES = ("lare-rl", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "stable-baselines3", "sbx-rl", "torch")
+PACKAGES = (
+    "lare-rl",
+    "jax",
+    "jaxlib",
+    "optax",
+    "numpy",
+    "gymnasium",
+    "mujoco",
+    "mpe2",
+    "stable-baselines3",
+    "sbx-rl",
+    "torch",
+)
 
 TD3 = {
     "learning_rate": 3e-4,
