@@ -19,7 +19,19 @@ from lare.training.settings import decide
 from lare.training.single_agent import Session, start
 from lare.training.train import chosen_functions
 
-PACKAGES = ("lare-rl", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "stable-baselines3", "sbx-rl", "torch")
+PACKAGES = (
+    "lare-rl",
+    "jax",
+    "jaxlib",
+    "optax",
+    "numpy",
+    "gymnasium",
+    "mujoco",
+    "mpe2",
+    "stable-baselines3",
+    "sbx-rl",
+    "torch",
+)
 
 TD3 = {
     "learning_rate": 3e-4,

@@ -1,0 +1,30 @@
+"""The pictures of docs/particle-tasks.md.
+
+python benchmarks/particle_pictures.py
+"""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lare.tasks.particles.drawing import draw
+from lare.tasks.particles.table import find_particle_task
+
+PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
+
+
+def main() -> None:
+    for seed, name in enumerate(("CN-6", "PP-6", "CompetitivePP-6", "TriangleArea")):
+        task = find_particle_task(name)
+        # Some steps from the start, in which each agent keeps its direction.
+        action = 1 + jnp.arange(task.agents) % 4
+        state = task.reset(jax.random.key(seed))
+        for key in jax.random.split(jax.random.key(seed), 6):
+            state = task.step(state, action, key)
+        draw(task, np.asarray(state.position)).savefig(PICTURES / f"{name}.png", dpi=60)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""What a step of cooperative navigation costs, beside the one of mpe2 (`simple_spread`), the contenders taking turns.
+
+    python benchmarks/particles.py
+
+Random actions, episodes of 25 steps, all observations and rewards computed. Ours are whole batches of worlds in one
+compiled call; mpe2, the maintained home of the multi-agent particle environments, steps one world with as many agents
+and landmarks. Its task is not quite ours (`docs/particle-tasks.md` has the differences), the work is.
+"""
+
+import warnings
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import tyro
+from jaxtyping import Array, Float, PRNGKeyArray
+from measure import interleave, show, summary, write
+
+from lare.tasks.particles.table import find_particle_task
+from lare.tasks.particles.task import ACTIONS, STEPS, ParticleTask
+from lare.tasks.particles.world import State
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)
+    from mpe2 import simple_spread_v3
+
+
+@partial(jax.jit, static_argnums=(0, 2))
+def episodes(task: ParticleTask, key: PRNGKeyArray, worlds: int) -> Float[Array, "worlds steps"]:
+    """One episode in each world; the sums make sure that nothing is left out."""
+
+    def step(state: State, key: PRNGKeyArray):
+        action_key, key = jax.random.split(key)
+        state = task.step(state, jax.random.randint(action_key, (task.agents,), 0, ACTIONS), key)
+        return state, jnp.sum(task.observe(state)) + jnp.sum(task.reward(state))
+
+    def run(key: PRNGKeyArray) -> Float[Array, " steps"]:
+        start_key, key = jax.random.split(key)
+        return jax.lax.scan(step, task.reset(start_key), jax.random.split(key, STEPS))[1]
+
+    return jax.vmap(run)(jax.random.split(key, worlds))
+
+
+def ours(task: ParticleTask, worlds: int) -> None:
+    jax.block_until_ready(episodes(task, jax.random.key(0), worlds))
+
+
+def theirs(environment) -> None:
+    environment.reset(seed=0)
+    while environment.agents:
+        environment.step({agent: environment.action_space(agent).sample() for agent in environment.agents})
+
+
+def main(rounds: int = 7, batches: tuple[int, ...] = (64, 1024)) -> None:
+    """Measure.
+
+    Args:
+        rounds: how often each has its turn.
+        batches: numbers of worlds of ours in one call.
+    """
+    figures = {}
+    for name in ("CN-6", "CN-30"):
+        task = find_particle_task(name)
+        contenders = {f"{worlds} worlds": partial(ours, task, worlds) for worlds in batches}
+        contenders["mpe2"] = partial(theirs, simple_spread_v3.parallel_env(N=task.agents, max_cycles=STEPS))
+        steps = {**{f"{worlds} worlds": worlds * STEPS for worlds in batches}, "mpe2": STEPS}
+        seconds = interleave(contenders, rounds)
+        each = {who: [value / steps[who] for value in values] for who, values in seconds.items()}
+        figures[name] = summary(each, 1, f"{batches[0]} worlds")
+        show(f"{name}, a step of a world", figures[name], f"{batches[0]} worlds")
+    write("particles", {"rounds": rounds, "steps in an episode": STEPS, "step of one world": figures})
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

@@ -1,0 +1,97 @@
+"""Pictures of particle tasks: a state, and an episode as a film."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib import colormaps
+from matplotlib.animation import PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+
+from lare.tasks.particles.task import ParticleTask
+
+TEAM, OTHERS, LANDMARK = "#0072b2", "#d55e00", "#9a9a9a"
+"""The first team, all others that move, and what stays."""
+CREDIT = colormaps["RdBu"]
+MARGIN = 1.08
+"""How much further than the square the picture reaches."""
+
+
+def draw(
+    task: ParticleTask,
+    position: Float[np.ndarray, "entities 2"],
+    credit: Float[np.ndarray, " agents"] | None = None,
+    scale: float | None = None,
+) -> Figure:
+    """A state, to scale. With credit, each learning agent has its own as number and colour: `scale` is the darkest."""
+    figure, axes = blank()
+    paint(axes, task, position, reach(task, position), credit, scale)
+    return figure
+
+
+def film(
+    path: Path,
+    task: ParticleTask,
+    positions: Float[np.ndarray, "steps entities 2"],
+    credit: Float[np.ndarray, "steps agents"] | None = None,
+    frames_per_second: int = 8,
+) -> None:
+    """An episode as a GIF, all of it to one scale of length and one of credit."""
+    figure, axes = blank()
+    side, scale = reach(task, positions), None if credit is None else float(np.abs(credit).max())
+    writer = PillowWriter(frames_per_second)
+    with writer.saving(figure, str(path), dpi=100):
+        for number, position in enumerate(positions):
+            axes.clear()
+            paint(axes, task, position, side, None if credit is None else credit[number], scale)
+            writer.grab_frame()
+
+
+def blank() -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(4, 4))
+    FigureCanvasAgg(figure)
+    return figure, figure.add_axes((0, 0, 1, 1))
+
+
+def reach(task: ParticleTask, position: Float[np.ndarray, "*steps entities 2"]) -> float:
+    """Half the side of a picture in which nothing is cut off."""
+    outermost = np.abs(position) + task.world.size[:, None]
+    return float(MARGIN * max(task.radius, outermost.max()))
+
+
+def paint(
+    axes: Axes,
+    task: ParticleTask,
+    position: Float[np.ndarray, "entities 2"],
+    side: float,
+    credit: Float[np.ndarray, " agents"] | None,
+    scale: float | None,
+) -> None:
+    axes.set(xlim=(-side, side), ylim=(-side, side), aspect="equal")
+    axes.axis("off")
+    square = (-task.radius, -task.radius)
+    axes.add_patch(Rectangle(square, 2 * task.radius, 2 * task.radius, fill=False, edgecolor="#dddddd"))
+    colours: list = [TEAM if one < task.teams[0].stop else OTHERS for one in range(task.world.moving)]
+    if credit is not None:
+        bound = scale or float(np.abs(credit).max()) or 1.0
+        shades = CREDIT(0.5 + 0.4 * np.clip(np.asarray(credit) / bound, -1, 1))
+        colours[: task.agents] = [tuple(shade) for shade in shades]
+    colours += [LANDMARK] * (len(position) - len(colours))
+    landmarks_first = [*range(task.world.moving, len(position)), *range(task.world.moving)]
+    for one in landmarks_first:
+        moves = one < task.world.moving
+        edge = "#333333" if moves else "none"
+        radius = max(float(task.world.size[one]), 0.008 * side)
+        axes.add_patch(Circle(tuple(position[one]), radius, facecolor=colours[one], edgecolor=edge, linewidth=0.7))
+    if credit is not None:
+        for (x, y), size, value in zip(position, task.world.size, credit, strict=False):
+            axes.text(x, y + size + 0.01 * side, f"{value:.2g}", fontsize=8, ha="center", va="bottom")
+
+
+def pixels(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
