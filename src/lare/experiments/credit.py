@@ -27,11 +27,11 @@ class Credit:
     """Pearson's, of each factor with the true reward, over the last steps of all seeds. NaN where one never varies."""
 
 
-def factor_labels(run: Run) -> list[tuple[str, str]]:
-    """Name and meaning of each column of z."""
-    if run.function is None:
+def factor_labels(run: Run, place: int = 0) -> list[tuple[str, str]]:
+    """Name and meaning of each column of z, by the function of one of the task's roles."""
+    if not run.functions:
         return []
-    labels = list(zip(run.function.names, run.function.meanings, strict=True))
+    labels = list(zip(run.functions[place].names, run.functions[place].meanings, strict=True))
     if run.judges != "both":
         return labels
     return [(f"{name} ({which})", meaning) for which in ("before", "after") for name, meaning in labels]
@@ -57,6 +57,14 @@ def first_seed(learner: Learner) -> Learner:
     return jax.tree.map(lambda leaf: leaf[0], learner)
 
 
+def correlations(
+    columns: Float[np.ndarray, "rows columns"], reward: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, " columns"]:
+    """Pearson's, of each column with the reward; NaN where one never varies."""
+    with np.errstate(invalid="ignore"):
+        return np.array([np.corrcoef(column, reward)[0, 1] for column in columns.T])
+
+
 def factor_correlations(learner: Learner, recipe: Recipe) -> Float[np.ndarray, " factors"]:
     def recent(held: replay.Replay) -> replay.Draw:
         return replay.read(held, jnp.maximum(held.transitions - 1 - jnp.arange(RECENT), replay.oldest_transition(held)))
@@ -64,5 +72,4 @@ def factor_correlations(learner: Learner, recipe: Recipe) -> Float[np.ndarray, "
     steps = jax.vmap(recent)(learner.replay)
     reward = np.asarray(steps.reward).ravel()
     factors = np.asarray(steps.factors).reshape(len(reward), recipe.factors)
-    with np.errstate(invalid="ignore"):
-        return np.array([np.corrcoef(column, reward)[0, 1] for column in factors.T])
+    return correlations(factors, reward)

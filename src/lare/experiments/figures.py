@@ -8,6 +8,8 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
@@ -79,6 +81,34 @@ def courses(factors: Float[np.ndarray, "steps factors"], names: Sequence[str]) -
         axes.tick_params(labelsize=9)
         axes.locator_params(axis="y", nbins=3)
     rows[-1].set_xlabel("step of the episode")
+    return svg(figure)
+
+
+def credit_map(reward: Float[np.ndarray, "steps agents"], proxy: Float[np.ndarray, "steps agents"] | None) -> str:
+    """Who got which reward when: true, and beside it proxy, each on a scale of its own (a decoder knows sums only)."""
+    parts = {"true reward": reward} | ({} if proxy is None else {"proxy reward": proxy})
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure = Figure(figsize=(6.4, 1.2 + 0.16 * reward.shape[1]), layout="constrained")
+        for axes, (title, values) in zip(figure.subplots(1, len(parts), squeeze=False)[0], parts.items(), strict=True):
+            image = axes.imshow(values.T, aspect="auto", cmap="viridis", interpolation="nearest", origin="lower")
+            axes.set_title(title, loc="left", fontsize=11)
+            axes.set(xlabel="step", ylabel="agent")
+            figure.colorbar(image, ax=axes, location="bottom", aspect=30, shrink=0.9)
+    return svg(figure)
+
+
+def scatters(by_title: Mapping[str, Float[np.ndarray, "rows 2"]], values: Float[np.ndarray, " rows"]) -> str:
+    """Points in the plane, coloured by a value."""
+    low, high = np.percentile(values, [2, 98])
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure = Figure(figsize=(6.4, 3.4), layout="constrained")
+        places = figure.subplots(1, len(by_title), squeeze=False)[0]
+        image = ScalarMappable(Normalize(low, high), "viridis")
+        for axes, (title, points) in zip(places, by_title.items(), strict=True):
+            axes.scatter(*points.T, c=image.to_rgba(values), s=4, linewidths=0)
+            axes.set_title(title, loc="left", fontsize=11)
+            axes.set(xticks=[], yticks=[])
+        figure.colorbar(image, ax=places, location="bottom", aspect=50, shrink=0.6, label="true reward")
     return svg(figure)
 
 

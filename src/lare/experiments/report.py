@@ -13,7 +13,9 @@ import lare
 from lare.credit.methods import find_method
 from lare.errors import LareError
 from lare.experiments import figures
+from lare.experiments.agents_report import agents_details
 from lare.experiments.credit import credit_of, factor_labels
+from lare.experiments.html import function_text, note, table
 from lare.training.run import Run, open_run
 from lare.training.settings import Settings, decide
 
@@ -78,17 +80,6 @@ def labels(runs: Sequence[Run]) -> list[str]:
     return [f"{name} #{place + 1}" if named.count(name) > 1 else name for place, name in enumerate(named)]
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """An HTML table of escaped cells; the columns in `numbers` are set as figures."""
-
-    def cells(tag: str, row: Sequence[str]) -> str:
-        kinds = (' class="number"' if place in numbers else "" for place in range(len(row)))
-        return "".join(f"<{tag}{kind}>{escape(cell)}</{tag}>" for kind, cell in zip(kinds, row, strict=True))
-
-    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return f'<div class="wide"><table><tr>{cells("th", head)}</tr>\n{body}\n</table></div>'
-
-
 def curve(run: Run, key: str) -> figures.Curve | None:
     """One number of metrics.jsonl over the steps; None where the run has none of it."""
     lines = [line for line in run.metrics() if line["seed"] in run.seeds]
@@ -123,18 +114,20 @@ def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
         )
         for name, run in zip(names, runs, strict=True)
     ]
-    note = (
-        "Return: mean true return of the deterministic policy at the last evaluation. Credit error: mean |proxy reward - "
-        "true reward| over the last 5,000 steps; correlation: Pearson's, over the same. ±: standard deviation over seeds."
+    explained = (
+        "Return: mean true return at the last evaluation. Credit error: mean |proxy reward - "
+        "true reward| over the newest steps; correlation: Pearson's, over the same. ±: standard deviation over seeds."
     )
-    return table(head, rows, range(2, 7)) + f'<p class="note">{escape(note)}</p>'
+    return table(head, rows, range(2, 7)) + note(explained)
 
 
 def learning(task: str, runs: dict[str, Run]) -> Iterable[str]:
     """Curves of one task, all its runs in each."""
     yield f"<h2>Learning {escape(task)}</h2>"
     shown = ["evaluation/return", "credit/error", "credit/correlation"]
-    shown[1:1] = [f"evaluation/{name}" for name in next(iter(runs.values())).config.task.measures]
+    spec = next(iter(runs.values())).config.task
+    shown[1:1] = [f"evaluation/{name}" for name in spec.measures]
+    shown[1:1] = [f"evaluation/return_{role.name.removeprefix(f'{spec.name}-')}" for role in spec.teams]
     titles = {
         "evaluation/return": "true return",
         "credit/error": "mean |proxy - true reward|",
@@ -146,7 +139,7 @@ def learning(task: str, runs: dict[str, Run]) -> Iterable[str]:
             label = titles.get(key, key.removeprefix("evaluation/"))
             yield f"<h3>{escape(label[0].upper() + label[1:])}</h3>"
             yield figures.curves(found, label, from_zero=key == "credit/error")
-    yield '<p class="note">Line: mean over seeds. Band: ± one standard deviation over seeds.</p>'
+    yield note("Line: mean over seeds. Band: ± one standard deviation over seeds.")
 
 
 def details(name: str, run: Run) -> Iterable[str]:
@@ -154,21 +147,24 @@ def details(name: str, run: Run) -> Iterable[str]:
     method = find_method(run.config.settings.method)
     yield f"<h2>{escape(name)} on {escape(run.config.task.name)}</h2>"
     yield f"<p>{escape(method.summary[0].upper() + method.summary[1:])}. Source: {escape(method.source)}.</p>"
+    yield from agents_details(run) if run.config.task.particles else one_agent_details(run)
+    yield "<h3>Settings</h3>"
+    yield settings_table(run)
+
+
+def one_agent_details(run: Run) -> Iterable[str]:
     credit = credit_of(run)
     if credit is not None:
         yield f"<h3>Credit over one episode ({len(credit.reward)} steps)</h3>"
         yield figures.credit(credit.reward, credit.proxy)
-        yield (
-            '<p class="note">The last training episode of the first seed, exploration included, judged by the newest '
-            f"decoder. Return {credit.reward.sum():.1f}, sum of the proxy rewards {credit.proxy.sum():.1f}.</p>"
+        yield note(
+            "The last training episode of the first seed, exploration included, judged by the newest decoder. "
+            f"Return {credit.reward.sum():.1f}, sum of the proxy rewards {credit.proxy.sum():.1f}."
         )
     if run.function is not None:
         yield from factors(run, credit)
         yield "<h3>The latent function</h3>"
-        yield f'<p class="note">By {escape(run.function.model)}. SHA-256 {run.function.digest}.</p>'
-        yield f"<pre>{escape(run.function.source)}</pre>"
-    yield "<h3>Settings</h3>"
-    yield settings_table(run)
+        yield function_text(run.function.model, run.function.digest, run.function.source)
 
 
 def factors(run: Run, credit: Any) -> Iterable[str]:
@@ -182,7 +178,7 @@ def factors(run: Run, credit: Any) -> Iterable[str]:
     yield table(("factor", "meaning, in the model's words", "correlation with the true reward"), rows, (2,))
     if credit is not None:
         yield figures.courses(credit.factors, [name for name, _ in named])
-    yield f'<p class="note">phi judges the observation {escape(judged(run))} the step.</p>'
+    yield note(f"phi judges the observation {judged(run)} the step.")
 
 
 def judged(run: Run) -> str:
@@ -201,7 +197,7 @@ def settings_table(run: Run) -> str:
     return (
         table(("setting", "value"), rows)
         + f"<details><summary>Everything (config.json)</summary><pre>{everything}</pre></details>"
-        + f'<p class="note">Drawn by LaRe {escape(lare.__version__)}.</p>'
+        + note(f"Drawn by LaRe {lare.__version__}.")
     )
 
 

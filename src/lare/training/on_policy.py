@@ -13,7 +13,7 @@ Functions are written for one seed; `compiled` gives them their leading seed axi
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -108,8 +108,8 @@ def seen(
     return jnp.concatenate([observation, number], axis=-1)
 
 
-def play(policy: Policy, key: PRNGKeyArray, count: int, recipe: Recipe) -> Played:
-    """Whole episodes of the policy, its actions drawn as it says."""
+def play(policy: Any, key: PRNGKeyArray, count: int, recipe: Recipe) -> Played:
+    """Whole episodes of a policy: of whatever has the `sample` of `ppo.Policy`."""
     task = recipe.task
     start_key, key = jax.random.split(key)
     start = jax.vmap(task.reset)(jax.random.split(start_key, count))
@@ -139,7 +139,7 @@ def features(played: Played, factors: Float[Array, "steps episodes agents factor
 
 
 def of_team(
-    rows: Float[Array, "episodes steps agents features"], team: Team, size: int
+    rows: Float[Array, "episodes steps agents widest"], team: Team, size: int
 ) -> Float[Array, "rows team features"]:
     """A team's features, its episodes one behind the other."""
     return rows[..., team.start : team.stop, :size].reshape(-1, team.stop - team.start, size)

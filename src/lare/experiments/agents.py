@@ -1,0 +1,166 @@
+"""What a run of many agents looks like from outside: one episode with everybody's credit, and many for their statistics."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare.algorithms.ppo import Policy
+from lare.errors import LareError
+from lare.experiments.credit import correlations
+from lare.tasks.particles.task import STEPS, Team
+from lare.training import on_policy
+from lare.training.many_agents import Session, load_learner, restore
+from lare.training.on_policy import Learner, Played, Recipe
+from lare.training.run import Run
+
+SAMPLED = 40
+"""Episodes for statistics."""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """One episode of the first seed's policy."""
+
+    position: Float[np.ndarray, "steps entities 2"]
+    """After each step."""
+    reward: Float[np.ndarray, "steps agents"]
+    """True."""
+    proxy: Float[np.ndarray, "steps agents"] | None
+    """By the decoders of the last checkpoint; None for a method without."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Steps of agents of one team, over some episodes of the first seed's policy."""
+
+    team: Team
+    observation: Float[np.ndarray, "rows observation"]
+    """What the step led to."""
+    factors: Float[np.ndarray, "rows factors"]
+    reward: Float[np.ndarray, " rows"]
+    """True."""
+
+    @property
+    def correlations(self) -> Float[np.ndarray, " factors"]:
+        """Pearson's, of each factor with the true reward; NaN where one never varies."""
+        return correlations(self.factors, self.reward)
+
+
+def first_seed(learner: Learner) -> Learner:
+    return jax.tree.map(lambda leaf: leaf[0], learner)
+
+
+def watch(run: Run, key: int = 0) -> Watched:
+    """Play one episode."""
+    session, _ = restore(run)
+    recipe, learner = session.recipe, first_seed(session.learner)
+    played, position = play_and_look(learner.algorithm.online.actor, jax.random.key(key), recipe)
+    proxy = None
+    if learner.credit:
+        factors = factors_of(session, played)
+        rows = on_policy.features(played, jnp.asarray(factors), recipe)
+        r_hat = on_policy.rewards(learner, rows, jnp.swapaxes(played.reward, 0, 1), recipe)
+        proxy = np.asarray(r_hat)[0]
+    return Watched(np.asarray(position), np.asarray(played.reward)[:, 0], proxy)
+
+
+def play_and_look(policy: Policy, key: PRNGKeyArray, recipe: Recipe) -> tuple[Played, Float[Array, "steps entities 2"]]:
+    """One episode, and where everything was after each of its steps."""
+    task = recipe.task
+    start_key, *keys = jax.random.split(key, 1 + 2 * STEPS)
+    step, observe, reward = jax.jit(task.step), jax.jit(task.observe), jax.jit(task.reward)
+    state = jax.jit(task.reset)(start_key)
+    rows, position = [], []
+    for action_key, step_key in zip(keys[:STEPS], keys[STEPS:], strict=True):
+        before = observe(state)
+        action = policy.sample(on_policy.seen(before, recipe), action_key)
+        state = step(state, jnp.argmax(action, axis=-1), step_key)
+        rows.append(Played(before, action, observe(state), reward(state)))
+        position.append(state.position)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[:, None], *rows), jnp.stack(position)
+
+
+def factors_of(session: Session, played: Played) -> Float[np.ndarray, "steps episodes agents factors"]:
+    """Z of episodes of a single seed."""
+    return session.factors(jax.tree.map(lambda leaf: leaf[None], played))[0]
+
+
+def sample(run: Run, random: bool = False) -> list[Sample]:
+    """Steps of each team, under the first seed's policy, or under random actions."""
+    session, _ = restore(run)
+    recipe, policy = session.recipe, first_seed(session.learner).algorithm.online.actor
+    if random:  # a network of zeros prefers nothing
+        policy = jax.tree.map(jnp.zeros_like, policy)
+    played = jax.jit(partial(on_policy.play, count=SAMPLED, recipe=recipe))(policy, jax.random.key(1))
+    factors, found = factors_of(session, played), []
+    for place, team in enumerate(recipe.task.teams):
+        agents = slice(team.start, team.stop)
+        size = recipe.factors[place] if recipe.factors else 0
+        rows = (np.asarray(played.next_observation)[..., agents, :], factors[..., agents, :size])
+        observation, of_team = (part.reshape(-1, part.shape[-1]) for part in rows)
+        found.append(Sample(team, observation, of_team, np.asarray(played.reward)[..., agents].ravel()))
+    return found
+
+
+class Mixed(eqx.Module):
+    """A policy whose first team is led by one policy and whose other agents are led by another."""
+
+    first: Policy
+    others: Policy
+    stop: int = eqx.field(static=True)
+    """Where the first team ends."""
+
+    def sample(self, observation: Float[Array, "*batch agents observation"], key: PRNGKeyArray) -> Array:
+        """Each draws its own actions."""
+        keys = jax.random.split(key)
+        ours, theirs = self.first.sample(observation, keys[0]), self.others.sample(observation, keys[1])
+        return jnp.concatenate([ours[..., : self.stop, :], theirs[..., self.stop :, :]], axis=-2)
+
+
+class Match(NamedTuple):
+    """How the first team of one run did against the others of another: its return, for each pair of seeds."""
+
+    first: Run
+    others: Run
+    returns: Float[np.ndarray, "seeds other_seeds"]
+
+
+def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
+    """Let the first team of each run meet the other team of each: four matches, all from the same starts.
+
+    Raises:
+        LareError: the runs are not of one task with two teams.
+    """
+    names = {run.config.task.name for run in runs}
+    if len(names) > 1 or len(runs[0].config.task.teams) != 2:
+        raise LareError(
+            f"cross-play needs two runs of one task in which two teams learn, and these are of {', '.join(sorted(names))}"
+        )
+    loaded = [load_learner(run) for run in runs]
+    recipe = loaded[0][0]
+    stop = recipe.task.teams[0].stop
+
+    @jax.jit
+    def total(mixed: Mixed, key: PRNGKeyArray) -> Float[Array, ""]:
+        reward = on_policy.play(mixed, key, episodes, recipe).reward
+        return jnp.sum(reward[..., :stop]) / episodes
+
+    def policies(place: int) -> list[Policy]:
+        actors = loaded[place][1].algorithm.online.actor
+        return [jax.tree.map(lambda leaf, seed=seed: leaf[seed], actors) for seed in range(len(runs[place].seeds))]
+
+    matches = []
+    for ours, first in enumerate(runs):
+        for theirs, others in enumerate(runs):
+            returns = [
+                [float(total(Mixed(one, other, stop), jax.random.key(0))) for other in policies(theirs)]
+                for one in policies(ours)
+            ]
+            matches.append(Match(first, others, np.array(returns)))
+    return matches

@@ -1,0 +1,92 @@
+"""The part of a report that only runs of many agents have."""
+
+import base64
+import tempfile
+from collections.abc import Iterable
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from lare.experiments import figures
+from lare.experiments.agents import Sample, Watched, sample, watch
+from lare.experiments.credit import correlations, factor_labels
+from lare.experiments.html import function_text, note, table
+from lare.tasks.particles.drawing import film
+from lare.tasks.particles.table import find_particle_task
+from lare.training.run import Run
+
+PICTURED = 1500
+"""Points of a t-SNE picture."""
+
+
+def agents_details(run: Run) -> Iterable[str]:
+    """Who got which credit, the episode as a film, the factors of each team, and where its steps lie."""
+    watched = watch(run)
+    yield "<h3>Who got which credit when</h3>"
+    yield figures.credit_map(watched.reward, watched.proxy)
+    sums = f"Sum of the true rewards {watched.reward.sum():.1f}"
+    if watched.proxy is not None:
+        sums += f", of the proxy rewards {watched.proxy.sum():.1f}"
+    yield note(
+        f"One episode of the first seed's policy, every agent a row. {sums}. In the film each agent wears its credit as "
+        "number and colour: blue for more, red for less."
+    )
+    yield moving(run, watched)
+    if run.functions:
+        for place, taken in enumerate(sample(run)):
+            yield from of_team(run, place, taken)
+
+
+def moving(run: Run, watched: Watched) -> str:
+    """The film, inside the page."""
+    name = run.config.task.particles
+    assert name is not None
+    credit = watched.reward if watched.proxy is None else watched.proxy
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place) / "episode.gif"
+        film(path, find_particle_task(name), watched.position, credit)
+        data = base64.b64encode(path.read_bytes()).decode()
+    return f'<img class="film" alt="one episode, with the credit of each agent" src="data:image/gif;base64,{data}">'
+
+
+def of_team(run: Run, place: int, taken: Sample) -> Iterable[str]:
+    """A team's factors and its latent function."""
+    name, function = run.config.task.roles[place].name, run.functions[place]
+    yield f"<h3>The factors of {escape(name)}</h3>"
+    rows = [
+        (factor, meaning, "-" if np.isnan(value) else f"{value:.2f}")
+        for (factor, meaning), value in zip(factor_labels(run, place), taken.correlations, strict=True)
+    ]
+    yield table(("factor", "meaning, in the model's words", "correlation with the true reward"), rows, (2,))
+    raw, latent = (
+        np.nanmean(np.abs(correlations(columns, taken.reward))) for columns in (taken.observation, taken.factors)
+    )
+    yield note(
+        f"Absolute correlation with the true reward, mean over dimensions: {raw:.2f} of the {taken.observation.shape[1]} "
+        f"numbers that an agent observes, {latent:.2f} of the {taken.factors.shape[1]} factors."
+    )
+    yield from neighbourhoods(taken)
+    yield f"<h3>The latent function of {escape(name)}</h3>"
+    yield function_text(function.model, function.digest, function.source)
+
+
+def neighbourhoods(taken: Sample) -> Iterable[str]:
+    """The paper's appendix G: t-SNE of observations and of factors, coloured by the true reward."""
+    try:
+        from sklearn.manifold import TSNE
+    except ImportError:
+        yield note("With pip install 'lare-rl[tsne]' a t-SNE picture of observations and factors would stand here.")
+        return
+    chosen = np.random.default_rng(0).permutation(len(taken.reward))[:PICTURED]
+
+    def plane(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows 2"]:
+        rows = columns[chosen]
+        rows = (rows - rows.mean(axis=0)) / np.maximum(rows.std(axis=0), 1e-9)
+        return TSNE(init="pca", random_state=0).fit_transform(rows)
+
+    yield figures.scatters(
+        {"observations": plane(taken.observation), "factors": plane(taken.factors)}, taken.reward[chosen]
+    )
+    yield note("t-SNE of steps of agents; steps that are alike lie together. Colour: the true reward.")

@@ -1,0 +1,25 @@
+"""Pieces of a page."""
+
+from collections.abc import Iterable, Sequence
+from html import escape
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
+    """An HTML table of escaped cells; the columns in `numbers` are set as figures."""
+
+    def cells(tag: str, row: Sequence[str]) -> str:
+        kinds = (' class="number"' if place in numbers else "" for place in range(len(row)))
+        return "".join(f"<{tag}{kind}>{escape(cell)}</{tag}>" for kind, cell in zip(kinds, row, strict=True))
+
+    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    return f'<div class="wide"><table><tr>{cells("th", head)}</tr>\n{body}\n</table></div>'
+
+
+def note(text: str) -> str:
+    """Small print."""
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def function_text(model: str, digest: str, source: str) -> str:
+    """A latent function, to be read."""
+    return note(f"By {model}. SHA-256 {digest}.") + f"<pre>{escape(source)}</pre>"
