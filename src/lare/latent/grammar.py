@@ -15,6 +15,7 @@ from lare.latent.language import (
     DTYPE_NAMES,
     DTYPES,
     EINSUM,
+    FUTURE,
     INSTEAD,
     METHODS,
     MODULES,
@@ -27,8 +28,10 @@ from lare.latent.language import (
 from lare.latent.syntax import (
     Function,
     assigned,
+    beneath,
     definitions,
     dotted,
+    evaluated,
     exists,
     is_docstring,
     is_key,
@@ -83,6 +86,12 @@ CONSTRUCTS = {
 }
 """How the commonest of what is not available is called."""
 
+KEPT = (
+    *(ast.While, ast.Try, ast.TryStar, ast.AsyncFor, ast.AsyncWith, ast.Set, ast.SetComp, ast.Starred),
+    *(ast.NamedExpr, ast.Yield, ast.YieldFrom, ast.Await),
+)
+"""Of these, what stands in them stays when they go, and so has to be right."""
+
 OPERATORS = (
     *(ast.Add, ast.Sub, ast.Mult, ast.Div, ast.FloorDiv, ast.Mod, ast.Pow, ast.MatMult),
     *(ast.BitAnd, ast.BitOr, ast.BitXor, ast.UAdd, ast.USub, ast.Not, ast.Invert),
@@ -118,6 +127,8 @@ class Gate(ast.NodeVisitor):
     def generic_visit(self, node: ast.AST) -> None:
         name = CONSTRUCTS.get(type(node), type(node).__name__)
         self.refuse("E-CONSTRUCT", node, f"{name} is not available")
+        if isinstance(node, KEPT):
+            self.visit_all(list(beneath(node)))
 
     def visit_all(self, nodes: Sequence[ast.AST | None]) -> None:
         for node in nodes:
@@ -162,8 +173,8 @@ class Gate(ast.NodeVisitor):
             self.refuse(
                 "E-IMPORT", node, f"from {module} import: write `import numpy as np` and the function's full name"
             )
-        elif not names <= (TYPING if node.module == "typing" else {"annotations"}):
-            self.refuse("E-IMPORT", node, f"from {node.module} import: only {', '.join(sorted(TYPING))}")
+        elif not names <= (there := TYPING if node.module == "typing" else FUTURE):
+            self.refuse("E-IMPORT", node, f"from {node.module} import: only {', '.join(sorted(there))}")
 
     # --- functions ----------------------------------------------------------------------------------------------
 
@@ -236,9 +247,6 @@ class Gate(ast.NodeVisitor):
     def visit_AugAssign(self, node: ast.AugAssign) -> None:
         if isinstance(node.target, ast.Name) and node.target.id in self.scope_inputs():
             self.refuse("E-INPUT", node, f"`{node.target.id} ...=` writes into the input: copy it first")
-        for inner in ast.walk(node.target):
-            if isinstance(inner, ast.Attribute) and inner.attr in CHANGING:
-                self.refuse("E-CONSTRUCT", node, f".{inner.attr} in the target of an assignment: call it before")
         self.operator(node.op, node)
         self.visit_all([node.target, node.value])
 
@@ -313,9 +321,12 @@ class Gate(ast.NodeVisitor):
     def scope_inputs(self) -> frozenset[str]:
         return self.scopes[-1].inputs
 
+    def instead(self, name: str) -> str:
+        return f"; write {INSTEAD[name]}" if name in INSTEAD else ""
+
     def hint(self, name: str, among: set[str] | frozenset[str]) -> str:
         if name in INSTEAD:
-            return f"; write {INSTEAD[name]}"
+            return self.instead(name)
         if len(self.problems) >= MOST_HINTS or len(name) > LONGEST_HINTED:
             return ""
         near = difflib.get_close_matches(name, sorted(among), 1, 0.8)
@@ -358,15 +369,21 @@ class Gate(ast.NodeVisitor):
 
     def unknown(self, node: ast.AST, name: str) -> None:
         """A dotted name that is not on the list: say whether there is such a thing, and why it is not available."""
-        code = "E-NUMPY" if name.startswith("numpy.") else "E-MATH"
-        reason = REASONS.get(name.split(".")[1])
-        if reason is None:
-            reason = "it is not on the list" if exists(name) else "there is no such function"
-        self.refuse(code, node, f"{shown(name)} is not available: {reason}{self.hint(name, frozenset(DOTTED))}")
+        module, first, *_ = name.split(".")
+        code, reason = {"numpy": ("E-NUMPY", REASONS.get(first)), "math": ("E-MATH", None)}[module]
+        if reason is not None:
+            said = f"is not available: {reason}{self.instead(name)}"
+        elif exists(name):
+            said = f"is not allowed{self.instead(name)}"
+        else:
+            said = f"is not available: there is no such function{self.hint(name, frozenset(DOTTED))}"
+        self.refuse(code, node, f"{shown(name)} {said}")
 
     def visit_Call(self, node: ast.Call) -> None:
+        inner = [*node.args, *(one.value for one in node.keywords)]
         if any(isinstance(one, ast.Starred) for one in node.args) or any(one.arg is None for one in node.keywords):
             self.refuse("E-CALL", node, "* and ** in a call are not available")
+            self.visit_all([one.value if isinstance(one, ast.Starred) else one for one in inner])
             return
         name = dotted(node.func)
         signature: Signature | None = None
@@ -395,9 +412,11 @@ class Gate(ast.NodeVisitor):
             self.visit(node.func.value)
         else:
             self.refuse("E-CALL", node, "only a function that has a name can be called")
+            self.approved.add(node.func)  # a lambda: that it has no name has been said
+            self.visit(node.func)
         if signature is not None and name is not None:
             self.arguments(node, name, signature)
-        self.visit_all([*node.args, *(one.value for one in node.keywords)])
+        self.visit_all(inner)
 
     def arguments(self, node: ast.Call, name: str, signature: Signature) -> None:
         """Whether a call of a known function is one that the language has."""
@@ -524,7 +543,7 @@ def recursion(tree: ast.Module, functions: frozenset[str]) -> Iterator[Problem]:
     calls = {
         name: {
             inner.func.id
-            for inner in ast.walk(node)
+            for inner in evaluated(node)
             if isinstance(inner, ast.Call) and isinstance(inner.func, ast.Name) and inner.func.id in functions
         }
         for name, node in definitions(tree)
