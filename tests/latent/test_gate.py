@@ -260,7 +260,7 @@ def said(source: str) -> list[str]:
         (phi("x = np.euler_gamma\nreturn [action]"), ["E-NUMPY line 2: np.euler_gamma is not allowed"]),
         (phi("return [math.pow(2, 3)]"), ["E-MATH line 2: math.pow is not allowed; write the operator **"]),
         (phi("return [math.gcd(2, 3)]"), ["E-MATH line 2: math.gcd is not allowed"]),
-        (phi("return [math.load(1)]"), ["E-MATH line 2: math.load is not available: there is no such function; did you mean math.log?"]),
+        (phi("return [math.two(1)]"), ["E-MATH line 2: math.two is not available: there is no such function"]),
         (phi("return [math.sigmoid(1)]"), ["E-MATH line 2: math.sigmoid is not available: there is no such function"]),
         # Calls
         (phi("return [max(*action)]"), ["E-CALL line 2: * and ** in a call are not available"]),
@@ -608,7 +608,7 @@ def call_of(name: str, signature: language.Signature) -> str:
 
 def test_every_name_of_numpy_is_on_the_list_or_refused(monkeypatch):
     # Nearly all of the time would go into looking for what might have been meant.
-    monkeypatch.setattr("lare.latent.grammar.difflib.get_close_matches", lambda *_: [])
+    monkeypatch.setattr("lare.latent.expressions.difflib.get_close_matches", lambda *_: [])
     names = sorted(names_of_numpy() | language.NUMPY.keys() | language.NUMPY_CONSTANTS)
     assert len(names) > 2000
     none = language.Signature(1, 1)
