@@ -51,9 +51,9 @@ def main(argument: str) -> None:
     problems = gate.inspect(source) if start["gate"] else []
     try:
         programs = {} if problems else load(source, functions, gated=start["gate"])
-        send({"problems": problems[:MOST_PROBLEMS]})
+        send({"number": start["number"], "problems": problems[:MOST_PROBLEMS]})
     except BaseException as error:  # a program that is not gated does what it likes here
-        send({"problems": []} | failure(error))
+        send({"number": start["number"], "problems": []} | failure(error))
         return
     sizes = start["observation"], start["action"], start["rows"]
     if given["audit"]:
@@ -63,7 +63,7 @@ def main(argument: str) -> None:
         events.clear()
         # Whoever has lost its parent in the middle of a long call ends all the same: the signal is not handled.
         signal.setitimer(signal.ITIMER_REAL, request["seconds"])
-        answer = serve(programs, request, memory, sizes)
+        answer = serve(programs, request, memory, sizes) | {"number": request["number"]}
         signal.setitimer(signal.ITIMER_REAL, 0)
         send(answer | {"events": events[:10]} if given["audit"] else answer)
 
