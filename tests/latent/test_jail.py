@@ -1,8 +1,10 @@
 """The jail: what its filter lets through, what each layer holds alone, and any Python at all inside of it."""
 
+import ctypes
 import errno
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -127,6 +129,8 @@ def test_refused_calls_end_the_process_where_that_is_wanted(machine):
     assert judged(machine, CALLS[machine]["brk"], kill=True) == ALLOW
 
 
+FAILED = "the process that runs the latent function failed:"
+
 # --- each layer alone ------------------------------------------------------------------------------------------------
 
 ALONE = """
@@ -181,6 +185,27 @@ def test_a_refused_call_ends_the_process_where_that_is_wanted(seccomp):
     code = "from lare.latent import jail; jail.enter(kill=True); print('in', flush=True); open('/')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.stdout, done.returncode) == ("in\n", -signal.SIGSYS)
+
+
+@pytest.mark.parametrize(("kill", "ending"), [(True, f"signal {signal.SIGSYS}"), (False, "exit status 7")])
+def test_so_does_a_worker_with_its_program(seccomp, kill, ending):
+    # Where a test says that a program made no refused call, it relies on this.
+    body = "try: os.getcwd()\nexcept PermissionError: os._exit(7)"
+    program = JailedProgram("import os\n" + phi(body), 2, 1, gated=False, kill=kill)
+    with pytest.raises(WorkerFailed) as error:
+        program.call(np.zeros((1, 2)), np.zeros((1, 1)))
+    assert str(error.value) == f"{FAILED} it ended ({ending})"
+
+
+@pytest.mark.skipif(
+    platform.machine() not in jail.MACHINES or sys.platform != "linux", reason="no seccomp for this machine"
+)
+def test_what_the_kernel_has_is_in_force(layers):
+    # Nearly all of these tests are skipped where a layer is missing: it must be the kernel that does not have it.
+    version = ctypes.CDLL(None).syscall(jail.LANDLOCK_CREATE_RULESET, None, ctypes.c_size_t(0), 1)
+    with open("/proc/self/status", encoding="ascii") as file:
+        filters = "Seccomp_filters:" in file.read()
+    assert layers == (*["landlock"] * (version >= 1), "rlimits", *["seccomp"] * filters)
 
 
 def test_what_a_system_does_not_have_is_not_named():
@@ -337,8 +362,6 @@ def test_nothing_of_this_environment_is_inside(seccomp, monkeypatch):
     threads = {"OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"}
     assert names - {"LC_CTYPE", "LD_LIBRARY_PATH"} == threads
 
-
-FAILED = "the process that runs the latent function failed:"
 
 FORGE = """
 def forge(line):
