@@ -308,12 +308,19 @@ def test_cost_in_memory():
 
 
 @pytest.mark.parametrize(("seconds", "slow"), [((1.5, 1.25), "1.2"), ((0.9, 5.0), ""), ((5.0, 0.9), "")])
-def test_cost_in_time(monkeypatch, seconds, slow):
+@pytest.mark.parametrize(("name", "rows"), [("runs", 256), ("cost", 4096)])
+def test_cost_in_time(monkeypatch, name, rows, seconds, slow):
     # Once may be bad luck; the clock is one of ours.
     clock = iter([0.0, seconds[0], 10.0, 10.0 + seconds[1]])
     monkeypatch.setattr(checks.time, "perf_counter", lambda: next(clock))
-    said = message("cost", trial())
-    assert said == (f"E-COST: 4096 rows take {slow} s; at most 1 s are accepted" if slow else "")
+    said = message(name, trial())
+    assert said == (f"E-COST: {rows} rows take {slow} s; at most 1 s are accepted" if slow else "")
+
+
+def test_what_is_slow_is_not_tried_any_further(monkeypatch):
+    clock = iter([0.0, 2.0, 2.0, 4.0])
+    monkeypatch.setattr(checks.time, "perf_counter", lambda: next(clock))
+    assert [check.name for check in examine(trial())] == ["runs"]
 
 
 def test_empty_batch():

@@ -1,8 +1,10 @@
 """The jail: what its filter lets through, what each layer holds alone, and any Python at all inside of it."""
 
+import ctypes
 import errno
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -127,6 +129,8 @@ def test_refused_calls_end_the_process_where_that_is_wanted(machine):
     assert judged(machine, CALLS[machine]["brk"], kill=True) == ALLOW
 
 
+FAILED = "the process that runs the latent function failed:"
+
 # --- each layer alone ------------------------------------------------------------------------------------------------
 
 ALONE = """
@@ -181,6 +185,27 @@ def test_a_refused_call_ends_the_process_where_that_is_wanted(seccomp):
     code = "from lare.latent import jail; jail.enter(kill=True); print('in', flush=True); open('/')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.stdout, done.returncode) == ("in\n", -signal.SIGSYS)
+
+
+@pytest.mark.parametrize(("kill", "ending"), [(True, f"signal {signal.SIGSYS}"), (False, "exit status 7")])
+def test_so_does_a_worker_with_its_program(seccomp, kill, ending):
+    # Where a test says that a program made no refused call, it relies on this.
+    body = "try: os.getcwd()\nexcept PermissionError: os._exit(7)"
+    program = JailedProgram("import os\n" + phi(body), 2, 1, gated=False, kill=kill)
+    with pytest.raises(WorkerFailed) as error:
+        program.call(np.zeros((1, 2)), np.zeros((1, 1)))
+    assert str(error.value) == f"{FAILED} it ended ({ending})"
+
+
+@pytest.mark.skipif(
+    platform.machine() not in jail.MACHINES or sys.platform != "linux", reason="no seccomp for this machine"
+)
+def test_what_the_kernel_has_is_in_force(layers):
+    # Nearly all of these tests are skipped where a layer is missing: it must be the kernel that does not have it.
+    version = ctypes.CDLL(None).syscall(jail.LANDLOCK_CREATE_RULESET, None, ctypes.c_size_t(0), 1)
+    with open("/proc/self/status", encoding="ascii") as file:
+        filters = "Seccomp_filters:" in file.read()
+    assert layers == (*["landlock"] * (version >= 1), "rlimits", *["seccomp"] * filters)
 
 
 def test_what_a_system_does_not_have_is_not_named():
@@ -338,7 +363,12 @@ def test_nothing_of_this_environment_is_inside(seccomp, monkeypatch):
     assert names - {"LC_CTYPE", "LD_LIBRARY_PATH"} == threads
 
 
-FAILED = "the process that runs the latent function failed:"
+FORGE = """
+def forge(line):
+    request = sys._getframe(3).f_locals["request"]
+    os.write(1, line.replace(b"%s", request["number"].encode()))
+"""
+"""To answer in the worker's place, one has to look up what is asked, and can answer only that."""
 
 
 @pytest.mark.parametrize(
@@ -354,14 +384,14 @@ FAILED = "the process that runs the latent function failed:"
         ("os.write(1, b'junk\\n')", "it broke off (Expecting value: line 1 column 1 (char 0); still running)"),
         ("print('junk', flush=True)", "it broke off (Expecting value: line 1 column 1 (char 0); still running)"),
         ("os.write(1, b'x' * 10**6)", "it said more than it may"),
-        ("os.write(1, b'[1]\\n')\nwhile True: pass", "it said something that is no answer"),
-        ("os.write(1, b'null\\n')\nwhile True: pass", "it said something that is no answer"),
+        ("os.write(1, b'[1]\\n')\nwhile True: pass", "it said something that is no answer to what was asked"),
+        ("os.write(1, b'null\\n')\nwhile True: pass", "it said something that is no answer to what was asked"),
         (
             "os.write(1, b'[' * 9999 + b'\\n')\nwhile True: pass",
             "it broke off (maximum recursion depth exceeded while decoding a JSON array from a unicode string; still running)",
         ),
         (
-            "os.write(1, b'{\"values\": [[]]}\\n')\nwhile True: pass",
+            FORGE + 'forge(b\'{"number": "%s", "values": [[]]}\\n\')\nwhile True: pass',
             "it said something that cannot be read "
             "(ValueError('not enough values to unpack (expected at least 1, got 0)'))",
         ),
@@ -377,7 +407,7 @@ FAILED = "the process that runs the latent function failed:"
     ],
 )
 def test_what_breaks_the_worker_is_one_line_and_leaves_nothing(seccomp, monkeypatch, body, message):
-    program = JailedProgram("import ctypes, os\n" + phi(body), 2, 1, gated=False)
+    program = JailedProgram("import ctypes, os, sys\n" + phi(body), 2, 1, gated=False)
     if "did not answer" in message:
         monkeypatch.setattr(jailed, "TIME_LIMIT", 1.0)
     with pytest.raises(WorkerFailed) as error:
@@ -421,9 +451,27 @@ def test_what_breaks_the_worker_while_it_is_loaded(monkeypatch, body, message):
     assert str(error.value) == f"{FAILED} {message}"
 
 
+@pytest.mark.parametrize("number", ["", '"number": "", ', '"number": "0123456789abcdef", ', '"number": null, '])
+def test_an_answer_to_another_request_is_none(seccomp, number):
+    answer = f'{{{number}"values": [["array", [1, 1], "float64"]]}}'
+    program = JailedProgram(
+        "import os\n" + phi(f"os.write(1, {answer.encode()!r} + b'\\n')\nwhile True: pass"), 2, 1, gated=False
+    )
+    with pytest.raises(WorkerFailed, match="it said something that is no answer to what was asked"):
+        program.call(np.zeros((1, 2)), np.zeros((1, 1)))
+
+
+def test_what_is_left_of_an_answer_is_not_the_next_one(seccomp):
+    body = FORGE + 'forge(b\'{"number": "%s", "values": []}\\n\')\nfor turn in range(10**7): pass\nreturn [action]'
+    program = JailedProgram("import os, sys\n" + phi(body), 2, 1, gated=False)
+    assert program.call(np.zeros((1, 2)), np.zeros((1, 1))).values == ()
+    with pytest.raises(WorkerFailed, match="it said something that is no answer to what was asked"):
+        program.call(np.zeros((1, 2)), np.zeros((1, 1)))
+
+
 LIES = {
     "a forged answer": (
-        'os.write(1, b\'{"values": [["array", [1, 1], "float64"]]}\\n\')\nwhile True: pass',
+        FORGE + 'forge(b\'{"number": "%s", "values": [["array", [1, 1], "float64"]]}\\n\')\nwhile True: pass',
         (("array", (1, 1), "float64"),),
         [[0.0]],
     ),
@@ -445,7 +493,7 @@ LIES = {
 
 @pytest.mark.parametrize(("body", "values", "factors"), LIES.values(), ids=LIES)
 def test_who_lies_gets_nothing_for_it(seccomp, body, values, factors):
-    program = JailedProgram("import os\n" + phi(body), 2, 1, gated=False)
+    program = JailedProgram("import os, sys\n" + phi(body), 2, 1, gated=False)
     returned = program.call(np.zeros((1, 2)), np.zeros((1, 1)))
     program.close()
     assert returned.values == values

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lare.latent import language
-from lare.latent.oblivious import Looked, Missing, Oblivious, careful_functions, hidden, shown
+from lare.latent.oblivious import Looked, Missing, Oblivious, Watched, careful_functions, hidden, owner, shown, watched
 from lare.latent.program import FILE, Program
 from toys import PHI, phi
 
@@ -94,6 +94,61 @@ def test_who_looks_is_found(expression, message):
     assert str(error.value) == message
     lines = [frame.lineno for frame in traceback.extract_tb(error.value.__traceback__) if frame.filename == FILE]
     assert lines[-1] == 4
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "x[:] = action",
+        "x[:, 0] = action[:, 0]",
+        "x[0] = [action[0, 0], 1, 2, 3, 4, 5]",
+        "x[action > 0] = 1",
+        "x[np.argmax(action[0])] = 1",
+        "x[:] += action",
+        "y = x\ny += action",
+        "y = x\ny @= action[:6] + np.eye(6)",
+        "y = [x]\ny[0] *= action",
+        "x.T[:] = action.T",
+        "x.reshape(-1)[:] = action.reshape(-1)",
+        "np.swapaxes(x, 0, 1)[:] = action.T",
+        "y = np.asarray(x)[1:]\ny[0] = action[0]",
+        "for x[:, 0] in [action[:, 0]]: pass",
+        "y = [0 for x[:] in [action]]",
+        "x[:], y = action, 1",
+        "np.add(action, 1, out=x)",
+        "np.add(action[:, 0:3], 1, out=x[:, 0:3])",
+        "np.add(1, 2, out=x, where=action > 0)",
+        "def f(y): y[:] = action\nf(x)",
+        "y = np.zeros((8, 6))\ny[:] = action\nx[:] = y",
+    ],
+)
+@pytest.mark.parametrize(
+    "look", ["x[0, 0]", "view[0, 0]", "x.sum()", "np.max(x + 1)", "x.copy()[0, 0]", "1 + abs(view.T)[0, 0]"]
+)
+def test_an_array_that_takes_values_in_is_hidden_with_all_its_views(written, look):
+    with pytest.raises(Looked, match=DECISION):
+        run_hidden(phi(f"x = np.zeros((8, 6))\nview = x[:, 0:2]\n{written}\nif {look} > 0: pass\nreturn [x]"))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "x = np.zeros((8, 6))\nx[:] = 1\nx += 2\nnp.add(x, 1, out=x)\nif x[0, 0] == 4: return [action]",
+        "x = np.zeros((8, 6))\ny = x.copy()\ny[:] = action\nif x[0, 0] == 0: return [action]",
+        "x = np.zeros((8, 6))\ny = x[:, 0] + 0\nx[:] = action\nif y[0] == 0: return [action]",
+    ],
+)
+def test_constants_that_values_do_not_reach_stay_open(body):
+    assert type(run_hidden(phi(f"{body}\nreturn []"))[0]) is Oblivious
+
+
+def test_a_table_of_constants_may_be_read_by_values_but_not_cut_by_them():
+    table = "x = np.array([1.0, 2.0, 3.0])\nplaces = np.argmax(action, axis=1) % 3\n"
+    assert type(run_hidden(phi(f"{table}return [x[places][:, None]]"))[0]) is Oblivious
+    with pytest.raises(Looked, match=DECISION):
+        run_hidden(phi(f"{table}if x[places][0] > 1: pass"))
+    with pytest.raises(Looked, match=INDEX):
+        run_hidden(phi(f"{table}return [x[places[0:3] > 0]]"))
 
 
 @pytest.mark.parametrize(
@@ -206,7 +261,18 @@ def test_no_function_of_numpy_forgets_whom_it_was_given(name):
 
 def test_functions_of_what_is_not_hidden_hide_nothing():
     assert type(FUNCTIONS["numpy.sum"](np.ones(3))) is np.float64
-    assert type(FUNCTIONS["numpy.zeros"]((2, 3))) is np.ndarray
+    assert type(FUNCTIONS["numpy.zeros"]((2, 3))) is Watched
+    assert float(FUNCTIONS["numpy.zeros"]((2, 3))[0, 0]) == 0
+
+
+@pytest.mark.parametrize("name", sorted(name for name in FUNCTIONS.keys() - TAKE_NO_ARRAY if not name.startswith("$")))
+def test_who_shares_memory_has_its_owner(name):
+    x = watched(np.abs(batch()[0][:, :3]) + 0.5)
+    given = ARGUMENTS[name](x) if name in ARGUMENTS else (x,) * language.DOTTED[name].least
+    with np.errstate(all="ignore"):
+        found = FUNCTIONS[name](*given)
+    for one in found if isinstance(found, list | tuple) else [found]:
+        assert not np.shares_memory(one, x) or owner(one) is owner(x)
 
 
 def test_a_keyword_is_an_argument_too():

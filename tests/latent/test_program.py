@@ -53,6 +53,15 @@ ODDITIES = {
     "augmented": (
         "x = action.copy()\ny = x\nx *= 2\nx **= 2\nx[:, 0] *= 3\nx[1:, 1:3] **= 2\nx -= 1\ny[0] = 7\nreturn [x, y]"
     ),
+    "augmented once": (
+        "x, y = [1, 2, 3], [0, 1, 2]\ndef f(z):\n    z.append(len(z))\n    return z[-1] - 3\n"
+        "x[f(y)] += 10\nx[f(y)] *= f(y)\n[x, y][y.pop(0)][-1] -= f(y)\n"
+        "def g(z):\n    z[0] = 7\n    return 1\nx[0] += g(x)\nx[x[0] - 8 : 1 + g(x)] += [5]\nreturn [np.array(x), np.array(y)]"
+    ),
+    "augmented slices": (
+        "x = np.arange(24.0).reshape(4, 6)\nx[1:, ::2] *= 2\nx[..., -1] -= 1\nx[:2][1:] += 3\nx[None, 0, :] /= 4\n"
+        "y = [x]\ny[0][(1, 2)] **= 2\ny[-1][[0, 2]] //= 3\nreturn [x]"
+    ),
     "augmented lists": "x = [1, 2]\ny = x\nx *= 2\nx += [5]\nx[0] *= 9\nreturn [np.array(x), np.array(y)]",
     "annotations": "x: np.ndarray = action\ny: int\ny = 2\nreturn [x * y]",
     "tuples": "(a, b), c = (1, 2), 3\nd = e = a\nreturn [action * (a + b * c - d / e)]",
@@ -93,6 +102,7 @@ def test_a_program_means_what_python_takes_it_to_mean(source):
         (phi("x = [\n    j\n    for i in range(3)\n    for j in [1][9:][0]\n]"), 5),
         (phi("f = (\n    lambda x:\n    x[7]\n)\nf([1])"), 4),
         (phi("x = [1]\nx[\n    3\n] *= 2"), 3),
+        (phi("x = [1]\nx[\n    [][1]\n] *= 2"), 4),
         (phi("x = [1]\n\nx *= (\n    1 / 0)"), 5),
         (phi("with np.errstate(all='ignore'):\n    pass\n    np.zeros((2, 3)) + np.zeros(4)"), 4),
         (phi("for i in range(2):\n    pass\n\n    action[99]"), 5),

@@ -94,7 +94,10 @@ def test_what_is_as_asked_for_is_read_unchanged(values):
     assert parse(json.dumps(values)) == Reply(**values)
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"self": 1}', '{"Understand": "u", "Analyze": "a", "Functions": ""}'])
+@pytest.mark.parametrize(
+    "text",
+    ["```" + "\t" * 190_000, "[" * 100_000, '{"self": 1}', '{"Understand": "u", "Analyze": "a", "Functions": ""}'],
+)
 def test_what_once_broke_the_parser(text):
     with pytest.raises(MalformedReply):
         parse(text)

@@ -9,7 +9,8 @@ import ast
 import re
 from collections.abc import Iterator
 
-from lare.latent.grammar import Gate, Problem, recursion
+from lare.latent.expressions import Problem
+from lare.latent.grammar import Gate, recursion
 from lare.latent.syntax import definitions
 
 LONGEST = 20_000

@@ -8,6 +8,7 @@ import contextlib
 import json
 import mmap
 import os
+import secrets
 import select
 import subprocess
 import sys
@@ -24,8 +25,8 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
+from lare.latent.expressions import Problem
 from lare.latent.gate import guard
-from lare.latent.grammar import Problem
 from lare.latent.worker import MOST_FACTORS
 
 ROWS = 4096
@@ -176,12 +177,16 @@ class JailedProgram:
         )
 
     def ask(self, request: dict[str, Any] | None) -> dict[str, Any]:
-        """Send a request, if there is one, and wait for the answer."""
+        """Send a request, if there is one, and wait for the answer to it."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         deadline = time.monotonic() + TIME_LIMIT
+        number = (
+            secrets.token_hex(8) if request is not None else ""
+        )  # an answer cannot be laid up before it is asked for
         try:
             if request is not None:
+                request = request | {"number": number}
                 # A request fits into the pipe whole, or the pipe is full because nobody reads it, and this fails.
                 os.write(self.process.stdin.fileno(), json.dumps(request).encode() + b"\n")
             line = b""
@@ -201,8 +206,8 @@ class JailedProgram:
         except BaseException:
             self.close()  # its answer would be taken for that to the next request
             raise
-        if not isinstance(answer, dict):
-            self.broken("it said something that is no answer")
+        if not isinstance(answer, dict) or answer.get("number", "") != number:
+            self.broken("it said something that is no answer to what was asked")
         return answer
 
     def ending(self) -> str:
@@ -301,7 +306,9 @@ def start(memory: Sequence[Shared], kill: bool, audit: bool) -> subprocess.Popen
             cwd="/",
             env={**needed, **one_thread},
             pass_fds=[inputs.read, outputs.write],
-            start_new_session=True,  # Ctrl-C is for the parent, which saves and leaves
+            # Ctrl-C is for the parent, which saves and leaves. A group of its own, but not a session: when the parent
+            # is killed, the kernel wakes and ends whoever is stopped in a group that nobody is left to continue.
+            process_group=0,
         )
     except OSError as error:
         raise NoWorker(f"the process for the latent function cannot be started: {error.strerror or error}") from error

@@ -180,6 +180,9 @@ BUILTINS: dict[str, Signature] = {
     **signatures("zip", 1, 16, "strict"),
 }
 
+FUTURE = frozenset("absolute_import annotations division print_function unicode_literals".split())
+"""What comes of `__future__` and has come: importing it changes nothing."""
+
 TYPING = frozenset("Any Dict Iterable List NamedTuple Optional Sequence Tuple Union".split())
 
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_ -]{0,63}")
@@ -206,7 +209,7 @@ REASONS = {
     **dict.fromkeys("unique nonzero argwhere flatnonzero extract compress trim_zeros union1d".split(), VALUES),
     **dict.fromkeys("vectorize frompyfunc apply_along_axis apply_over_axes fromfunction piecewise".split(), CALLBACK),
 }  # fmt: skip
-"""Why a NumPy function that exists is not on the list."""
+"""Why a NumPy function that exists is not allowed, where there is more to say."""
 
 INSTEAD = {
     "numpy.clamp": "np.clip",
@@ -219,7 +222,21 @@ INSTEAD = {
     "numpy.softmax": "np.exp(x - x.max(axis=1, keepdims=True)), divided by its sum",
     "numpy.empty": "np.zeros",
     "numpy.empty_like": "np.zeros_like",
+    "numpy.add.accumulate": "np.cumsum",
+    "numpy.add.at": "the operator +=",
+    "numpy.allclose": "np.isclose and np.all",
+    "numpy.bool": "np.bool_",
+    "numpy.count_nonzero": "np.sum of a condition",
+    "numpy.emath.sqrt": "np.sqrt(np.maximum(x, 0))",
+    "numpy.gradient": "np.diff",
+    "numpy.nanstd": "np.std",
+    "numpy.nanvar": "np.var",
+    "numpy.trapezoid": "np.sum",
+    "math.dist": "np.linalg.norm of the difference",
+    "math.fsum": "np.sum",
+    "math.isclose": "np.isclose",
     "math.pow": "the operator **",
+    "math.prod": "np.prod",
     "pow": "the operator **",
     "print": "nothing: the function only returns its factors",
     "isinstance": "the shapes that are given: two arrays of two dimensions",

@@ -4,13 +4,14 @@ A latent function judges a whole batch at once; an `if` on a value would decide 
 that runs through on these arrays takes the same way through its code whatever the values are.
 """
 
+import weakref
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Never
+from typing import Any
 
 import numpy as np
 
 from lare.latent.language import DOTTED, METHODS
-from lare.latent.program import CALLED_TYPES, OPERATORS, namespace, only_numbers, resolve
+from lare.latent.program import CALLED_TYPES, only_numbers, resolve
 
 
 class Looked(Exception):
@@ -21,34 +22,54 @@ class Missing(Exception):
     """An entry was asked for that there is not. NumPy itself lets a slice end anywhere."""
 
 
-class Oblivious(np.ndarray):
-    """An array whose values cannot decide anything. Everything computed from it is one as well."""
+WRITTEN: weakref.WeakValueDictionary[int, np.ndarray] = weakref.WeakValueDictionary()
+"""Arrays of constants that values of the batch have been written into, by their identity."""
 
-    def __bool__(self) -> Never:
-        raise Looked("a decision depends on values of the batch: use np.where instead of if, and, or, max, min")
 
-    def __int__(self) -> Never:
-        raise Looked("a value of the batch is turned into one number: keep it an array")
+class Watched(np.ndarray):
+    """An array of constants, as long as no values of the batch are written into its memory; then it is hidden too."""
 
-    def __float__(self) -> Never:
-        raise Looked("a value of the batch is turned into one number: keep it an array, and use np instead of math")
+    def __bool__(self) -> bool:
+        refuse(self, "a decision depends on values of the batch: use np.where instead of if, and, or, max, min")
+        return super().__bool__()
 
-    def __index__(self) -> Never:
-        raise Looked("a value of the batch is used as an index: use np.where or np.take_along_axis")
+    def __int__(self) -> int:
+        refuse(self, "a value of the batch is turned into one number: keep it an array")
+        return super().__int__()
+
+    def __float__(self) -> float:
+        refuse(self, "a value of the batch is turned into one number: keep it an array, and use np instead of math")
+        return super().__float__()
+
+    def __index__(self) -> int:
+        refuse(self, "a value of the batch is used as an index: use np.where or np.take_along_axis")
+        return super().__index__()
 
     def __getitem__(self, key: Any) -> Any:
-        check_slices(key, self.shape)
-        if any(isinstance(part, Oblivious) for part in (key if isinstance(key, tuple) else (key,))):
+        by = [part for part in (key if isinstance(key, tuple) else (key,)) if touched([part])]
+        if is_hidden(self):
+            check_slices(key, self.shape)
+        if by and (is_hidden(self) or any(np.asarray(shown(part)).dtype == bool for part in by)):
             raise Looked("an array is indexed by values of the batch: use np.where or np.take_along_axis")
-        return hidden(super().__getitem__(key))
+        found = shown(self)[shown(key)]
+        return hidden(found) if by or is_hidden(self) else watched(found)
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        shown(self)[shown(key)] = shown(value)
+        if touched([key, value]):
+            write(self)
 
     def __getattribute__(self, name: str) -> Any:
         if name in METHODS:
             return careful(getattr(self.view(np.ndarray), name), SHAPING_METHODS.get(name, ()), self)
         return super().__getattribute__(name)
 
-    def __array_wrap__(self, array: np.ndarray, context: Any = None, return_scalar: bool = False) -> Any:
-        return hidden(array)
+    def __array_ufunc__(self, function: np.ufunc, method: str, *inputs: Any, **keywords: Any) -> Any:
+        return careful(getattr(function, method))(*inputs, **keywords)
+
+
+class Oblivious(Watched):
+    """An array whose values cannot decide anything. Everything computed from it is one as well."""
 
 
 def check_slices(key: Any, shape: tuple[int, ...]) -> None:
@@ -63,6 +84,32 @@ def check_slices(key: Any, shape: tuple[int, ...]) -> None:
                     raise Missing(f"the slice {part.start}:{part.stop} reaches past the {size} entries that there are")
 
 
+def owner(array: np.ndarray) -> np.ndarray:
+    """The array whose memory this one shows."""
+    while isinstance(array.base, np.ndarray):
+        array = array.base
+    return array
+
+
+def identity(array: np.ndarray) -> int:
+    """A number of the array whose memory this one shows. Not `id`, which is an audit event, and programs make none."""
+    return object.__hash__(owner(array))
+
+
+def write(array: np.ndarray) -> None:
+    """Values of the batch have been written into an array: whoever sees its memory is hidden from now on."""
+    WRITTEN[identity(array)] = owner(array)
+
+
+def is_hidden(value: Any) -> bool:
+    return isinstance(value, Oblivious) or (isinstance(value, np.ndarray) and identity(value) in WRITTEN)
+
+
+def refuse(array: Watched, message: str) -> None:
+    if is_hidden(array):
+        raise Looked(message)
+
+
 def hidden(value: Any) -> Any:
     """The same values, not to be looked into."""
     if isinstance(value, np.ndarray | np.generic):
@@ -72,18 +119,27 @@ def hidden(value: Any) -> Any:
     return value
 
 
+def watched(value: Any) -> Any:
+    """The same constants, where it is noticed if something is written into them."""
+    if isinstance(value, np.ndarray):
+        return value.view(Watched)
+    if isinstance(value, list | tuple):
+        return type(value)(watched(one) for one in value)
+    return value
+
+
 def shown(value: Any) -> Any:
     """The same values as an ordinary array."""
-    if isinstance(value, Oblivious):
+    if isinstance(value, Watched):
         return value.view(np.ndarray)
     if isinstance(value, list | tuple):
         return type(value)(shown(one) for one in value)
     return value
 
 
-def touched(arguments: Iterable[Any]) -> bool:
+def touched(values: Iterable[Any]) -> bool:
     """Whether one of some values, or of the values in them, is hidden."""
-    return any(isinstance(one, Oblivious) or (isinstance(one, list | tuple) and touched(one)) for one in arguments)
+    return any(is_hidden(one) or (isinstance(one, list | tuple) and touched(one)) for one in values)
 
 
 def careful(function: Callable[..., Any], shaping: tuple[int, ...] = (), *owners: Any) -> Callable[..., Any]:
@@ -97,7 +153,12 @@ def careful(function: Callable[..., Any], shaping: tuple[int, ...] = (), *owners
         if shaping and touched([*sizes, *(keywords[key] for key in keywords.keys() & SIZES)]):
             raise Looked("the shape of an array depends on values of the batch: use np.where, which keeps every row")
         result = function(*shown(arguments), **{name: shown(value) for name, value in keywords.items()})
-        return hidden(result) if touched([*owners, *arguments, *keywords.values()]) else result
+        if not touched([*owners, *arguments, *keywords.values()]):
+            return watched(result)
+        out = keywords.get("out", ())
+        for one in out if isinstance(out, tuple) else (out,):
+            write(one)
+        return hidden(result)
 
     return call
 
@@ -127,6 +188,4 @@ def careful_functions() -> Mapping[str, Callable[..., Any]]:
         for name in names
         if name.startswith("numpy.")
     }
-    functions |= {f"{name}()": careful(resolve(name)) for name in CALLED_TYPES}
-    # What takes a hidden array in is hidden from then on.
-    return functions | {f"$i{name}": careful(namespace()[f"$i{name}"]) for name in OPERATORS}
+    return functions | {f"{name}()": careful(resolve(name)) for name in CALLED_TYPES}

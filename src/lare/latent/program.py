@@ -86,6 +86,7 @@ def everything() -> dict[str, Any]:
         names |= {f"${name}": guarded(name, plain), f"$i{name}": guarded(name, in_place)}
     names |= {
         "$list": list,
+        "$slice": slice,
         "$array": array_only,
         "$dtype": dtype_of,
         "$extend": extend,
@@ -257,6 +258,20 @@ def called(name: str, *arguments: ast.expr) -> ast.Call:
     return ast.Call(ast.Name(name, ast.Load()), list(arguments), [])
 
 
+def named(name: str, value: ast.expr) -> ast.NamedExpr:
+    return ast.NamedExpr(ast.Name(name, ast.Store()), value)
+
+
+def sliced(index: ast.expr) -> ast.expr:
+    """An index as a value: `1:2` is one only between brackets."""
+    if isinstance(index, ast.Slice):
+        ends = [end or ast.Constant(None) for end in (index.lower, index.upper, index.step)]
+        return ast.copy_location(called("$slice", *ends), index)
+    if isinstance(index, ast.Tuple):
+        return ast.copy_location(ast.Tuple([sliced(one) for one in index.elts], ast.Load()), index)
+    return index
+
+
 class Rewrite(ast.NodeTransformer):
     """The syntax tree of what is run, from that of what was written. Lines stay where they are."""
 
@@ -318,8 +333,12 @@ class Rewrite(ast.NodeTransformer):
 
     def visit_AugAssign(self, node: ast.AugAssign) -> ast.stmt:
         self.generic_visit(node)
-        old = copy.deepcopy(node.target)
+        old = copy.copy(node.target)
         old.ctx = ast.Load()
+        if isinstance(old, ast.Subscript) and isinstance(node.target, ast.Subscript):
+            # What is indexed, and by what, is computed once, when the old value is read.
+            old.value, old.slice = named("$target", old.value), named("$index", sliced(old.slice))
+            node.target.value, node.target.slice = ast.Name("$target", ast.Load()), ast.Name("$index", ast.Load())
         new = called(f"$i{GUARDED[type(node.op)]}", old, node.value)
         return ast.copy_location(ast.Assign([node.target], new), node)
 

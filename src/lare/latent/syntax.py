@@ -1,6 +1,9 @@
 """Reading syntax trees: what a program defines, binds and names."""
 
 import ast
+import inspect
+import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -32,11 +35,32 @@ def assigned(node: ast.AST) -> set[str]:
         inner = frontier.pop()
         if isinstance(inner, ast.Name) and not isinstance(inner.ctx, ast.Load):
             found.add(inner.id)
+        if isinstance(inner, ast.ExceptHandler) and inner.name:
+            found.add(inner.name)
         if isinstance(inner, ast.FunctionDef):
             found.add(inner.name)
         elif not isinstance(inner, ast.Lambda):
             frontier += ast.iter_child_nodes(inner)
     return found
+
+
+def evaluated(node: ast.AST) -> Iterator[ast.AST]:
+    """A node and everything below it, but for annotations: nobody evaluates these."""
+    yield node
+    for name, value in ast.iter_fields(node):
+        if name not in {"annotation", "returns"}:
+            for inner in value if isinstance(value, list) else [value]:
+                if isinstance(inner, ast.AST):
+                    yield from evaluated(inner)
+
+
+def beneath(node: ast.AST) -> Iterator[ast.AST]:
+    """Statements, expressions and loops right below a node, and those of its handlers of exceptions."""
+    for inner in ast.iter_child_nodes(node):
+        if isinstance(inner, ast.stmt | ast.expr | ast.comprehension):
+            yield inner
+        elif isinstance(inner, ast.ExceptHandler):
+            yield from inner.body
 
 
 def rebound(function: ast.FunctionDef) -> set[str]:
@@ -91,12 +115,13 @@ def is_number(node: ast.AST) -> bool:
 
 
 def exists(name: str) -> bool:
-    """Whether NumPy has something of that name. Looks only at what is loaded already."""
-    value: object = np
-    for part in name.split(".")[1:] if name.startswith("numpy.") else ():
-        if part.startswith("_") or part not in vars(value):
+    """Whether there is something of a dotted name, as far as it can be told without loading anything."""
+    module, *parts = name.split(".")
+    value: object = {"numpy": np, "math": math}[module]
+    for part in parts:
+        if value is None or part.startswith("_"):
+            return True  # nobody promises anything of what is private, or not loaded yet
+        if part not in dir(value):
             return False
-        value = vars(value)[part]
-        if not hasattr(value, "__dict__"):
-            break
-    return name.startswith("numpy.")
+        value = inspect.getattr_static(value, part, None)
+    return True

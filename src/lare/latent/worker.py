@@ -6,6 +6,7 @@ is no witness. It says what came back, and the parent checks the numbers.
 """
 
 import builtins
+import functools
 import gc
 import json
 import mmap
@@ -51,9 +52,9 @@ def main(argument: str) -> None:
     problems = gate.inspect(source) if start["gate"] else []
     try:
         programs = {} if problems else load(source, functions, gated=start["gate"])
-        send({"problems": problems[:MOST_PROBLEMS]})
+        send({"number": start["number"], "problems": problems[:MOST_PROBLEMS]})
     except BaseException as error:  # a program that is not gated does what it likes here
-        send({"problems": []} | failure(error))
+        send({"number": start["number"], "problems": []} | failure(error))
         return
     sizes = start["observation"], start["action"], start["rows"]
     if given["audit"]:
@@ -63,7 +64,7 @@ def main(argument: str) -> None:
         events.clear()
         # Whoever has lost its parent in the middle of a long call ends all the same: the signal is not handled.
         signal.setitimer(signal.ITIMER_REAL, request["seconds"])
-        answer = serve(programs, request, memory, sizes)
+        answer = serve(programs, request, memory, sizes) | {"number": request["number"]}
         signal.setitimer(signal.ITIMER_REAL, 0)
         send(answer | {"events": events[:10]} if given["audit"] else answer)
 
@@ -145,8 +146,14 @@ def describe(values: Any) -> Any:
 
 def one(value: Any) -> list[Any]:
     if isinstance(value, np.ndarray):
-        return ["array", list(value.shape), str(value.dtype)[:20]]
+        return ["array", list(value.shape), name_of(value.dtype)]
     return [type(value).__name__[:40]]
+
+
+@functools.lru_cache(maxsize=64)
+def name_of(dtype: np.dtype) -> str:
+    """A type's name, which NumPy makes up anew each time: this took a third of a small call."""
+    return str(dtype)[:20]
 
 
 def fits(values: Any, rows: int) -> bool:

@@ -30,7 +30,7 @@ class Reply(Checked):
     """Source of `evaluation_func(observation, action)`."""
 
 
-FENCE = re.compile(r"```[ \t]*([A-Za-z]*)[ \t]*\r?\n(.*?)```", re.DOTALL)
+FENCE = re.compile(r"```[ \t]*+([A-Za-z]*+)[ \t]*+\r?\n(.*?)```", re.DOTALL)
 """A fenced block, with its language."""
 
 
