@@ -19,8 +19,9 @@ from lare.credit import accuracy, decomposition
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Fit
 from lare.normalise import Scale
-from lare.training import off_policy, replay
-from lare.training.off_policy import RECENT, Learner, Recipe
+from lare.training import learner as common
+from lare.training import replay
+from lare.training.learner import RECENT, Learner, Recipe
 from lare.training.run import open_run
 from lare.training.single_agent import load_learner
 
@@ -29,20 +30,20 @@ UPDATES, STRETCH = 20_000, 5_000
 
 @partial(jax.jit, static_argnames=("fit", "recipe"))
 def updates(credit: Decomposition, held: replay.Replay, key: jax.Array, fit: Fit, recipe: Recipe) -> Decomposition:
-    def one(credit: Decomposition, drawn: off_policy.CreditDraws) -> tuple[Decomposition, None]:
-        features = off_policy.features(replay.read(held, drawn.steps), recipe.method)
+    def one(credit: Decomposition, drawn: common.CreditDraws) -> tuple[Decomposition, None]:
+        features = common.features(replay.read(held, drawn.steps), recipe.method)
         chosen = drawn.episodes
         episodes = Episodes(features, drawn.episode, chosen.length, chosen.mean_reward, chosen.counts)
         return decomposition.update(credit, episodes, key, fit, recipe.credit)[0], None
 
-    return jax.lax.scan(one, credit, off_policy.draw_parts_of_episodes(held, key, STRETCH, recipe))[0]
+    return jax.lax.scan(one, credit, common.draw_parts_of_episodes(held, key, STRETCH, recipe))[0]
 
 
 def refit(learner: Learner, recipe: Recipe, fit: Fit, scale: Scale) -> list[dict[str, float]]:
     held, known = learner.replay, learner.credit
     assert known is not None
     recent = replay.read(held, held.transitions - 1 - jnp.arange(RECENT))
-    features, every = off_policy.features(recent, recipe.method), jnp.ones(RECENT, bool)
+    features, every = common.features(recent, recipe.method), jnp.ones(RECENT, bool)
     credit = decomposition.init(jax.random.key(0), recipe.features, recipe.method, recipe.credit, steps=1, agents=1)
     credit = credit._replace(moments=known.moments, scale=scale)
     found = []
@@ -62,7 +63,7 @@ def refit(learner: Learner, recipe: Recipe, fit: Fit, scale: Scale) -> list[dict
 def ceiling(learner: Learner, recipe: Recipe) -> float:
     held = learner.replay
     recent = replay.read(held, held.transitions - 1 - jnp.arange(RECENT))
-    rows = np.c_[np.asarray(off_policy.features(recent, recipe.method)), np.ones(RECENT)]
+    rows = np.c_[np.asarray(common.features(recent, recipe.method)), np.ones(RECENT)]
     best = rows @ np.linalg.lstsq(rows, np.asarray(recent.reward), rcond=None)[0]
     return float(np.corrcoef(best, recent.reward)[0, 1])
 

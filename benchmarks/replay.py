@@ -29,7 +29,7 @@ from lare.algorithms.td3 import TD3Settings
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
 from lare.training import off_policy, replay
-from lare.training.off_policy import Recipe
+from lare.training.learner import Recipe, features
 from lare.training.replay import Replay, Step
 from lare.training.single_agent import Session
 
@@ -37,14 +37,18 @@ SEED, EPISODE, UPDATES = 0, 1000, 50
 STORED = (10_000, 100_000, 1_000_000)
 RECIPE = Recipe(
     method=find_method("lare-rrdu"),
-    td3=TD3Settings(),
+    algorithm=TD3Settings(),
     credit=CreditSettings(),
     scale_rewards=False,
     observation_size=17,
     action_size=6,
+    discrete=False,
     factors=6,
     longest_episode=EPISODE,
     capacity=1_010_000,
+    steps=1_000_000,
+    turn=UPDATES,
+    fit_updates=1,
 )
 
 
@@ -80,9 +84,15 @@ def reads(held: Replay, key: jax.Array) -> Any:
     def one(draw: off_policy.Draws) -> Any:
         assert draw.credit is not None
         drawn, batch = replay.read(held, draw.credit.steps), replay.read(held, draw.batch)
-        credit = off_policy.features(drawn, RECIPE.method), draw.credit.episodes
-        features = off_policy.features(batch, RECIPE.method)
-        return credit, features, batch.observation, batch.action, batch.next_observation, batch.continues
+        credit = features(drawn, RECIPE.method), draw.credit.episodes
+        return (
+            credit,
+            features(batch, RECIPE.method),
+            batch.observation,
+            batch.action,
+            batch.next_observation,
+            batch.continues,
+        )
 
     start = jax.tree.map(jnp.zeros_like, one(jax.tree.map(lambda leaf: leaf[0], draws)))
     return jax.lax.scan(lambda _, draw: (one(draw), None), start, draws)[0]

@@ -308,3 +308,11 @@ def test_hidden_and_shown_again():
     x, (y, z) = hidden((np.ones(3), [np.float32(2), "text"]))
     assert [type(one) for one in (x, y, z)] == [Oblivious, Oblivious, str]
     assert [type(one) for one in shown([x, (y, z)])] == [np.ndarray, tuple]
+
+
+def test_an_entry_of_each_row_may_be_chosen_by_its_values():
+    own = "rows = np.arange(len(observation))\nnearest = np.argmin(observation, axis=1)\n"
+    (found,) = run_hidden(phi(f"{own}return [observation[rows, nearest][:, None]]"))
+    assert type(found) is Oblivious
+    with pytest.raises(Looked, match=INDEX):
+        run_hidden(phi(f"{own}return [observation[nearest]]"))

@@ -88,10 +88,18 @@ class Policy(eqx.Module):
         self, observation: Float[Array, "*batch observation"], key: PRNGKeyArray
     ) -> Float[Array, "*batch action"]:
         """A ~ pi(. | s)."""
+        draw = jax.random.gumbel if self.log_deviation is None else jax.random.normal
+        size = self.network.layers[-1].bias.shape[-1]
+        return self.drawn(observation, draw(key, (*observation.shape[:-1], size)))
+
+    def drawn(
+        self, observation: Float[Array, "*batch observation"], noise: Float[Array, "*batch action"]
+    ) -> Float[Array, "*batch action"]:
+        """The action that noise decides on: standard normal noise, or Gumbel's, whose largest sum is a choice."""
         out = self.network(observation)
         if self.log_deviation is None:
-            return jax.nn.one_hot(jax.random.categorical(key, out), out.shape[-1])
-        return out + jnp.exp(self.log_deviation) * jax.random.normal(key, out.shape)
+            return jax.nn.one_hot(jnp.argmax(out + noise, axis=-1), out.shape[-1])
+        return out + jnp.exp(self.log_deviation) * noise
 
     def mode(self, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch action"]:
         """The likeliest action."""

@@ -14,10 +14,10 @@ from lare.algorithms.ppo import Policy
 from lare.errors import LareError
 from lare.experiments.credit import correlations
 from lare.tasks.particles.task import STEPS, Team
-from lare.training import on_policy
+from lare.training import teams
 from lare.training.many_agents import Session, load_learner, restore
-from lare.training.on_policy import Learner, Played, Recipe
 from lare.training.run import Run
+from lare.training.teams import Learner, Played, Recipe
 
 SAMPLED = 40
 """Episodes for statistics."""
@@ -64,8 +64,8 @@ def watch(run: Run, key: int = 0) -> Watched:
     proxy = None
     if learner.credit:
         factors = factors_of(session, played)
-        rows = on_policy.features(played, jnp.asarray(factors), recipe)
-        r_hat = on_policy.rewards(learner, rows, jnp.swapaxes(played.reward, 0, 1), recipe)
+        rows = teams.features(played, jnp.asarray(factors), recipe)
+        r_hat = teams.rewards(learner, rows, jnp.swapaxes(played.reward, 0, 1), recipe)
         proxy = np.asarray(r_hat)[0]
     return Watched(np.asarray(position), np.asarray(played.reward)[:, 0], proxy)
 
@@ -79,7 +79,7 @@ def play_and_look(policy: Policy, key: PRNGKeyArray, recipe: Recipe) -> tuple[Pl
     rows, position = [], []
     for action_key, step_key in zip(keys[:STEPS], keys[STEPS:], strict=True):
         before = observe(state)
-        action = policy.sample(on_policy.seen(before, recipe), action_key)
+        action = policy.sample(teams.seen(before, recipe), action_key)
         state = step(state, jnp.argmax(action, axis=-1), step_key)
         rows.append(Played(before, action, observe(state), reward(state)))
         position.append(state.position)
@@ -97,7 +97,7 @@ def sample(run: Run, random: bool = False) -> list[Sample]:
     recipe, policy = session.recipe, first_seed(session.learner).algorithm.online.actor
     if random:  # a network of zeros prefers nothing
         policy = jax.tree.map(jnp.zeros_like, policy)
-    played = jax.jit(partial(on_policy.play, count=SAMPLED, recipe=recipe))(policy, jax.random.key(1))
+    played = jax.jit(partial(teams.play, count=SAMPLED, recipe=recipe))(policy, jax.random.key(1))
     factors, found = factors_of(session, played), []
     for place, team in enumerate(recipe.task.teams):
         agents = slice(team.start, team.stop)
@@ -148,7 +148,7 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
 
     @jax.jit
     def total(mixed: Mixed, key: PRNGKeyArray) -> Float[Array, ""]:
-        reward = on_policy.play(mixed, key, episodes, recipe).reward
+        reward = teams.play(mixed, key, episodes, recipe).reward
         return jnp.sum(reward[..., :stop]) / episodes
 
     def policies(place: int) -> list[Policy]:

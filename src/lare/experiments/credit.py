@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.credit import decomposition
-from lare.training import off_policy, replay
-from lare.training.off_policy import RECENT, Learner, Recipe
+from lare.training import replay
+from lare.training.learner import RECENT, Learner, Recipe, features
 from lare.training.run import Run
 from lare.training.single_agent import load_learner
 
@@ -47,7 +47,7 @@ def credit_of(run: Run) -> Credit | None:
     begin = int(one.replay.first[episode % len(one.replay.first)])
     steps = replay.read(one.replay, jnp.arange(begin, int(replay.end_of(one.replay, episode))))
     assert one.credit is not None
-    proxy = decomposition.proxy_rewards(one.credit, off_policy.features(steps, recipe.method), recipe.credit)
+    proxy = decomposition.proxy_rewards(one.credit, features(steps, recipe.method), recipe.credit)
     return Credit(
         np.asarray(steps.reward), np.asarray(proxy), np.asarray(steps.factors), factor_correlations(learner, recipe)
     )

@@ -46,10 +46,15 @@ class Watched(np.ndarray):
         return super().__index__()
 
     def __getitem__(self, key: Any) -> Any:
-        by = [part for part in (key if isinstance(key, tuple) else (key,)) if touched([part])]
+        parts = key if isinstance(key, tuple) else (key,)
+        by = [part for part in parts if touched([part])]
         if is_hidden(self):
             check_slices(key, self.shape)
-        if by and (is_hidden(self) or any(np.asarray(shown(part)).dtype == bool for part in by)):
+        # x[np.arange(n), chosen] takes an entry of each row, as np.take_along_axis does. Not so a mask, which decides
+        # how many there are, a number, which speaks for all rows, or rows that are chosen.
+        if any(np.asarray(shown(part)).dtype == bool for part in by) or (
+            is_hidden(self) and by and (touched(parts[:1]) or any(np.ndim(part) == 0 for part in by))
+        ):
             raise Looked("an array is indexed by values of the batch: use np.where or np.take_along_axis")
         found = shown(self)[shown(key)]
         return hidden(found) if by or is_hidden(self) else watched(found)

@@ -14,6 +14,7 @@ from pydantic import ConfigDict, Field, model_validator
 from lare.errors import Checked, LareError
 from lare.tasks.environment import make
 from lare.tasks.particles import NAMES, NAMESPACE
+from lare.tasks.spaces import Choice
 
 Judges = Literal["before", "after", "both"]
 """Which observation `phi` judges a step by: that before the action, that which the action led to, or both, one after
@@ -171,6 +172,13 @@ def check_spaces(spec: TaskSpec, environment: gymnasium.Env) -> None:
     assert isinstance(action, Box)
     if not action.is_bounded():
         raise LareError(f"task {spec.name!r}: the actions of {spec.environment} have no bounds: {action}")
+
+
+def is_discrete(spec: TaskSpec) -> bool:
+    """Whether the actions are a choice among `action_size`."""
+    environment = make(spec.environment, spec.max_episode_steps)
+    environment.close()
+    return isinstance(environment.action_space, Choice)
 
 
 def time_limit(spec: TaskSpec) -> int:

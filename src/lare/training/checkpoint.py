@@ -12,7 +12,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ class Learner(Protocol):
     @property
     def replay(self) -> Any: ...
 
-    def _replace(self, **changes: Any) -> Self: ...
+    def _replace(self, **changes: Any) -> Any: ...
 
 
 Some = TypeVar("Some", bound=Learner)

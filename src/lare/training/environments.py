@@ -19,6 +19,11 @@ from lare.training.replay import Step
 
 Policy = Callable[[Float[np.ndarray, "seeds *episodes observation"]], Float[np.ndarray, "seeds *episodes action"]]
 
+Explorer = Callable[
+    [Float[np.ndarray, "seeds observation"], Float[np.ndarray, "seeds action"]], Float[np.ndarray, "seeds action"]
+]
+"""From observations and noise to actions."""
+
 
 class Stream(IntEnum):
     """What random numbers are for. Each use has numbers of its own, whatever the others consume."""
@@ -49,10 +54,11 @@ def make_episodic(task: TaskSpec, **kwargs: Any) -> EpisodicReward:
 
 
 def to_bounds(action: Float[np.ndarray, " action"], space: gymnasium.Space) -> Float[np.ndarray, " action"]:
-    """From [-1, 1] to the environment's own units, or to the choice that the largest number makes."""
+    """From [-1, 1] (what lies beyond is the bound) to the environment's units, or to the choice of the largest number."""
     assert isinstance(space, Box)
     if isinstance(space, Choice):
         return space.chosen(action)
+    action = np.clip(action, -1, 1)
     return np.asarray(space.low + (action + 1) / 2 * (space.high - space.low), np.float32)
 
 
@@ -112,18 +118,18 @@ class Lane:
 
 @dataclass(frozen=True)
 class Collected:
-    """A chunk of steps of every seed. Actions in [-1, 1], and, for `phi`, in the environment's units."""
+    """Some steps of every seed. Actions as the policy chose them, and, for `phi`, in the environment's units."""
 
     steps: Step
     environment_action: Float[np.ndarray, "seeds time action"]
 
 
-def collect(lanes: Sequence[Lane], policy: Policy, noise: Float[np.ndarray, "time seeds action"]) -> Collected:
-    """Let the policy act, `noise` added to its actions, for as many steps as there is noise."""
+def collect(lanes: Sequence[Lane], explore: Explorer, noise: Float[np.ndarray, "time seeds action"]) -> Collected:
+    """Let the policy act for as many steps as there is noise."""
     rows: list[list[tuple]] = [[] for _ in lanes]
     for disturbance in noise:
         observation = np.stack([lane.observation for lane in lanes])
-        actions = np.clip(policy(observation) + disturbance, -1, 1)
+        actions = explore(observation, disturbance)
         for lane, action, row in zip(lanes, actions, rows, strict=True):
             row.append((action, *lane.step(action)))
             if row[-1][-1]:

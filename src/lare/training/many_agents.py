@@ -13,10 +13,10 @@ from lare.credit.methods import find_method
 from lare.tasks.particles.table import find_particle_task
 from lare.training import checkpoint, episodes
 from lare.training.environments import Stream
-from lare.training.on_policy import Compiled, Learner, Played, Recipe, compiled, init
 from lare.training.run import Run
 from lare.training.seeds import lines, seed_keys
 from lare.training.settings import Plan
+from lare.training.teams import Compiled, Learner, Played, Recipe, compiled, init
 
 
 @dataclass

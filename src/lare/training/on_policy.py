@@ -1,278 +1,98 @@
-"""The compiled parts of training many agents: play, store, fit the decoders, improve the policy.
+"""The training step of PPO: fit the decoder on the replay, relabel the newest steps by it, update the policy on them.
 
-Algorithm 1 of the LaRe paper, lines 6 to 8, for on-policy algorithms. As in `off_policy.py`, this is where credit and
-algorithm meet. Between `play` and `store` the host runs `phi`, once on everything that was played.
+Algorithm 1 of the LaRe paper, lines 6 to 8, for an algorithm that learns from what its newest policy met. The decoder goes
+on learning from all that is stored.
 
-A *team* is the agents that share a return: the mean over them of the sums of their true rewards, known at the end of the
-episode only. Each team has a decoder of its own; all agents share one actor and one critic, which are told who they act
-for where there are several teams.
-
-Functions are written for one seed; `compiled` gives them their leading seed axis.
+Observations reach the networks by their running mean and deviation, the newest steps included.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, Scalar
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
 from lare.algorithms import ppo
-from lare.algorithms.ppo import PPO, Policy, PPOSettings
-from lare.credit import accuracy, decomposition
-from lare.credit.decomposition import Decomposition, Episodes
-from lare.credit.methods import Encoder, Fit, Method, Reward
-from lare.tasks.particles.task import ACTIONS, STEPS, ParticleTask, Team
-from lare.tasks.particles.world import State
-from lare.training import episodes as replay
-from lare.training.episodes import EpisodeReplay
-from lare.training.replay import draw_steps
-from lare.training.settings import AgentSettings
+from lare.algorithms.ppo import Policy
+from lare.credit.decomposition import Decomposition
+from lare.normalise import Moments, standardise
+from lare.training import learner as common
+from lare.training import replay
+from lare.training.learner import Compiled, CreditDraws, Learner, Recipe, draw_credit, rewards
+
+Actor = tuple[Policy, Moments]
+"""A policy, and what its observations are normalised by."""
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """What is to be trained and how: everything that the compiled functions hold fixed."""
-
-    task: ParticleTask
-    method: Method
-    ppo: PPOSettings
-    agents: AgentSettings
-    factors: tuple[int, ...]
-    """Of each team's latent function; empty for a method that needs none."""
-    evaluation_episodes: int
-
-    @property
-    def features(self) -> tuple[int, ...]:
-        """Size of what each team's decoder sees."""
-        match self.method.encoder:
-            case None:
-                return (0,) * len(self.task.teams)
-            case Encoder.LATENT:
-                return self.factors
-            case Encoder.RAW:
-                return (self.task.observation_size,) * len(self.task.teams)
-            case Encoder.TAKEN:
-                return (self.task.observation_size + ACTIONS,) * len(self.task.teams)
-
-    @property
-    def policy_input(self) -> int:
-        """Size of what actor and critic see."""
-        return self.task.observation_size + (self.task.agents if len(self.task.teams) > 1 else 0)
-
-
-class Learner(NamedTuple):
-    """The whole training state of one seed."""
-
-    algorithm: PPO
-    credit: tuple[Decomposition, ...]
-    """One for each team; none for a method that fits nothing."""
-    replay: EpisodeReplay
-
-
-class Played(NamedTuple):
-    """Whole episodes."""
-
-    observation: Float[Array, "*seeds steps episodes agents observation"]
-    action: Float[Array, "*seeds steps episodes agents action"]
-    """Rows with a single 1."""
-    next_observation: Float[Array, "*seeds steps episodes agents observation"]
-    reward: Float[Array, "*seeds steps episodes agents"]
-    """True."""
-
-
-def init(key: PRNGKeyArray, recipe: Recipe) -> Learner:
-    algorithm_key, *keys = jax.random.split(key, 1 + len(recipe.task.teams))
-    task, settings = recipe.task, recipe.agents
-    credit = tuple(
-        decomposition.init(key, size, recipe.method, settings.credit, STEPS, team.stop - team.start)
-        for key, size, team in zip(keys, recipe.features, task.teams, strict=True)
-        if recipe.method.fit is not None
-    )
-    return Learner(
-        ppo.init(algorithm_key, recipe.policy_input, ACTIONS, True, recipe.ppo),
-        credit,
-        replay.empty(settings.capacity, STEPS, task.agents, max(recipe.features)),
-    )
-
-
-def seen(
-    observation: Float[Array, "*batch agents observation"], recipe: Recipe
-) -> Float[Array, "*batch agents policy_input"]:
-    """What actor and critic see: the observation and, where there are several teams, which agent it is."""
-    if recipe.policy_input == recipe.task.observation_size:
-        return observation
-    number = jnp.broadcast_to(jnp.eye(recipe.task.agents), (*observation.shape[:-1], recipe.task.agents))
-    return jnp.concatenate([observation, number], axis=-1)
-
-
-def play(policy: Any, key: PRNGKeyArray, count: int, recipe: Recipe) -> Played:
-    """Whole episodes of a policy: of whatever has the `sample` of `ppo.Policy`."""
-    task = recipe.task
-    start_key, key = jax.random.split(key)
-    start = jax.vmap(task.reset)(jax.random.split(start_key, count))
-
-    def one(carry: tuple[State, Array], key: PRNGKeyArray):
-        state, observation = carry
-        action_key, step_key = jax.random.split(key)
-        action = policy.sample(seen(observation, recipe), action_key)
-        keys = jax.random.split(step_key, count)
-        state = jax.vmap(task.step)(state, jnp.argmax(action, axis=-1), keys)
-        after = jax.vmap(task.observe)(state)
-        return (state, after), Played(observation, action, after, jax.vmap(task.reward)(state))
-
-    return jax.lax.scan(one, (start, jax.vmap(task.observe)(start)), jax.random.split(key, STEPS))[1]
-
-
-def features(played: Played, factors: Float[Array, "steps episodes agents factors"], recipe: Recipe):
-    """What the decoders see, episode by episode: (episodes, steps, agents, features), padded to the largest team's."""
-    match recipe.method.encoder:
-        case Encoder.RAW:
-            rows = played.next_observation
-        case Encoder.TAKEN:
-            rows = jnp.concatenate([played.observation, played.action], axis=-1)
-        case _:
-            rows = factors
-    return jnp.swapaxes(rows, 0, 1)
-
-
-def of_team(
-    rows: Float[Array, "episodes steps agents widest"], team: Team, size: int
-) -> Float[Array, "rows team features"]:
-    """A team's features, its episodes one behind the other."""
-    return rows[..., team.start : team.stop, :size].reshape(-1, team.stop - team.start, size)
-
-
-def mean_rewards(reward: Float[Array, "episodes steps agents"], team: Team) -> Float[Array, " episodes"]:
-    """R/T of a team, R the mean over its agents of their returns."""
-    return jnp.mean(reward[..., team.start : team.stop], axis=(1, 2))
-
-
-def store(learner: Learner, played: Played, factors: Array, recipe: Recipe) -> Learner:
-    """Put new episodes into the replay and into the running statistics."""
-    rows, reward = features(played, factors, recipe), jnp.swapaxes(played.reward, 0, 1)
-    credit = []
-    for one, team, size in zip(learner.credit, recipe.task.teams, recipe.features, strict=bool(learner.credit)):
-        one = decomposition.observe_steps(one, of_team(rows, team, size))
-        means = mean_rewards(reward, team)
-        credit.append(decomposition.observe_returns(one, means, jnp.ones_like(means, bool)))
-    return learner._replace(credit=tuple(credit), replay=replay.extend(learner.replay, rows, reward))
+def actor_of(learner: Learner) -> Actor:
+    assert isinstance(learner.algorithm, ppo.PPO)
+    assert learner.observations is not None
+    return learner.algorithm.online.actor, learner.observations
 
 
 def fit(learner: Learner, key: PRNGKeyArray, recipe: Recipe) -> tuple[Learner, dict[str, Float[Array, ""]]]:
-    """Some updates of every team's decoder, each on episodes of its own; the mean of each metric over them."""
-    assert recipe.method.fit is not None
-    held, settings, way = learner.replay, recipe.agents.credit, recipe.method.fit
-    count = max(1, settings.steps // STEPS)
-    drawn = STEPS if way is Fit.ALL_STEPS else settings.drawn_steps
-    length, ones = jnp.full(count, STEPS), jnp.ones(count)
+    """All updates of the decoder before one of the policy; the mean of each metric over them."""
+    draw_key, key = jax.random.split(key)
+    draws = draw_credit(learner.replay, draw_key, recipe.fit_updates, recipe)
+    if learner.credit is None or draws is None:
+        return learner, {}
 
-    def one(credit: tuple[Decomposition, ...], key: PRNGKeyArray):
-        draw_key, steps_key, key = jax.random.split(key, 3)
-        chosen = replay.draw(held, draw_key, (count,))
-        rows, reward = held.features[chosen], held.reward[chosen]
-        if way is not Fit.ALL_STEPS:
-            steps = draw_steps(steps_key, length, drawn)
-            rows = jnp.take_along_axis(rows, steps[..., None, None], axis=1)
-        episode = jnp.repeat(jnp.arange(count), drawn)
-        fitted, losses = [], []
-        for old, team, size in zip(credit, recipe.task.teams, recipe.features, strict=True):
-            batch = Episodes(of_team(rows, team, size), episode, length, mean_rewards(reward, team), ones)
-            new, measured = decomposition.update(old, batch, key, way, settings)
-            fitted.append(new)
-            losses.append(measured["credit/loss"])
-        return tuple(fitted), {"credit/loss": jnp.mean(jnp.stack(losses))}
+    def one(credit: Decomposition, turn: tuple[CreditDraws, PRNGKeyArray]):
+        return common.fit(credit, learner.replay, *turn, recipe)
 
-    credit, measured = jax.lax.scan(one, learner.credit, jax.random.split(key, recipe.agents.fit_updates))
+    credit, measured = jax.lax.scan(one, learner.credit, (draws, jax.random.split(key, recipe.fit_updates)))
     return learner._replace(credit=credit), jax.tree.map(jnp.mean, measured)
 
 
-def rewards(
-    learner: Learner, rows: Array, reward: Float[Array, "episodes steps agents"], recipe: Recipe
-) -> Float[Array, "episodes steps agents"]:
-    """What the policy is trained on; proxy rewards always by the decoders as they stand."""
-    parts = []
-    for place, (team, size) in enumerate(zip(recipe.task.teams, recipe.features, strict=True)):
-        shape = (*reward.shape[:2], team.stop - team.start)
-        match recipe.method.reward:
-            case Reward.TRUE:
-                part = reward[..., team.start : team.stop]
-            case Reward.EPISODIC:
-                total = STEPS * mean_rewards(reward, team)
-                part = jnp.zeros(shape).at[:, -1].set(total[:, None])
-            case Reward.PROXY:
-                credit = learner.credit[place]
-                part = decomposition.proxy_rewards(credit, of_team(rows, team, size), recipe.agents.credit)
-                part = part.reshape(shape)
-        if recipe.method.shared:
-            part = jnp.broadcast_to(jnp.mean(part, axis=-1, keepdims=True), shape)
-        parts.append(part)
-    return jnp.concatenate(parts, axis=-1)
+def rollout(learner: Learner, recipe: Recipe) -> ppo.Rollout:
+    """The newest steps of the replay, a single lane, with what the method pays for them."""
+    held, (_, moments) = learner.replay, actor_of(learner)
+    number = held.transitions - recipe.turn + jnp.arange(recipe.turn)
+    steps = replay.read(held, number)
+    # Where a step's successor belongs to another episode, or to none yet, its own has ended.
+    episode = held.episode[number % replay.capacity(held)]
+    ended = jnp.append(episode[1:] != episode[:-1], ~held.running)
+    before, after = (standardise(moments, rows) for rows in (steps.observation, steps.next_observation))
+    reward = rewards(steps, learner, recipe)
+    row = ppo.Rollout(before, steps.action, reward, after, steps.continues, ended.astype(jnp.float32))
+    return jax.tree.map(lambda leaf: leaf[:, None], row)
 
 
 def improve(
-    learner: Learner, played: Played, factors: Array, key: PRNGKeyArray, left: Float[Scalar, ""], recipe: Recipe
+    learner: Learner, key: PRNGKeyArray, done: Int[Scalar, ""], recipe: Recipe
 ) -> tuple[Learner, dict[str, Float[Array, ""]]]:
-    """Update the policy on what it has just played. The end of the time is the end of the task: it pays no more."""
-    true = jnp.swapaxes(played.reward, 0, 1)
-    reward = jnp.swapaxes(rewards(learner, features(played, factors, recipe), true, recipe), 0, 1)
-    ended = jnp.zeros_like(reward).at[-1].set(1.0)
-
-    def lanes(rows: Float[Array, "steps episodes agents *rest"]) -> Float[Array, "steps lanes *rest"]:
-        return rows.reshape(STEPS, -1, *rows.shape[3:])
-
-    before, after = (seen(rows, recipe) for rows in (played.observation, played.next_observation))
-    rollout = ppo.Rollout(*map(lanes, (before, played.action, reward, after, 1 - ended, ended)))
-    algorithm, measured = ppo.update(learner.algorithm, rollout, key, left, recipe.ppo)
-    return learner._replace(algorithm=algorithm), measured
+    """Fit the decoder and update the policy on the steps that have just been stored."""
+    assert isinstance(recipe.algorithm, ppo.PPOSettings)
+    assert isinstance(learner.algorithm, ppo.PPO)
+    fit_key, key = jax.random.split(key)
+    algorithm, (learner, fitted) = learner.algorithm, fit(learner, fit_key, recipe)
+    left = 1 - done / recipe.steps
+    algorithm, improved = ppo.update(algorithm, rollout(learner, recipe), key, left, recipe.algorithm)
+    return learner._replace(algorithm=algorithm), fitted | improved
 
 
-def assess(learner: Learner, recipe: Recipe) -> dict[str, Float[Array, ""]]:
-    """How near the newest decoders' proxy rewards come to the true ones, over the episodes of the newest update."""
-    if not learner.credit:
-        return {}
-    newest = replay.newest(learner.replay, min(recipe.agents.episodes, recipe.agents.capacity))
-    reward = learner.replay.reward[newest]
-    r_hat = rewards(learner, learner.replay.features[newest], reward, recipe).ravel()
-    everything = jnp.ones(r_hat.shape, bool)
-    return {
-        "credit/error": accuracy.mean_error(r_hat, reward.ravel(), everything),
-        "credit/correlation": accuracy.correlation(r_hat, reward.ravel(), everything),
-    }
+def act(actor: Actor, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch action"]:
+    """The likeliest action."""
+    policy, moments = actor
+    return policy.mode(standardise(moments, observation))
 
 
-def evaluate(policy: Policy, key: PRNGKeyArray, recipe: Recipe) -> dict[str, Float[Array, ""]]:
-    """Mean true return of each team, the sum over its agents; the first team's is also the return."""
-    reward = play(policy, key, recipe.evaluation_episodes, recipe).reward
-    first, *others = recipe.task.teams
-
-    def total(team: Team) -> Float[Array, ""]:
-        return jnp.sum(reward[..., team.start : team.stop]) / recipe.evaluation_episodes
-
-    named = {f"evaluation/return_{team.name}": total(team) for team in (first, *others) if others}
-    return {"evaluation/return": total(first)} | named
+def explore(
+    actor: Actor, observation: Float[Array, " observation"], noise: Float[Array, " action"]
+) -> Float[Array, " action"]:
+    """An action of the policy, drawn by given noise."""
+    policy, moments = actor
+    return policy.drawn(standardise(moments, observation), noise)
 
 
-class Compiled(NamedTuple):
-    """The functions of a run, compiled, with a leading seed axis on every array but `left`."""
-
-    play: Callable[..., Played]
-    store: Callable[..., Learner]
-    fit: Callable[..., tuple[Learner, dict[str, Float[Array, " seeds"]]]]
-    improve: Callable[..., tuple[Learner, dict[str, Float[Array, " seeds"]]]]
-    assess: Callable[..., dict[str, Float[Array, " seeds"]]]
-    evaluate: Callable[..., dict[str, Float[Array, " seeds"]]]
+def noise(random: Sequence[np.random.Generator], done: int, recipe: Recipe) -> Float[np.ndarray, "time seeds action"]:
+    """For the steps of a rollout: Gumbel's, by which the largest of the disturbed numbers is a choice; or normal."""
+    shape = (recipe.turn, recipe.action_size)
+    drawn = (one.gumbel(size=shape) if recipe.discrete else one.standard_normal(shape) for one in random)
+    return np.stack(list(drawn), 1).astype(np.float32)
 
 
 def compiled(recipe: Recipe) -> Compiled:
-    """`store`, `fit` and `improve` consume the learner that they are given: its memory holds the new one."""
-    return Compiled(
-        play=jax.jit(jax.vmap(partial(play, count=recipe.agents.episodes, recipe=recipe))),
-        store=jax.jit(jax.vmap(partial(store, recipe=recipe)), donate_argnums=0),
-        fit=jax.jit(jax.vmap(partial(fit, recipe=recipe)), donate_argnums=0),
-        improve=jax.jit(jax.vmap(partial(improve, recipe=recipe), in_axes=(0, 0, 0, 0, None)), donate_argnums=0),
-        assess=jax.jit(jax.vmap(partial(assess, recipe=recipe))),
-        evaluate=jax.jit(jax.vmap(partial(evaluate, recipe=recipe))),
-    )
+    """The functions of a run."""
+    return common.compiled(recipe, improve, actor_of, act, explore, noise)

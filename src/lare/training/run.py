@@ -25,7 +25,7 @@ import lare
 from lare.errors import Checked, LareError
 from lare.latent.evaluator import LatentRewardError
 from lare.latent.function import LatentFunction, load
-from lare.tasks.spec import Judges, TaskSpec, time_limit
+from lare.tasks.spec import Judges, TaskSpec, is_discrete, time_limit
 from lare.training.checkpoint import STATE, write_atomically
 from lare.training.settings import Plan
 
@@ -46,6 +46,8 @@ class Config(Checked):
     task_sha256: str
     longest_episode: int
     """The environment's time limit."""
+    discrete: bool
+    """Whether its actions are a choice."""
     function_sha256: tuple[str, ...]
     """Of the latent functions in use: one for each team, none for a method that needs none."""
     isolation: str | None
@@ -57,14 +59,17 @@ class Config(Checked):
 def describe(task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) -> Config:
     """Everything that the run depends on. Raises `LareError` where the replay could not hold a single episode."""
     longest = time_limit(task)
-    if plan.algorithm == "td3" and plan.rows < longest + 2:
+    if plan.algorithm != "ippo" and plan.rows < longest + 2:
         raise LareError(f"capacity = {plan.rows} is too small: an episode of {task.name} takes up to {longest + 1}")
+    if plan.algorithm == "ppo" and plan.rows < 2 * plan.turn + longest:
+        raise LareError(f"capacity = {plan.rows} is too small: a rollout takes up to {2 * plan.turn + longest}")
     return Config(
         lare=lare.__version__,
         settings=plan,
         task=task,
         task_sha256=task.digest,
         longest_episode=longest,
+        discrete=is_discrete(task),
         function_sha256=tuple(function.digest for function in functions),
         isolation=isolation(task, functions[0]) if functions else None,
         versions={name: version(name) for name in VERSIONS} | {"python": platform.python_version()},

@@ -13,7 +13,7 @@ from lare.tasks.spec import Judges, TaskSpec
 
 LARGEST_SEED = 2**31 - 1
 
-Algorithm = Literal["td3", "ippo"]
+Algorithm = Literal["td3", "ppo", "ippo"]
 
 
 class AgentSettings(Checked):
@@ -44,15 +44,28 @@ IPPO = PPOSettings(
 """The paper's figures for the particle tasks."""
 
 
+PPO = PPOSettings(hidden=(256, 256), entropy=0.01, anneal=True)
+"""The published figures for the MuJoCo tasks; a Gaussian takes the place of their Beta policy."""
+
+
+class RolloutSettings(Checked):
+    """What ppo does between two updates of the policy of a single agent."""
+
+    steps: Annotated[int, Field(ge=1)] = 2000
+    """Environment steps that are collected."""
+    fit_updates: Annotated[int, Field(ge=1)] = 500
+    """Gradient steps of the decoder."""
+
+
 class Settings(Checked):
     """What `lare train` and `lare.train` are given. What is None is decided by the task and the algorithm."""
 
     method: str | None = None
     """How credit is assigned (see `lare methods`); lare-rrdu for td3, lare-rd for ippo, unless given."""
     algorithm: Algorithm | None = None
-    """The reinforcement learning algorithm: ippo for tasks of many agents, td3 for all others."""
+    """The reinforcement learning algorithm: ippo for tasks of many agents, td3, or ppo, for all others."""
     steps: Annotated[int | None, Field(ge=1)] = None
-    """Environment steps of each seed (all agents act in one): 1,000,000 for td3, 2,050,000 for ippo."""
+    """Environment steps of each seed (all agents act in one): 1,000,000 for a single agent, 2,050,000 for ippo."""
     seeds: Annotated[int, Field(ge=1)] = 1
     """How many seeds to train, in lockstep in one process."""
     seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 0
@@ -64,14 +77,17 @@ class Settings(Checked):
     chunk: Annotated[int, Field(ge=1)] = 50
     """td3: environment steps, and then as many updates, between two calls of the compiled training step."""
     evaluate_every: Annotated[int | None, Field(ge=1)] = None
-    """Environment steps between two evaluations; a checkpoint is written at each: 5000 for td3, 10 updates for ippo."""
+    """Environment steps between two evaluations; a checkpoint is written at each: 5000 for td3, 10 updates for ippo, 5
+    for ppo."""
     evaluation_episodes: Annotated[int | None, Field(ge=1)] = None
-    """Episodes in one evaluation: 10 for td3, 50 for ippo."""
+    """Episodes in one evaluation: 10 for a single agent, 50 for ippo."""
     capacity: Annotated[int, Field(ge=4)] = 1_000_000
-    """td3: observations that the replay of a seed holds; an episode of T steps takes T + 1."""
+    """td3, ppo: observations that the replay of a seed holds; an episode of T steps takes T + 1."""
     scale_rewards: bool = False
-    """td3: divide the rewards that the algorithm sees by the running root mean square of R/T."""
+    """td3, ppo: divide the rewards that the algorithm sees by the running root mean square of R/T."""
     td3: TD3Settings = TD3Settings()
+    ppo: PPOSettings = PPO
+    rollout: RolloutSettings = RolloutSettings()
     credit: CreditSettings = CreditSettings()
     ippo: PPOSettings = IPPO
     agents: AgentSettings = AgentSettings()
@@ -109,12 +125,20 @@ class Plan(Settings):
     @property
     def turn(self) -> int:
         """Environment steps of a seed between two calls of the compiled training step."""
-        return self.chunk if self.algorithm == "td3" else self.agents.episodes * EPISODE
+        return {"td3": self.chunk, "ppo": self.rollout.steps, "ippo": self.agents.episodes * EPISODE}[self.algorithm]
 
     @property
     def what_a_turn_is(self) -> str:
-        episodes = self.agents.episodes
-        return f"chunk = {self.chunk}" if self.algorithm == "td3" else f"{episodes} episodes of {EPISODE} steps"
+        return {
+            "td3": f"chunk = {self.chunk}",
+            "ppo": f"rollout.steps = {self.rollout.steps}",
+            "ippo": f"{self.agents.episodes} episodes of {EPISODE} steps",
+        }[self.algorithm]
+
+    @property
+    def of_algorithm(self) -> TD3Settings | PPOSettings:
+        """The figures of the algorithm."""
+        return {"td3": self.td3, "ppo": self.ppo, "ippo": self.ippo}[self.algorithm]
 
     @property
     def rows(self) -> int:
@@ -139,10 +163,12 @@ def decide(settings: Settings, task: TaskSpec) -> Plan:
             f"{algorithm} is for {'many agents' if algorithm == 'ippo' else 'a single agent'}, and {task.name} is a task "
             f"of {'many' if many else 'one'}"
         )
-    episodes = settings.agents.episodes
     usual: dict[str, Any] = {"algorithm": algorithm}
-    if many:
-        turn = episodes * EPISODE
+    if algorithm == "ppo":
+        turn = settings.rollout.steps
+        usual |= {"steps": max(1, 1_000_000 // turn) * turn, "evaluate_every": 5 * turn}
+    if algorithm == "ippo":
+        turn = settings.agents.episodes * EPISODE
         usual |= {"method": "lare-rd", "steps": 1000 * turn, "evaluate_every": 10 * turn, "evaluation_episodes": 50}
     given = {name: getattr(settings, name) for name in type(settings).model_fields}
     plan = Plan(**usual | {name: value for name, value in given.items() if value is not None})

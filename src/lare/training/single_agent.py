@@ -14,20 +14,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from lare.algorithms.ppo import PPOSettings
 from lare.credit.methods import find_method
 from lare.tasks.episodic import EpisodicReward
-from lare.training import checkpoint, replay
+from lare.training import checkpoint, off_policy, on_policy, replay
 from lare.training.environments import (
     Collected,
+    Explorer,
     Lane,
-    Policy,
     Stream,
     collect,
     evaluate,
     generator,
     make_episodic,
 )
-from lare.training.off_policy import Compiled, Learner, Recipe, compiled, init
+from lare.training.learner import Compiled, Learner, Recipe, init
 from lare.training.run import Run
 from lare.training.seeds import lines, seed_keys
 from lare.training.settings import Plan
@@ -55,28 +56,26 @@ class Session:
         return self.run.config.settings
 
     def policy(self, observation: np.ndarray) -> np.ndarray:
-        return np.asarray(self.functions.act(self.learner.algorithm.online.actor, observation))
+        return np.asarray(self.functions.act(self.functions.actor(self.learner), observation))
 
     def advance(self) -> None:
-        """One chunk: steps, factors, replay, updates."""
+        """One turn: steps, factors, replay, updates."""
         collected = collect(self.lanes, *self.behaviour())
         steps = collected.steps._replace(factors=self.factors(collected))
         self.learner = self.functions.store(self.learner, steps)
-        warmup = self.settings.td3.warmup
-        if self.step >= warmup:
+        if self.step >= self.recipe.warmup:
             keys = seed_keys(jnp.asarray(self.run.seeds), self.step + 1)
-            self.learner, self.latest = self.functions.improve(self.learner, keys, self.step - warmup)
-        self.step += self.settings.chunk
+            self.learner, self.latest = self.functions.improve(self.learner, keys, self.step)
+        self.step += self.settings.turn
 
-    def behaviour(self) -> tuple[Policy, Float[np.ndarray, "time seeds action"]]:
-        """The policy that collects the next chunk, and the noise on its actions."""
-        shape, td3 = (self.settings.chunk, self.recipe.action_size), self.settings.td3
+    def behaviour(self) -> tuple[Explorer, Float[np.ndarray, "time seeds action"]]:
+        """How the next steps are collected, and the noise for them."""
         random = [generator(seed, Stream.EXPLORATION, self.step) for seed in self.run.seeds]
-        if self.step < td3.warmup:
-            idle = np.zeros((len(self.lanes), self.recipe.action_size), np.float32)
-            return lambda _: idle, np.stack([one.uniform(-1, 1, shape) for one in random], 1).astype(np.float32)
-        noise = np.stack([one.standard_normal(shape) for one in random], 1)
-        return self.policy, (td3.exploration_noise * noise).astype(np.float32)
+        if self.step < self.recipe.warmup:
+            shape = (self.settings.turn, self.recipe.action_size)
+            return lambda _, noise: noise, np.stack([one.uniform(-1, 1, shape) for one in random], 1).astype(np.float32)
+        actor, explore = self.functions.actor(self.learner), self.functions.explore
+        return lambda *given: np.asarray(explore(actor, *given)), self.functions.noise(random, self.step)
 
     def factors(self, collected: Collected) -> Float[np.ndarray, "seeds time factors"]:
         """Z of new steps: `phi` on the observations that the task says it judges."""
@@ -147,19 +146,28 @@ def drop(held: replay.Replay, dropped: Array) -> replay.Replay:
     return jax.tree.map(choose, jax.vmap(replay.drop_running)(held), held)
 
 
+def compiled(recipe: Recipe) -> Compiled:
+    """The functions of the run's algorithm."""
+    return (on_policy if isinstance(recipe.algorithm, PPOSettings) else off_policy).compiled(recipe)
+
+
 def recipe_for(run: Run) -> Recipe:
     task, settings = run.config.task, run.config.settings
     factors = run.function.size if run.function else 0
     return Recipe(
         method=find_method(settings.method),
-        td3=settings.td3,
+        algorithm=settings.of_algorithm,
         credit=settings.credit,
         scale_rewards=settings.scale_rewards,
         observation_size=task.observation_size,
         action_size=task.action_size,
+        discrete=run.config.discrete,
         factors=2 * factors if run.judges == "both" else factors,
         longest_episode=run.config.longest_episode,
         capacity=settings.rows,
+        steps=settings.steps,
+        turn=settings.turn,
+        fit_updates=settings.rollout.fit_updates,
     )
 
 
@@ -216,14 +224,14 @@ def begin(run: Run, make_learner: Callable[[], Learner]) -> Session:
 
 def compile_ahead(run: Run, recipe: Recipe) -> Compiled:
     """The functions of a run, compiled for the shapes that they will see."""
-    seeds, chunk = len(run.seeds), run.config.settings.chunk
+    seeds, turn = len(run.seeds), run.config.settings.turn
 
     def shape(*sizes: int, dtype: type = np.float32) -> Any:
-        return jax.ShapeDtypeStruct((seeds, chunk, *sizes), dtype)
+        return jax.ShapeDtypeStruct((seeds, turn, *sizes), dtype)
 
     observation, flag = shape(recipe.observation_size), shape(dtype=bool)
     steps = replay.Step(observation, shape(recipe.action_size), shape(recipe.factors), shape(), observation, flag, flag)
-    functions = compiled(recipe, chunk)
+    functions = compiled(recipe)
     learner, keys = learner_shape(run), jax.eval_shape(seed_keys, jnp.asarray(run.seeds), 0)
     return functions._replace(
         store=ahead(functions.store, learner, steps),

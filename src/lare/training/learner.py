@@ -1,0 +1,247 @@
+"""The training state of a single agent's run: what is stored, what the decoder is fitted to, what the algorithm is paid.
+
+This is the one place where credit and algorithm meet: `credit` does not know what its rewards are for, the algorithm not
+where they come from. What differs between algorithms, when to update and how to act, is in `off_policy.py` and
+`on_policy.py`.
+
+Functions are written for one seed; sessions give them their leading seed axis.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from lare.algorithms import ppo, td3
+from lare.credit import accuracy, decomposition
+from lare.credit.decomposition import CreditSettings, Decomposition, Episodes
+from lare.credit.methods import Encoder, Fit, Method, Reward
+from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe, observe_scale
+from lare.training import replay
+from lare.training.replay import Draw, Replay, Step
+
+RECENT = 5000
+"""Steps over which proxy rewards are compared with the true ones."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What is to be trained and how: everything that the compiled functions hold fixed."""
+
+    method: Method
+    algorithm: td3.TD3Settings | ppo.PPOSettings
+    credit: CreditSettings
+    scale_rewards: bool
+    """Divide the rewards that the algorithm sees by the running root mean square of R/T."""
+    observation_size: int
+    action_size: int
+    discrete: bool
+    """Whether the actions are a choice: a row with a single 1."""
+    factors: int
+    longest_episode: int
+    capacity: int
+    steps: int
+    """Of the whole run."""
+    turn: int
+    """Environment steps between two calls of `improve`."""
+    fit_updates: int
+    """ppo: updates of the decoder before each of the policy. An off-policy algorithm makes one with each of its own."""
+
+    @property
+    def warmup(self) -> int:
+        """Environment steps with random actions before the first update."""
+        return self.algorithm.warmup if isinstance(self.algorithm, td3.TD3Settings) else 0
+
+    @property
+    def features(self) -> int:
+        """Size of what the decoder sees."""
+        return self.factors if self.method.encoder is Encoder.LATENT else 2 * self.observation_size + self.action_size
+
+
+class Learner(NamedTuple):
+    """The whole training state of one seed."""
+
+    algorithm: td3.TD3 | ppo.PPO
+    credit: Decomposition | None
+    scale: Scale
+    observations: Moments | None
+    """What an on-policy algorithm's observations are normalised by."""
+    replay: Replay
+
+
+def init(key: PRNGKeyArray, recipe: Recipe) -> Learner:
+    algorithm_key, credit_key = jax.random.split(key)
+    sizes = recipe.observation_size, recipe.action_size
+    if isinstance(recipe.algorithm, ppo.PPOSettings):
+        algorithm = ppo.init(algorithm_key, *sizes, recipe.discrete, recipe.algorithm)
+        observations = no_moments(recipe.observation_size)
+    else:
+        algorithm, observations = td3.init(algorithm_key, *sizes, recipe.algorithm), None
+    return Learner(
+        algorithm,
+        None
+        if recipe.method.encoder is None
+        else decomposition.init(
+            credit_key, recipe.features, recipe.method, recipe.credit, steps=recipe.longest_episode, agents=1
+        ),
+        no_scale(),
+        observations,
+        replay.empty(recipe.capacity, recipe.observation_size, recipe.action_size, recipe.factors),
+    )
+
+
+def features(steps: Step | Draw, method: Method) -> Float[Array, "batch features"]:
+    """What the method's decoder sees of some steps."""
+    if method.encoder is Encoder.LATENT:
+        return jnp.asarray(steps.factors)
+    change = steps.observation - steps.next_observation
+    # A Gaussian may choose beyond the bounds; what happened is that the bound was taken.
+    return jnp.concatenate([steps.observation, jnp.clip(steps.action, -1, 1), change], axis=-1)
+
+
+def store(learner: Learner, steps: Step, recipe: Recipe) -> Learner:
+    """Put new steps into the replay and into the running statistics."""
+    before = learner.replay.episodes
+    held = replay.extend(learner.replay, steps)
+    episode = before + jnp.arange(len(steps.reward))
+    finished = episode < held.episodes
+    first = held.first[episode % len(held.first)]
+    length = jnp.where(finished, replay.end_of(held, episode) - first, 1)
+    mean_reward = held.episode_return[episode % len(held.first)] / length
+    credit = learner.credit
+    if credit is not None:
+        credit = decomposition.observe_steps(credit, features(steps, recipe.method))
+        credit = decomposition.observe_returns(credit, mean_reward, finished)
+    observations = learner.observations
+    if observations is not None:
+        observations = observe(observations, jnp.asarray(steps.observation))
+    scale = observe_scale(learner.scale, mean_reward, finished)
+    return learner._replace(credit=credit, scale=scale, observations=observations, replay=held)
+
+
+class CreditDraws(NamedTuple):
+    """Which steps one update of the decoder reads, and of which episodes (`episode` as in `Episodes`)."""
+
+    steps: Int[Array, "*updates rows"]
+    episode: Int[Array, "*updates rows"]
+    episodes: replay.EpisodeDraw
+
+
+def draw_credit(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> CreditDraws | None:
+    """Decide for some updates of the decoder what each of them reads; None for a method that fits nothing."""
+    if recipe.method.fit is None:
+        return None
+    if recipe.method.fit is Fit.ALL_STEPS:
+        whole = partial(draw_whole_episodes, held, recipe=recipe)
+        return jax.vmap(whole)(jax.random.split(key, updates))
+    return draw_parts_of_episodes(held, key, updates, recipe)
+
+
+def draw_parts_of_episodes(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> CreditDraws:
+    """K steps of each of `steps // K` episodes, for RRD."""
+    episodes_key, steps_key = jax.random.split(key)
+    drawn, count = recipe.credit.drawn_steps, max(1, recipe.credit.steps // recipe.credit.drawn_steps)
+    episodes = replay.draw_episodes(held, episodes_key, (updates, count))
+    steps = episodes.first[..., None] + replay.draw_steps(steps_key, episodes.length, drawn)
+    episode = jnp.broadcast_to(jnp.repeat(jnp.arange(count), drawn), (updates, count * drawn))
+    return CreditDraws(steps.reshape(updates, -1), episode, episodes)
+
+
+def draw_whole_episodes(held: Replay, key: PRNGKeyArray, recipe: Recipe) -> CreditDraws:
+    """All steps of max(1, steps // mean length) episodes, one behind the other, for RD.
+
+    The rows are as many as the longest episode has, or `steps` if that is more; an episode that would run over the end
+    is left out whole. Rows behind the last episode belong to none.
+    """
+    budget, places = max(recipe.credit.steps, recipe.longest_episode), recipe.credit.steps
+    drawn = replay.draw_episodes(held, key, (places,))
+    stored = replay.end_of(held, held.episodes - 1) - replay.oldest_transition(held)
+    wanted = recipe.credit.steps * replay.finished(held) // jnp.maximum(stored, 1)
+    end = jnp.cumsum(drawn.length)
+    counts = drawn.counts * (jnp.arange(places) < jnp.maximum(wanted, 1)) * (end <= budget)
+    row = jnp.arange(budget)
+    place = jnp.minimum(jnp.searchsorted(end, row, side="right"), places - 1)
+    step = drawn.first[place] + row - (end - drawn.length)[place]
+    belongs = (counts[place] > 0) & (row < end[place])
+    episodes = drawn._replace(counts=counts)
+    return CreditDraws(jnp.where(belongs, step, drawn.first[0]), jnp.where(belongs, place, places), episodes)
+
+
+def fit(
+    credit: Decomposition, held: Replay, draws: CreditDraws, key: PRNGKeyArray, recipe: Recipe
+) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    """One update of the decoder."""
+    assert recipe.method.fit is not None
+    seen, chosen = features(replay.read(held, draws.steps), recipe.method), draws.episodes
+    episodes = Episodes(seen, draws.episode, chosen.length, chosen.mean_reward, chosen.counts)
+    return decomposition.update(credit, episodes, key, recipe.method.fit, recipe.credit)
+
+
+def rewards(batch: Draw, learner: Learner, recipe: Recipe) -> Float[Array, " batch"]:
+    """What the algorithm is trained on; proxy rewards always by the decoder as it stands."""
+    match recipe.method.reward:
+        case Reward.TRUE:
+            reward = batch.reward
+        case Reward.EPISODIC:
+            reward = batch.episodic_reward
+        case Reward.PROXY:
+            assert learner.credit is not None
+            reward = decomposition.proxy_rewards(learner.credit, features(batch, recipe.method), recipe.credit)
+    return reward / magnitude(learner.scale) if recipe.scale_rewards else reward
+
+
+def assess(learner: Learner, steps: int, recipe: Recipe) -> dict[str, Float[Array, ""]]:
+    """How near the newest decoder's proxy rewards come to the true ones, over the last `steps` steps."""
+    if learner.credit is None:
+        return {}
+    held = learner.replay
+    number = held.transitions - 1 - jnp.arange(steps)
+    counts = number >= replay.oldest_transition(held)
+    recent = replay.read(held, jnp.where(counts, number, replay.oldest_transition(held)))
+    r_hat = decomposition.proxy_rewards(learner.credit, features(recent, recipe.method), recipe.credit)
+    return {
+        "credit/error": accuracy.mean_error(r_hat, recent.reward, counts),
+        "credit/correlation": accuracy.correlation(r_hat, recent.reward, counts),
+    }
+
+
+class Compiled(NamedTuple):
+    """How an algorithm is trained. Every array has a leading seed axis, but for `done`."""
+
+    store: Callable[[Learner, Step], Learner]
+    improve: Callable[..., tuple[Learner, dict[str, Float[Array, " seeds"]]]]
+    """From learner, keys, and the environment steps done before; the mean of each metric over its updates."""
+    assess: Callable[[Learner], dict[str, Float[Array, " seeds"]]]
+    actor: Callable[[Learner], Any]
+    """What is needed to act."""
+    act: Callable[[Any, np.ndarray], Float[Array, "seeds *episodes action"]]
+    """The deterministic policy, from actor and observations."""
+    explore: Callable[[Any, np.ndarray, np.ndarray], Float[Array, "seeds action"]]
+    """The policy that collects, from actor, observations and noise."""
+    noise: Callable[[Sequence[np.random.Generator], int], Float[np.ndarray, "time seeds action"]]
+    """For the steps of a turn, from random numbers for each seed and the environment steps done before."""
+
+
+def compiled(
+    recipe: Recipe,
+    improve: Callable[..., Any],
+    actor: Callable[[Learner], Any],
+    act: Callable[..., Array],
+    explore: Callable[..., Array],
+    noise: Callable[..., np.ndarray],
+) -> Compiled:
+    """`store` and `improve` consume the learner that they are given: its memory holds the new one."""
+    return Compiled(
+        store=jax.jit(jax.vmap(partial(store, recipe=recipe)), donate_argnums=0),
+        improve=jax.jit(jax.vmap(partial(improve, recipe=recipe), in_axes=(0, 0, None)), donate_argnums=0),
+        assess=jax.jit(jax.vmap(partial(assess, steps=RECENT, recipe=recipe))),
+        actor=actor,
+        act=jax.jit(jax.vmap(act)),
+        explore=jax.jit(jax.vmap(explore)),
+        noise=partial(noise, recipe=recipe),
+    )

@@ -1,0 +1,78 @@
+"""What each method reads and is rewarded with."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from recipes import LENGTHS, recipe, steps_of, stored
+
+from lare.credit.methods import TABLE, Fit, Reward
+from lare.normalise import magnitude
+from lare.training import learner as common
+from lare.training import replay
+
+
+def test_store_keeps_statistics_of_what_came():
+    learner, given = stored(recipe("lare-rrdu")), steps_of(2)
+    np.testing.assert_allclose(learner.credit.moments.mean, given.factors.mean(axis=0), rtol=1e-4)
+    means = [part.mean() for part in np.split(given.reward, np.cumsum(LENGTHS)[:-1])]
+    assert float(learner.scale.mean_square) == pytest.approx(np.mean(np.square(means)), rel=1e-4)
+    np.testing.assert_array_equal(learner.scale, learner.credit.scale)
+
+
+def test_raw_features_are_s_a_and_the_change():
+    chosen = recipe("rrdu")
+    drawn = replay.read(stored(chosen).replay, jnp.array([7]))
+    taken = np.clip(drawn.action, -1, 1)
+    assert (taken != drawn.action).any()
+    want = np.concatenate([drawn.observation, taken, drawn.observation - drawn.next_observation], axis=1)
+    np.testing.assert_array_equal(common.features(drawn, chosen.method), want)
+    assert want.shape[1] == chosen.features == 8
+
+
+@pytest.mark.parametrize("key", range(4))
+def test_whole_episodes_are_masked_never_padded(key):
+    chosen = recipe("rd")
+    held = stored(chosen).replay
+    drawn = common.draw_whole_episodes(held, jax.random.key(key), chosen)
+    lengths, counts = np.asarray(drawn.episodes.length), np.asarray(drawn.episodes.counts)
+    # About 24 steps: mean length 8.2, so two episodes, if they fit.
+    assert 1 <= counts.sum() <= 2
+    assert lengths[counts > 0].sum() <= 24
+    for place in np.flatnonzero(counts):
+        rows = np.asarray(drawn.steps)[np.asarray(drawn.episode) == place]
+        np.testing.assert_array_equal(rows, int(drawn.episodes.first[place]) + np.arange(lengths[place]))
+    assert set(np.asarray(drawn.episode)) <= {*np.flatnonzero(counts), chosen.credit.steps}
+
+
+def test_parts_of_episodes_stay_inside_them():
+    chosen = recipe("rrdu")
+    drawn = common.draw_parts_of_episodes(stored(chosen).replay, jax.random.key(0), 7, chosen)
+    first = np.repeat(np.asarray(drawn.episodes.first), 4, axis=1)
+    length = np.repeat(np.asarray(drawn.episodes.length), 4, axis=1)
+    assert drawn.steps.shape == (7, 24)
+    assert (np.asarray(drawn.steps) >= first).all()
+    assert (np.asarray(drawn.steps) < first + length).all()
+
+
+@pytest.mark.parametrize("method", ["dense", "episodic", "lare-rrdu"])
+@pytest.mark.parametrize("scale_rewards", [False, True])
+def test_rewards(method, scale_rewards):
+    chosen = recipe(method, scale_rewards=scale_rewards)
+    learner = stored(chosen)
+    drawn = replay.read(learner.replay, jnp.arange(sum(LENGTHS)))
+    got, unit = common.rewards(drawn, learner, chosen), magnitude(learner.scale)
+    got = np.asarray(got) * (unit if scale_rewards else 1)
+    given = steps_of(chosen.factors)
+    if chosen.method.reward is Reward.TRUE:
+        np.testing.assert_allclose(got, given.reward, rtol=1e-5)
+    elif chosen.method.reward is Reward.EPISODIC:
+        returns = [part.sum() for part in np.split(given.reward, np.cumsum(LENGTHS)[:-1])]
+        np.testing.assert_allclose(got[given.ended], returns, rtol=1e-4, atol=1e-6)
+        assert not got[~given.ended].any()
+    else:
+        assert got.std() > 0
+
+
+def test_every_fit_has_a_method():
+    assert {method.fit for method in TABLE} >= set(Fit)
