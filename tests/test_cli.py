@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from lare import cli
+from lare.credit.methods import METHODS
 from lare.latent.checks import CHECKS
 from lare.llm.prompts import candidate
 from lare.tasks.spec import read_task, shipped_tasks
@@ -26,9 +27,17 @@ def test_tasks_are_listed(command):
     status, out, err = command("tasks")
     assert (status, err) == (0, "")
     head, *rows = [line.split() for line in out.splitlines()]
-    assert head == ["task", "environment", "observation", "action", "judges"]
+    assert head == ["task", "observation", "action", "judges", "agents"]
     assert [row[0] for row in rows] == shipped_tasks()
-    assert ["Reacher-v4", "Reacher-v4", "11", "2", "before"] in rows
+    assert ["Reacher-v4", "11", "2", "before", "one"] in rows
+    assert ["CN-30", "26", "5", "after", "many"] in rows
+    assert ["CompetitivePP-6-prey", "24", "5", "after", "of", "one", "team"] in rows
+
+
+def test_methods_are_listed(command):
+    status, out, err = command("methods")
+    assert (status, err) == (0, "")
+    assert [line.split()[0] for line in out.splitlines()[1:] if not line.startswith(" ")] == list(METHODS)
 
 
 @pytest.mark.parametrize("kind", ["factors", "reward"])
@@ -163,8 +172,28 @@ def test_the_ablation_without_pre_verification_keeps_what_runs(command):
         ("train Reacher-v4 --seed -1", "seed = -1: input should be greater than or equal to 0"),
         (
             "train Reacher-v4 --method magic",
-            "no method 'magic'; the methods are dense, episodic, rd, rrd, rrdu, lare-rd, lare-rrdu",
+            "no method 'magic'; the methods are dense, episodic, rd, rrd, rrdu, vib-rd, vib-rrdu, arel, stas, lare-rd, "
+            "lare-rrdu, lare-rd-shared",
         ),
+        ("train CN-6 --algorithm ppo", "ppo is for a single agent, and CN-6 is a task of many"),
+        ("train CN-6 --steps 1000", "steps = 1000 is not a multiple of 82 episodes of 25 steps"),
+        ("train CompetitivePP-6-prey", "CompetitivePP-6-prey is one team of CompetitivePP-6: train that"),
+        (
+            "train CompetitivePP-6 --function phi.py",
+            "CompetitivePP-6 needs one latent function for each of CompetitivePP-6-predator, CompetitivePP-6-prey; 1 were "
+            "given",
+        ),
+        (
+            "prompt CompetitivePP-6",
+            "CompetitivePP-6 has a latent function for each of its teams: name one of CompetitivePP-6-predator, "
+            "CompetitivePP-6-prey instead",
+        ),
+        (
+            "design CompetitivePP-6",
+            "CompetitivePP-6 has a latent function for each of its teams: name one of CompetitivePP-6-predator, "
+            "CompetitivePP-6-prey instead",
+        ),
+        ("cross-play . runs/none", ". is not a run: there is no config.json in it"),
         ("evaluate .", ". is not a run: there is no config.json in it"),
         ("report", "say which runs to report on"),
         ("report one two", "one is not a run: there is no config.json in it"),

@@ -27,10 +27,26 @@ def tasks() -> None:
 
     from lare.tasks.spec import read_task, shipped_tasks
 
-    table = Table("task", "environment", "observation", "action", "judges", box=None, pad_edge=False)
+    table = Table("task", "observation", "action", "judges", "agents", box=None, pad_edge=False)
+    table.columns[0].no_wrap = True
     for name in shipped_tasks():
         spec = read_task(name)
-        table.add_row(name, spec.environment, str(spec.observation_size), str(spec.action_size), spec.judges)
+        agents = "many" if spec.particles else "of one team" if spec.whole else "one"
+        table.add_row(name, str(spec.observation_size), str(spec.action_size), spec.judges, agents)
+    Console().print(table)
+
+
+def methods() -> None:
+    """List the ways to assign credit, and where each comes from."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from lare.credit.methods import TABLE
+
+    table = Table("method", "what the algorithm is trained on", "source", box=None, pad_edge=False)
+    for method in TABLE:
+        agents = " (many agents)" if method.for_many_only else ""
+        table.add_row(method.name, method.summary + agents, method.source)
     Console().print(table)
 
 
@@ -42,9 +58,9 @@ def prompt(task: Task, kind: Kind = "factors") -> None:
         kind: what is asked for: several factors, or one reward.
     """
     from lare.llm.prompts import candidate
-    from lare.tasks.spec import load_task
+    from lare.tasks.spec import load_task, the_role
 
-    for message in candidate(load_task(task), kind):
+    for message in candidate(the_role(load_task(task)), kind):
         say(f"--- {message['role']} ---\n{message['content']}\n")
 
 
@@ -191,17 +207,53 @@ def evaluate(
 
     Args:
         run: a run directory.
-        episodes: episodes of the deterministic policy, for each seed.
+        episodes: episodes for each seed. A single agent acts without noise, agents of particle tasks as in training.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
     from lare.experiments.evaluation import evaluate_run, record_video
+    from lare.training.run import open_run
 
     returns = evaluate_run(run, episodes)
-    for seed, of_seed in returns.items():
-        say(f"seed {seed}: return {of_seed.mean():.1f} ± {of_seed.std():.1f} over {episodes} episodes")
+    for team, of_team in returns.items():
+        for seed, of_seed in zip(open_run(run).seeds, of_team, strict=True):
+            named = f"{team}, " if len(returns) > 1 else ""
+            say(f"{named}seed {seed}: return {of_seed.mean():.1f} ± {of_seed.std():.1f} over {episodes} episodes")
     if video is not None:
         record_video(run, video)
         say(f"wrote {video}")
+
+
+def cross_play(
+    first: Annotated[Positional[Path], tyro.conf.arg(metavar="RUN")],
+    second: Annotated[Positional[Path], tyro.conf.arg(metavar="RUN")],
+    episodes: int = 200,
+) -> None:
+    """Let the first team of each of two runs meet the other team of each, every seed against every seed.
+
+    Prints the first team's return, mean and standard deviation over the pairs of seeds.
+
+    Args:
+        first: a run of a task in which two teams learn, as CompetitivePP-6.
+        second: another run of the same task.
+        episodes: episodes of each pair.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from lare.experiments.agents import cross_play as play
+    from lare.training.run import open_run
+
+    runs = open_run(first), open_run(second)
+    matches = play(runs, episodes)
+    ours, theirs = (role.name.removeprefix(f"{runs[0].config.task.name}-") for role in runs[0].config.task.roles)
+    named = [f"{run.config.settings.method} ({run.directory})" for run in runs]
+    table = Table(f"return of the {ours}s", *(f"{theirs}s of {name}" for name in named), box=None, pad_edge=False)
+    for name, row in zip(named, (matches[:2], matches[2:]), strict=True):
+        shown = (f"{match.returns.mean():.1f} ± {match.returns.std(ddof=match.returns.size > 1):.1f}" for match in row)
+        table.add_row(f"{ours}s of {name}", *shown)
+    Console().print(table)
+    pairs = matches[0].returns.size
+    say(f"mean ± standard deviation over {pairs} {'pairs' if pairs > 1 else 'pair'} of seeds, {episodes} episodes each")
 
 
 def report(
@@ -221,7 +273,7 @@ def report(
 def train(
     task: Annotated[Positional[str | None], tyro.conf.arg(metavar="[TASK]")] = None,
     settings: Annotated[Settings, tyro.conf.arg(name="")] = DEFAULTS,
-    function: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    function: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = (),
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     tensorboard: bool = False,
@@ -230,23 +282,25 @@ def train(
 
     Args:
         task: a shipped name (see `lare tasks`), or the path of a task file. Not given with --resume.
-        function: a latent function (.py) to use instead of a recorded one. It is verified before it is run.
+        function: a latent function (.py) to use instead of a recorded one, verified before it is run. Where several teams learn,
+            one --function for each, in the order of the task.
         out: the run directory, which must not exist; runs/TASK-METHOD-ALGORITHM-sSEED unless given.
         resume: a run directory to go on with, from its last checkpoint and with its own settings.
         tensorboard: write TensorBoard events into the run directory too (needs the extra lare-rl[tensorboard]).
     """
     import lare
+    from lare.latent.function import load, per_role
 
     if resume is not None:
-        if (task, function, out, settings) != (None, None, None, DEFAULTS):
+        if (task, function, out, settings) != (None, (), None, DEFAULTS):
             raise LareError("--resume goes on with the run's own settings: give it no task and no other settings")
         run = lare.resume(resume, tensorboard=tensorboard)
     elif task is None:
         raise LareError("say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR")
     else:
         spec = lare.load_task(task)
-        phi = lare.load_function(function, spec) if function else None
-        run = lare.train(spec, settings, function=phi, out=out, tensorboard=tensorboard)
+        functions = [load(file, role) for file, role in per_role(function, spec)] if function else None
+        run = lare.train(spec, settings, function=functions, out=out, tensorboard=tensorboard)
     say(f"finished {run.directory}; to see it: lare report {run.directory}")
 
 
@@ -282,6 +336,7 @@ def write_new(path: Path, text: str, option: str) -> None:
 DESCRIPTION = "Train reinforcement learning on episodic rewards, through latent rewards that a language model wrote."
 COMMANDS = {
     "tasks": tasks,
+    "methods": methods,
     "new-task": new_task,
     "prompt": prompt,
     "design": design,
@@ -289,6 +344,7 @@ COMMANDS = {
     "train": train,
     "evaluate": evaluate,
     "report": report,
+    "cross-play": cross_play,
 }
 
 

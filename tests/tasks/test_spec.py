@@ -9,7 +9,10 @@ from lare.errors import LareError
 from lare.tasks.spec import load_task, read_task, shipped_tasks, time_limit
 from toys import Chase, toy_spec
 
-NAMES = "HalfCheetah-v4, HalfCheetahSparse-v4, HumanoidStandup-v4, Reacher-v4, Walker2d-v4"
+NAMES = (
+    "CN-15, CN-30, CN-6, CompetitivePP-6, CompetitivePP-6-predator, CompetitivePP-6-prey, HalfCheetah-v4, "
+    "HalfCheetahSparse-v4, HumanoidStandup-v4, PP-15, PP-30, PP-6, Reacher-v4, TriangleArea, Walker2d-v4"
+)
 
 
 class Unbounded(Chase):
@@ -81,7 +84,7 @@ def test_like_over_two_generations(spec_file, tmp_path):
         ({"name": "a/b"}, "task '{file}': name = 'a/b': string should match pattern '^[\\w.\\-]+$'"),
         ({"action_size": 0}, "task '{file}': action_size = 0: input should be greater than or equal to 1"),
         ({"max_episode_steps": 0}, "task '{file}': max_episode_steps = 0: input should be greater than or equal to 1"),
-        ({"like": 3}, "task '{file}': like = 3 must name another task, without a circle"),
+        ({"like": 3}, "task '{file}': like = 3 must name other tasks, without a circle"),
         (
             {"like": "Reacher"},
             f"no task 'Reacher' (did you mean 'Reacher-v4'?): neither a file nor one of the shipped tasks, {NAMES}",
@@ -161,6 +164,16 @@ def test_an_unknown_task_is_refused(task, hint):
     assert str(error.value) == f"no task {task!r}{hint}: neither a file nor one of the shipped tasks, {NAMES}"
 
 
+def test_teams_have_specs_of_their_own():
+    task = read_task("CompetitivePP-6")
+    assert [role.name for role in task.roles] == ["CompetitivePP-6-predator", "CompetitivePP-6-prey"]
+    assert (task.particles, task.whole) == ("CompetitivePP-6", None)
+    assert [(role.particles, role.whole) for role in task.roles] == [(None, "CompetitivePP-6")] * 2
+    single = read_task("CN-6")
+    assert (single.roles, single.particles, single.whole) == ((single,), "CN-6", None)
+    assert (toy_spec().particles, toy_spec().whole) == (None, None)
+
+
 @pytest.mark.parametrize("circle", [["a"], ["a", "b"], ["a", "b", "c"]])
 def test_like_in_a_circle_is_refused(tmp_path, circle):
     files = [tmp_path / name for name in circle]
@@ -168,7 +181,7 @@ def test_like_in_a_circle_is_refused(tmp_path, circle):
         file.write_text(f'like = "{files[(place + 1) % len(files)]}"')
     with pytest.raises(LareError) as error:
         read_task(files[0])
-    assert str(error.value) == f"task '{files[-1]}': like = '{files[0]}' must name another task, without a circle"
+    assert str(error.value) == f"task '{files[-1]}': like = '{files[0]}' must name other tasks, without a circle"
 
 
 @pytest.mark.parametrize("key", ["name", "description", "observation", "action", "environment"])

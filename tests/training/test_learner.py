@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from recipes import LENGTHS, recipe, steps_of, stored
 
 from lare.credit.methods import TABLE, Fit, Reward
 from lare.normalise import magnitude
 from lare.training import learner as common
 from lare.training import replay
+from recipes import LENGTHS, recipe, steps_of, stored
 
 
 def test_store_keeps_statistics_of_what_came():

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from recipes import recipe, steps_of, stored
 
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import TABLE
 from lare.training import learner as common
 from lare.training import off_policy, replay
+from recipes import recipe, steps_of, stored
 
 
 @pytest.mark.parametrize("method", [method.name for method in TABLE if not method.for_many_only])

@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from recipes import LENGTHS, recipe, steps_of, stored
 
 from lare.algorithms.ppo import PPOSettings
 from lare.credit.methods import TABLE, Reward
 from lare.normalise import standardise
 from lare.training import learner as common
 from lare.training import on_policy
+from recipes import LENGTHS, recipe, steps_of, stored
 
 ppo = partial(recipe, algorithm=PPOSettings(hidden=(8,), minibatch=5, epochs=2), turn=20, fit_updates=3)
 

@@ -8,15 +8,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
 from lare.algorithms.ppo import Policy
 from lare.errors import LareError
 from lare.experiments.credit import correlations
+from lare.tasks.particles import drawing
+from lare.tasks.particles.table import find_particle_task
 from lare.tasks.particles.task import STEPS, Team
 from lare.training import teams
 from lare.training.many_agents import Session, load_learner, restore
 from lare.training.run import Run
+from lare.training.seeds import seed_keys
 from lare.training.teams import Learner, Played, Recipe
 
 SAMPLED = 40
@@ -33,6 +36,11 @@ class Watched:
     """True."""
     proxy: Float[np.ndarray, "steps agents"] | None
     """By the decoders of the last checkpoint; None for a method without."""
+
+    @property
+    def credit(self) -> Float[np.ndarray, "steps agents"]:
+        """Proxy rewards, or the true ones of a method without."""
+        return self.reward if self.proxy is None else self.proxy
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,25 @@ class Sample:
 
 def first_seed(learner: Learner) -> Learner:
     return jax.tree.map(lambda leaf: leaf[0], learner)
+
+
+def returns(run: Run, episodes: int) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
+    """The sum over its agents of the true rewards, for each team, by its name."""
+    recipe, learner, _, _ = load_learner(run)
+    play = jax.jit(jax.vmap(partial(teams.play, count=episodes, recipe=recipe)))
+    keys = seed_keys(jnp.asarray(run.seeds), 0)
+    earned = np.asarray(play(learner.algorithm.online.actor, keys).reward).sum(axis=1)
+    return {
+        role.name: earned[..., team.start : team.stop].sum(axis=-1)
+        for role, team in zip(run.config.task.roles, recipe.task.teams, strict=True)
+    }
+
+
+def frames(run: Run) -> list[UInt8[np.ndarray, "height width 3"]]:
+    """One episode as pictures, in which everybody wears its credit."""
+    watched, name = watch(run), run.config.task.particles
+    assert name is not None
+    return drawing.frames(find_particle_task(name), watched.position, watched.credit)
 
 
 def watch(run: Run, key: int = 0) -> Watched:

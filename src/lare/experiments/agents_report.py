@@ -1,10 +1,9 @@
 """The part of a report that only runs of many agents have."""
 
 import base64
-import tempfile
+import io
 from collections.abc import Iterable
 from html import escape
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -41,13 +40,10 @@ def agents_details(run: Run) -> Iterable[str]:
 
 def moving(run: Run, watched: Watched) -> str:
     """The film, inside the page."""
-    name = run.config.task.particles
+    name, buffer = run.config.task.particles, io.BytesIO()
     assert name is not None
-    credit = watched.reward if watched.proxy is None else watched.proxy
-    with tempfile.TemporaryDirectory() as place:
-        path = Path(place) / "episode.gif"
-        film(path, find_particle_task(name), watched.position, credit)
-        data = base64.b64encode(path.read_bytes()).decode()
+    film(buffer, find_particle_task(name), watched.position, watched.credit)
+    data = base64.b64encode(buffer.getvalue()).decode()
     return f'<img class="film" alt="one episode, with the credit of each agent" src="data:image/gif;base64,{data}">'
 
 

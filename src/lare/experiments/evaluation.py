@@ -1,29 +1,33 @@
-"""The policy of a finished (or stopped) run, evaluated and filmed."""
+"""The policy of a finished (or stopped) run, evaluated and filmed, for one agent and for many."""
 
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from lare.algorithms import td3
 from lare.errors import LareError
+from lare.experiments import agents
+from lare.tasks.particles.drawing import FRAMES_PER_SECOND
 from lare.tasks.spec import check_against_environment
 from lare.training.environments import Policy, Stream, episode_seed, evaluate, make_episodic, to_bounds
 from lare.training.run import Run, open_run
-from lare.training.single_agent import load_learner
+from lare.training.single_agent import compiled, load_learner
 
 
 def load_policy(run: Run) -> Policy:
     """The deterministic policies of all seeds, as of the last checkpoint."""
-    _, learner, _, _ = load_learner(run)
-    act = jax.jit(jax.vmap(td3.act))
-    return lambda observation: np.asarray(act(learner.algorithm.online.actor, observation))
+    recipe, learner, _, _ = load_learner(run)
+    functions = compiled(recipe)
+    actor = functions.actor(learner)
+    return lambda observation: np.asarray(functions.act(actor, observation))
 
 
-def evaluate_run(directory: str | Path, episodes: int = 10) -> dict[int, Float[np.ndarray, " episodes"]]:
-    """True returns of the deterministic policy, by seed.
+def evaluate_run(directory: str | Path, episodes: int = 10) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
+    """True returns by team; the only team of most tasks is called by the task's name.
+
+    A single agent acts without noise. Agents of particle tasks draw their actions, as they do in training; a team's
+    return is the sum over its agents.
 
     Raises:
         LareError: the directory is no run, or its task's environment has changed.
@@ -32,19 +36,25 @@ def evaluate_run(directory: str | Path, episodes: int = 10) -> dict[int, Float[n
         raise LareError(f"episodes = {episodes}: at least one is needed")
     run = open_run(directory)
     task = run.config.task
+    if task.particles:
+        return agents.returns(run, episodes)
     check_against_environment(task)
     environments = [[make_episodic(task) for _ in range(episodes)] for _ in run.seeds]
-    returns = evaluate(environments, load_policy(run), run.seeds).returns
-    return dict(zip(run.seeds, returns, strict=True))
+    return {task.name: evaluate(environments, load_policy(run), run.seeds).returns}
 
 
 def record_video(directory: str | Path, path: str | Path) -> None:
     """Film one episode of the first seed's policy, as a .gif, or as an .mp4 with the extra `lare-rl[video]`.
 
+    Agents of particle tasks wear their credit, as number and colour.
+
     Raises:
         LareError: the environment cannot be drawn on this machine, or the file cannot be written.
     """
     run, path = open_run(directory), Path(path)
+    if run.config.task.particles:
+        write_video(path, agents.frames(run), FRAMES_PER_SECOND)
+        return
     camera = {"camera_name": "track"} if has_tracking_camera(run) else {}
     environment = make_episodic(run.config.task, render_mode="rgb_array", **camera)
     policy, fps = load_policy(run), environment.metadata.get("render_fps", 30)

@@ -20,7 +20,7 @@ from lare.llm.model import Model, recorded_model
 from lare.llm.prompts import Kind, Message, Stage
 from lare.llm.recording import Recorder
 from lare.llm.reply import MalformedReply, parse
-from lare.tasks.spec import TaskSpec
+from lare.tasks.spec import TaskSpec, the_role
 
 CANDIDATES = 5
 """n of the paper."""
@@ -197,8 +197,9 @@ def design(
 
     Raises:
         DesignFailed: no attempt passed.
-        LareError: the model cannot answer.
+        LareError: the model cannot answer, or each team of the task has a function of its own.
     """
+    the_role(task)
     if candidates < 1:
         raise LareError(f"candidates = {candidates}: at least one is needed")
     model = model or recorded_model(task.name, kind, draw)

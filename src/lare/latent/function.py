@@ -4,9 +4,10 @@ import functools
 import hashlib
 import itertools
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -164,6 +165,17 @@ def split_header(text: str) -> tuple[list[str], str]:
 def read_source(path: str | Path) -> str:
     """The source of a function file, not yet looked into. Raises `LareError` where it cannot be read."""
     return normal(split_header(read_text(source_file(path)))[1])
+
+
+Given = TypeVar("Given")
+
+
+def per_role(given: Sequence[Given], task: TaskSpec) -> list[tuple[Given, TaskSpec]]:
+    """What is given for each role of a task, beside it. Raises `LareError` where there are not as many."""
+    if len(given) != len(task.roles):
+        names = ", ".join(role.name for role in task.roles)
+        raise LareError(f"{task.name} needs one latent function for each of {names}; {len(given)} were given")
+    return list(zip(given, task.roles, strict=True))
 
 
 def load(path: str | Path, task: TaskSpec) -> LatentFunction:

@@ -13,7 +13,7 @@ from lare.latent.jailed import JailedProgram, WorkerFailed
 from lare.latent.names import names_of
 from lare.llm.prompts import Kind
 from lare.tasks.environment import make
-from lare.tasks.spec import TaskSpec
+from lare.tasks.spec import TaskSpec, the_role
 
 STEPS = 256
 """Random steps that a function is tried on."""
@@ -44,9 +44,10 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors") -> Verdict:
     """Try a source, in a process without this one's environment, files and rights.
 
     Raises:
-        LareError: the task's environment cannot be made, or there is no process to be had.
+        LareError: the task's environment cannot be made, there is no process to be had, or each team of the task has a
+            function of its own.
     """
-    observation, action = random_steps(task)
+    observation, action = random_steps(the_role(task))
     sizes = observation.shape[1], action.shape[1]
     try:
         with contextlib.ExitStack() as stack:

@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from lare.errors import Checked, LareError
 from lare.tasks.environment import make
-from lare.tasks.particles import NAMES, NAMESPACE
+from lare.tasks.particles import NAMES, NAMESPACE, TEAMS
 from lare.tasks.spaces import Choice
 
 Judges = Literal["before", "after", "both"]
@@ -63,6 +63,13 @@ class TaskSpec(Checked):
         """Which particle task this is (`particles/table.py`), for those that many agents learn together."""
         name = self.environment.removeprefix(NAMESPACE)
         return name if name != self.environment and name in NAMES else None
+
+    @property
+    def whole(self) -> str | None:
+        """The task that this is one team of."""
+        name = self.environment.removeprefix(NAMESPACE)
+        named = [task for task, teams in TEAMS.items() if name in [f"{task}-{team}" for team in teams]]
+        return named[0] if named and name != self.environment else None
 
     @property
     def roles(self) -> tuple["TaskSpec", ...]:
@@ -124,7 +131,7 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
         raise LareError(f"task {task!r} is not valid TOML: {error}") from error
     for key in ("like", "teams"):
         named = values.get(key, [])
-        for other in [named] if isinstance(named, str) else named:
+        for other in named if isinstance(named, list) else [named]:
             if not isinstance(other, str) or other in (*seen, task):
                 raise LareError(f"task {task!r}: {key} = {named!r} must name other tasks, without a circle")
     if "teams" in values:
@@ -145,6 +152,14 @@ def read_text(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise LareError(f"{path} cannot be read: {error}") from error
+
+
+def the_role(spec: TaskSpec) -> TaskSpec:
+    """The spec, if it speaks of one role. Raises `LareError` where teams have specs of their own."""
+    if spec.teams:
+        names = ", ".join(role.name for role in spec.roles)
+        raise LareError(f"{spec.name} has a latent function for each of its teams: name one of {names} instead")
+    return spec
 
 
 def check_against_environment(spec: TaskSpec) -> None:

@@ -12,7 +12,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from lare.errors import LareError
 STATE = "state.npz"
 
 
+@runtime_checkable
 class Learner(Protocol):
     """Any training state with a replay: arrays with a seed axis first and, if they are saved by row, rows behind it.
 

@@ -156,6 +156,8 @@ def decide(settings: Settings, task: TaskSpec) -> Plan:
     Raises:
         LareError: method, algorithm and task do not go together, or the steps are no whole number of turns.
     """
+    if task.whole is not None:
+        raise LareError(f"{task.name} is one team of {task.whole}: train that")
     many = task.particles is not None
     algorithm = settings.algorithm or ("ippo" if many else "td3")
     if many != (algorithm == "ippo"):

@@ -10,7 +10,7 @@ from typing import Any
 from lare.credit.methods import Encoder, find_method
 from lare.errors import LareError
 from lare.latent.design import design
-from lare.latent.function import LatentFunction
+from lare.latent.function import LatentFunction, per_role
 from lare.tasks.spec import TaskSpec, load_task
 from lare.training import many_agents, single_agent
 from lare.training.progress import Clock, Listener, TensorBoard, Terminal
@@ -61,11 +61,8 @@ def chosen_functions(
         return ()
     if given is None:
         return tuple(design(role, draw=plan.draw) for role in task.roles)
-    functions = (given,) if isinstance(given, LatentFunction) else tuple(given)
-    if len(functions) != len(task.roles):
-        names = ", ".join(role.name for role in task.roles)
-        raise LareError(f"{task.name} needs a latent function for each of {names}, and {len(functions)} are given")
-    return functions
+    functions = [given] if isinstance(given, LatentFunction) else given
+    return tuple(function for function, _ in per_role(functions, task))
 
 
 def resume(directory: str | Path, *, tensorboard: bool = False, listeners: Sequence[Listener] | None = None) -> Run:

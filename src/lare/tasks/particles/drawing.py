@@ -1,21 +1,23 @@
 """Pictures of particle tasks: a state, and an episode as a film."""
 
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib import colormaps
-from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
+from PIL import Image
 
 from lare.tasks.particles.task import ParticleTask
 
 TEAM, OTHERS, LANDMARK = "#0072b2", "#d55e00", "#9a9a9a"
 """The first team, all others that move, and what stays."""
 CREDIT = colormaps["RdBu"]
+FRAMES_PER_SECOND = 8
 MARGIN = 1.08
 """How much further than the square the picture reaches."""
 
@@ -32,22 +34,31 @@ def draw(
     return figure
 
 
-def film(
-    path: Path,
+def frames(
     task: ParticleTask,
     positions: Float[np.ndarray, "steps entities 2"],
     credit: Float[np.ndarray, "steps agents"] | None = None,
-    frames_per_second: int = 8,
-) -> None:
-    """An episode as a GIF, all of it to one scale of length and one of credit."""
+) -> list[UInt8[np.ndarray, "height width 3"]]:
+    """An episode as pictures, all of them to one scale of length and one of credit."""
     figure, axes = blank()
     side, scale = reach(task, positions), None if credit is None else float(np.abs(credit).max())
-    writer = PillowWriter(frames_per_second)
-    with writer.saving(figure, str(path), dpi=100):
-        for number, position in enumerate(positions):
-            axes.clear()
-            paint(axes, task, position, side, None if credit is None else credit[number], scale)
-            writer.grab_frame()
+    found = []
+    for number, position in enumerate(positions):
+        axes.clear()
+        paint(axes, task, position, side, None if credit is None else credit[number], scale)
+        found.append(pixels(figure))
+    return found
+
+
+def film(
+    file: Path | BinaryIO,
+    task: ParticleTask,
+    positions: Float[np.ndarray, "steps entities 2"],
+    credit: Float[np.ndarray, "steps agents"] | None = None,
+) -> None:
+    """An episode as a GIF."""
+    first, *others = (Image.fromarray(frame) for frame in frames(task, positions, credit))
+    first.save(file, format="GIF", save_all=True, append_images=others, duration=1000 // FRAMES_PER_SECOND, loop=0)
 
 
 def blank() -> tuple[Figure, Axes]:
