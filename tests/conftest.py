@@ -10,7 +10,12 @@ import jax
 import pytest
 
 from lare import cli
+from lare.algorithms.ppo import PPOSettings
+from lare.algorithms.td3 import TD3Settings
+from lare.credit.decomposition import CreditSettings
+from lare.latent.function import LatentFunction, verified
 from lare.tasks.spec import TaskSpec
+from lare.training.settings import AgentSettings, RolloutSettings, Settings
 from toys import PHI, Chase, toy_spec
 
 # Most of a small run's time is compilation, and many tests compile the same. JAX may have been imported already, and
@@ -65,3 +70,48 @@ def command(monkeypatch, capsys, tmp_path):
         return status, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture(scope="session")
+def phi() -> LatentFunction:
+    return verified(PHI, toy_spec())
+
+
+@pytest.fixture(scope="session")
+def small():
+    """Settings of a run that takes a second."""
+
+    def build(**changes) -> Settings:
+        values = {
+            "steps": 240,
+            "seeds": 2,
+            "chunk": 12,
+            "evaluate_every": 60,
+            "evaluation_episodes": 2,
+            "td3": TD3Settings(hidden=(8,), batch_size=8, warmup=36),
+            "ppo": PPOSettings(hidden=(8,), minibatch=16, epochs=2),
+            "rollout": RolloutSettings(steps=60, fit_updates=2),
+            "credit": CreditSettings(hidden=(8,), drawn_steps=4, steps=16),
+        }
+        return Settings(**(values | changes))
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def small_many():
+    """The same for particle tasks: two updates of two seeds."""
+
+    def build(**changes) -> Settings:
+        credit = CreditSettings(hidden=(8,), steps=50, drawn_steps=5)
+        values = {
+            "steps": 200,
+            "seeds": 2,
+            "evaluate_every": 100,
+            "evaluation_episodes": 2,
+            "ippo": PPOSettings(hidden=(8,), minibatch=100, epochs=1),
+            "agents": AgentSettings(episodes=4, fit_every=1, fit_updates=2, capacity=6, credit=credit),
+        }
+        return Settings(**(values | changes))
+
+    return build

@@ -4,7 +4,7 @@ import textwrap
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
 
 from lare.tasks.spec import TaskSpec
 
@@ -80,6 +80,25 @@ class Broken(Chase):
         return observation, reward, terminated, truncated, info
 
 
+class Pick(gymnasium.Env):
+    """A toy with a choice to make: 1 for the place of the 1 in the observation."""
+
+    observation_space = Box(0, 1, (4,), np.float32)
+    action_space = Discrete(4)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observe(), {}
+
+    def observe(self):
+        self.place = int(self.np_random.integers(4))
+        return np.eye(4, dtype=np.float32)[self.place]
+
+    def step(self, action):
+        reward = float(action == self.place)
+        return self.observe(), reward, False, False, {}
+
+
 class Forgetful(Chase):
     """Its chance does not come from the seed: an episode cannot be had again."""
 
@@ -88,5 +107,29 @@ class Forgetful(Chase):
         return self.observe(), {}
 
 
+gymnasium.register("toys/Pick-v0", entry_point=Pick, max_episode_steps=20)
 gymnasium.register("toys/Broken-v0", entry_point=Broken, max_episode_steps=20)
 gymnasium.register("toys/Forgetful-v0", entry_point=Forgetful, max_episode_steps=20)
+
+
+class At:
+    """Does something when a run has come to a step."""
+
+    def __init__(self, step, action):
+        self.step, self.action, self.messages = step, action, []
+
+    def started(self, name, step, steps): ...
+    def evaluated(self, metrics): ...
+    def stopped(self): ...
+
+    def said(self, message):
+        self.messages.append(message)
+
+    def stepped(self, step):
+        if step == self.step:
+            self.action()
+
+
+def figures(run):
+    """Metrics without the times."""
+    return [{key: value for key, value in line.items() if not key.startswith("time/")} for line in run.metrics()]

@@ -65,3 +65,8 @@ def test_the_last_assignment_counts():
 
 def test_meanings_of_the_toy():
     assert factor_meanings(PHI) == {"f_near": "how near the action comes", "f_effort": "effort"}
+
+
+def test_a_numbered_comment_may_stand_above_the_first_of_several_lines():
+    body = "# 1. how near\nd = action\nx = -d\n# 2. effort\ny = action\nz = x\n# not numbered\ne = x\nw = e\nreturn [x, y, z, w]"
+    assert factor_meanings(phi(body)) == {"d": "how near", "x": "how near", "y": "effort", "e": "not numbered"}

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import lare
+from lare.algorithms.ppo import PPOSettings
 from lare.algorithms.td3 import TD3Settings
 from lare.credit.methods import TABLE, Encoder
 from lare.errors import LareError
@@ -19,38 +20,18 @@ from lare.latent.function import verified
 from lare.training import checkpoint
 from lare.training.environments import EnvironmentFault
 from lare.training.run import open_run
+from lare.training.settings import RolloutSettings
 from lare.training.train import Interrupted
-from toys import PHI, toy_spec
+from toys import PHI, At, figures, toy_spec
 
-METHODS = [method.name for method in TABLE]
-
-
-class At:
-    """Does something when a run has come to a step."""
-
-    def __init__(self, step, action):
-        self.step, self.action, self.messages = step, action, []
-
-    def started(self, name, step, steps): ...
-    def evaluated(self, metrics): ...
-    def stopped(self): ...
-
-    def said(self, message):
-        self.messages.append(message)
-
-    def stepped(self, step):
-        if step == self.step:
-            self.action()
+METHODS = [method.name for method in TABLE if not method.for_many_only]
 
 
-def figures(run):
-    """Metrics without the times."""
-    return [{key: value for key, value in line.items() if not key.startswith("time/")} for line in run.metrics()]
-
-
+@pytest.mark.parametrize("algorithm", ["td3", "ppo"])
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_trains_and_reports(method, small, phi, tmp_path):
-    run = lare.train(toy_spec(), small(method=method), function=phi, out=tmp_path / "run", listeners=[])
+def test_every_method_trains_and_reports(method, algorithm, small, phi, tmp_path):
+    settings = small(method=method, algorithm=algorithm)
+    run = lare.train(toy_spec(), settings, function=phi, out=tmp_path / "run", listeners=[])
     lines = run.metrics()
     assert [(line["step"], line["seed"]) for line in lines] == [
         (s, seed) for s in (60, 120, 180, 240) for seed in (0, 1)
@@ -100,19 +81,19 @@ def test_judges(judges, small, phi, tmp_path):
         assert z[0, column] == pytest.approx(-((2 * action[0, 0] - observation[row, 0]) ** 2), rel=1e-4)
 
 
-@pytest.mark.parametrize("method", ["dense", "rd", "lare-rrdu"])
-def test_a_killed_run_resumes_bit_for_bit(method, small, phi, tmp_path):
+@pytest.mark.parametrize(
+    ("algorithm", "method"), [("td3", "dense"), ("td3", "rd"), ("td3", "lare-rrdu"), ("ppo", "rrdu")]
+)
+def test_a_killed_run_resumes_bit_for_bit(algorithm, method, small, phi, tmp_path):
     """SIGKILL in a process of its own, in the middle of an episode and between two checkpoints."""
-    settings = small(method=method)
+    settings = small(method=method, algorithm=algorithm, rollout=RolloutSettings(steps=12, fit_updates=2))
     whole = lare.train(toy_spec(), settings, function=phi, out=tmp_path / "whole", listeners=[])
     phi.save(tmp_path / "phi")
     (tmp_path / "settings.json").write_text(settings.model_dump_json())
-    script = f"""
+    script = """
 import json, os, signal, sys
-from toys import PHI, toy_spec
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+from toys import At, toy_spec
 import lare
-from test_train import At
 spec = toy_spec()
 kill = At(156, lambda: os.kill(os.getpid(), signal.SIGKILL))
 settings = lare.Settings(**json.load(open("settings.json")))
@@ -250,6 +231,8 @@ def test_a_small_ring_forgets_and_goes_on(small, tmp_path):
 def test_a_replay_too_small_for_an_episode_is_refused(small, tmp_path):
     with pytest.raises(LareError, match="capacity = 20 is too small: an episode of Chase takes up to 21"):
         lare.train(toy_spec(), small(method="dense", capacity=20), out=tmp_path / "run", listeners=[])
+    with pytest.raises(LareError, match="capacity = 100 is too small: a rollout takes up to 140"):
+        lare.train(toy_spec(), small(algorithm="ppo", capacity=100), out=tmp_path / "run", listeners=[])
     assert not (tmp_path / "run").exists()
 
 
@@ -302,3 +285,37 @@ def test_must_learn_the_toy(method, phi, tmp_path):
     )
     run = lare.train(toy_spec(), settings, function=phi, out=tmp_path / "run", listeners=[])
     assert run.metrics()[-1]["evaluation/return"] > -3
+
+
+@pytest.mark.parametrize("method", ["dense", "lare-rrdu", "rd"])
+def test_ppo_must_learn_the_toy(method, phi, tmp_path):
+    settings = lare.Settings(
+        algorithm="ppo",
+        method=method,
+        steps=8000,
+        evaluate_every=8000,
+        ppo=PPOSettings(hidden=(32, 32), learning_rate=3e-3, gamma=0.5, minibatch=50),
+        rollout=RolloutSettings(steps=200, fit_updates=50),
+        credit=lare.training.settings.CreditSettings(hidden=(32, 32), learning_rate=3e-3, drawn_steps=8, steps=64),
+    )
+    run = lare.train(toy_spec(), settings, function=phi, out=tmp_path / "run", listeners=[])
+    assert run.metrics()[-1]["evaluation/return"] > -3
+
+
+@pytest.mark.parametrize("method", ["dense", "lare-rd"])
+def test_ppo_must_learn_to_choose(method, tmp_path):
+    """A random policy gets 5 of 20, the best 20."""
+    spec = toy_spec(environment="toys/Pick-v0", observation_size=4, action_size=4)
+    function = verified("def evaluation_func(observation, action):\n    return [observation * action]\n", spec)
+    settings = lare.Settings(
+        algorithm="ppo",
+        method=method,
+        steps=4000,
+        evaluate_every=4000,
+        ppo=PPOSettings(hidden=(32,), learning_rate=3e-3, gamma=0.5, minibatch=50),
+        rollout=RolloutSettings(steps=200, fit_updates=50),
+        credit=lare.training.settings.CreditSettings(hidden=(32,), learning_rate=3e-3, drawn_steps=8, steps=64),
+    )
+    run = lare.train(spec, settings, function=function, out=tmp_path / "run", listeners=[])
+    assert run.config.discrete
+    assert run.metrics()[-1]["evaluation/return"] > 17

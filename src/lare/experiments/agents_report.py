@@ -16,7 +16,7 @@ from lare.tasks.particles.drawing import film
 from lare.tasks.particles.table import find_particle_task
 from lare.training.run import Run
 
-PICTURED = 1500
+PICTURED = 1000
 """Points of a t-SNE picture."""
 
 

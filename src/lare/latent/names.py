@@ -1,6 +1,7 @@
 """What a source says of its factors: their names, and what the comments above them say they mean."""
 
 import ast
+import itertools
 import re
 import warnings
 
@@ -36,16 +37,35 @@ def factor_names(source: str) -> list[str] | None:
 
 
 def factor_meanings(source: str) -> dict[str, str]:
-    """For each variable, the comment right above its assignment: how a model explains its factors."""
-    lines = source.splitlines()
-    meanings = {}
-    for node in ast.walk(parsed(source)):
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            comment = []
-            number = node.lineno - 2
-            while number >= 0 and lines[number].strip().startswith("#"):
-                comment.insert(0, lines[number].strip().lstrip("#").strip())
-                number -= 1
-            if comment:
-                meanings[node.targets[0].id] = NUMBERING.sub("", " ".join(comment))
+    """How a model explains its factors: for each variable, the comment right above its assignment.
+
+    A factor that is worked out over several lines may have its comment, then with a number, above the first of them.
+    """
+    lines, factors = source.splitlines(), factor_names(source) or []
+    assigned = {
+        node.lineno - 1: node.targets[0].id
+        for node in ast.walk(parsed(source))
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+    }
+    meanings, comment, numbered = {}, "", ""
+    for number, line in enumerate(lines):
+        if is_comment(line) and not (number and is_comment(lines[number - 1])):
+            comment = read_comment(lines[number:])
+            numbered = comment if NUMBERING.match(comment) else ""
+        name = assigned.get(number)
+        above = number and is_comment(lines[number - 1])
+        if name is not None and (above or (name in factors and numbered)):
+            meanings[name] = NUMBERING.sub("", comment)
+        if name in factors:
+            numbered = ""
     return meanings
+
+
+def is_comment(line: str) -> bool:
+    return line.strip().startswith("#")
+
+
+def read_comment(lines: list[str]) -> str:
+    """The comment that some lines begin with."""
+    texts = (line.strip().lstrip("#").strip() for line in itertools.takewhile(is_comment, lines))
+    return " ".join(texts)

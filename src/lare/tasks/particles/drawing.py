@@ -86,6 +86,7 @@ def paint(
     square = (-task.radius, -task.radius)
     axes.add_patch(Rectangle(square, 2 * task.radius, 2 * task.radius, fill=False, edgecolor="#dddddd"))
     colours: list = [TEAM if one < task.teams[0].stop else OTHERS for one in range(task.world.moving)]
+    edges = ["#333333"] * len(colours) if credit is None else list(colours)
     if credit is not None:
         bound = scale or float(np.abs(credit).max()) or 1.0
         shades = CREDIT(0.5 + 0.4 * np.clip(np.asarray(credit) / bound, -1, 1))
@@ -93,10 +94,9 @@ def paint(
     colours += [LANDMARK] * (len(position) - len(colours))
     landmarks_first = [*range(task.world.moving, len(position)), *range(task.world.moving)]
     for one in landmarks_first:
-        moves = one < task.world.moving
-        edge = "#333333" if moves else "none"
+        edge = edges[one] if one < task.world.moving else "none"
         radius = max(float(task.world.size[one]), 0.008 * side)
-        axes.add_patch(Circle(tuple(position[one]), radius, facecolor=colours[one], edgecolor=edge, linewidth=0.7))
+        axes.add_patch(Circle(tuple(position[one]), radius, facecolor=colours[one], edgecolor=edge, linewidth=1))
     if credit is not None:
         for (x, y), size, value in zip(position, task.world.size, credit, strict=False):
             axes.text(x, y + size + 0.01 * side, f"{value:.2g}", fontsize=8, ha="center", va="bottom")

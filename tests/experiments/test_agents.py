@@ -1,0 +1,100 @@
+"""What runs of many agents look like from outside."""
+
+import numpy as np
+import pytest
+
+import lare
+from lare.errors import LareError
+from lare.experiments import agents
+from lare.experiments.evaluation import evaluate_run, record_video
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory, small_many):
+    """Two runs with two teams, and one with a single one."""
+    place = tmp_path_factory.mktemp("runs")
+    return [
+        lare.train(task, small_many(method=method, steps=200, seed=seed), out=place / str(seed), listeners=[])
+        for seed, (task, method) in enumerate(
+            [("CompetitivePP-6", "lare-rd"), ("CompetitivePP-6", "dense"), ("TriangleArea", "rd")]
+        )
+    ]
+
+
+def test_an_episode_is_watched(runs):
+    watched = agents.watch(runs[0])
+    assert watched.position.shape == (25, 11, 2)
+    assert watched.reward.shape == watched.proxy.shape == watched.credit.shape == (25, 8)
+    assert watched.proxy.std() > 0
+    without = agents.watch(runs[1])
+    assert without.proxy is None
+    np.testing.assert_array_equal(without.credit, without.reward)
+
+
+def test_samples_of_each_team(runs):
+    predators, preys = agents.sample(runs[0])
+    rows = agents.SAMPLED * 25
+    assert (predators.observation.shape, preys.observation.shape) == ((6 * rows, 24), (2 * rows, 24))
+    for sample, function in zip((predators, preys), runs[0].functions, strict=True):
+        assert sample.factors.shape == (len(sample.reward), function.size)
+        assert sample.correlations.shape == (function.size,)
+        assert np.nanmax(np.abs(sample.correlations)) > 0.3
+    assert agents.sample(runs[1])[0].factors.shape == (6 * rows, 0)
+
+
+def test_random_actions_are_not_the_policys(runs):
+    learned, random = agents.sample(runs[2]), agents.sample(runs[2], random=True)
+    assert not np.array_equal(learned[0].observation, random[0].observation)
+
+
+def test_true_returns_by_team(runs):
+    found = evaluate_run(runs[0].directory, 6)
+    assert list(found) == ["CompetitivePP-6-predator", "CompetitivePP-6-prey"]
+    assert all(values.shape == (2, 6) for values in found.values())
+    assert list(evaluate_run(runs[2].directory, 3)) == ["TriangleArea"]
+
+
+def test_cross_play_is_every_team_against_every_other(runs):
+    matches = agents.cross_play((runs[0], runs[1]), episodes=4)
+    assert [(match.first, match.others) for match in matches] == [
+        (one, other) for one in runs[:2] for other in runs[:2]
+    ]
+    assert all(match.returns.shape == (2, 2) and np.isfinite(match.returns).all() for match in matches)
+    # The same predators from the same starts, but other preys.
+    assert not np.array_equal(matches[0].returns, matches[1].returns)
+
+
+def test_a_team_against_its_own_other_team_is_the_run_itself(runs):
+    """On the diagonal each pair of one seed is what that seed's policies do together."""
+    own = agents.cross_play((runs[0], runs[0]), episodes=4)
+    for match in own[1:]:
+        np.testing.assert_array_equal(match.returns, own[0].returns)
+
+
+def test_cross_play_needs_two_teams_of_one_task(runs):
+    message = "cross-play needs two runs of one task in which two teams learn, and these are of "
+    with pytest.raises(LareError) as error:
+        agents.cross_play((runs[2], runs[2]))
+    assert str(error.value) == f"{message}TriangleArea"
+    with pytest.raises(LareError) as error:
+        agents.cross_play((runs[0], runs[2]))
+    assert str(error.value) == f"{message}CompetitivePP-6, TriangleArea"
+
+
+def test_a_film_of_a_run(runs, tmp_path):
+    record_video(runs[0].directory, tmp_path / "film.gif")
+    assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF8")
+
+
+def test_the_report(runs, tmp_path):
+    page = lare.write_report([run.directory for run in runs], tmp_path / "report.html").read_text()
+    assert page.count("data:image/gif;base64,") == 3
+    for heading in (
+        "The factors of CompetitivePP-6-predator",
+        "The latent function of CompetitivePP-6-prey",
+        "True return of the team of prey",
+        "Who got which credit when",
+    ):
+        assert heading in page
+    assert page.count("t-SNE of steps of agents") == 2
+    assert "nan" not in page.lower().replace("nanm", "")
