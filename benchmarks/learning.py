@@ -1,4 +1,4 @@
-"""Learning curves: 3 seeds, 100 thousand steps, the methods side by side.
+"""Learning curves: the methods side by side. MuJoCo: 3 seeds, 100 thousand steps; particle tasks: 1000 updates.
 
     python benchmarks/learning.py run RUNS [TASK/LABEL ...]   train what is missing, go on with the rest
     python benchmarks/learning.py keep RUNS                   copy what is finished to results/learning
@@ -36,34 +36,50 @@ HALF_CHEETAH = {
     "episodic": {"method": "episodic"},
 }
 OTHERS = {name: HALF_CHEETAH[name] for name in ("lare-rrdu", "rrdu", "dense")}
-EXPERIMENTS = {
-    "HalfCheetah-v4": HALF_CHEETAH,
-    "Reacher-v4": OTHERS,
-    "Walker2d-v4": OTHERS,
-    "HumanoidStandup-v4": OTHERS,
+MUJOCO = {"steps": 100_000, "seeds": 3}
+
+SMALL = {
+    name: {"method": name} for name in ("lare-rd", "rd", "dense", "lare-rd-shared", "rrd", "episodic", "stas", "arel")
 }
-STEPS, SEEDS = 100_000, 3
+LARGE = {name: SMALL[name] for name in ("lare-rd", "rd", "dense")}
+COMPETITIVE = {name: SMALL[name] for name in ("lare-rd", "rd")}
+
+EXPERIMENTS: dict[str, tuple[dict[str, int], dict[str, dict[str, Any]]]] = {
+    "HalfCheetah-v4": (MUJOCO, HALF_CHEETAH),
+    "Reacher-v4": (MUJOCO, OTHERS),
+    "Walker2d-v4": (MUJOCO, OTHERS),
+    "HumanoidStandup-v4": (MUJOCO, OTHERS),
+    **dict.fromkeys(("CN-6", "PP-6", "TriangleArea"), ({"seeds": 3}, SMALL)),
+    **dict.fromkeys(("CN-15", "PP-15", "CN-30", "PP-30"), ({"seeds": 1}, LARGE)),
+    "CompetitivePP-6": ({"seeds": 3}, COMPETITIVE),
+}
+"""For each task what all of its runs have in common, and what each run has."""
 KEPT = Path(__file__).parent / "results" / "learning"
-PICTURED = ("lare-rrdu", "lare-rrdu-published", "rrdu", "rrdu-published", "dense", "episodic")
+PICTURED = (
+    *("lare-rrdu", "lare-rrdu-published", "rrdu", "rrdu-published", "dense", "episodic"),
+    *("lare-rd", "rd", "lare-rd-shared", "rrd", "stas", "arel"),
+)
+"""As many as there are colours, for any of the tasks."""
 
 
 def run(directory: Path, wanted: list[str]) -> None:
-    names = [f"{task}/{label}" for task, labels in EXPERIMENTS.items() for label in labels]
+    names = [f"{task}/{label}" for task, (_, labels) in EXPERIMENTS.items() for label in labels]
     for name in wanted or names:
         task, label = name.split("/")
         out = directory / name
         if out.exists():
             lare.resume(out)
         else:
-            settings = lare.Settings(steps=STEPS, seeds=SEEDS, **EXPERIMENTS[task][label])
-            lare.train(task, settings, out=out)
+            common, labels = EXPERIMENTS[task]
+            lare.train(task, lare.Settings(**common, **labels[label]), out=out)
 
 
 def keep(directory: Path) -> None:
     """Settings and metrics of every run that has come to its end."""
     for metrics in sorted(directory.glob("*/*/metrics.jsonl")):
         place = KEPT / metrics.parent.relative_to(directory)
-        if read(metrics.parent)[1][-1]["step"] == STEPS:
+        config, lines = read(metrics.parent)
+        if lines and lines[-1]["step"] == config["settings"]["steps"]:
             place.mkdir(parents=True, exist_ok=True)
             for name in ("config.json", "metrics.jsonl"):
                 shutil.copyfile(metrics.parent / name, place / name)
@@ -83,12 +99,17 @@ def row(directory: Path) -> dict[str, Any]:
     late = [line for line in lines if line["step"] > 0.75 * last]
     seeds = sorted({line["seed"] for line in lines})
     by_seed = [np.mean([line["evaluation/return"] for line in late if line["seed"] == seed]) for seed in seeds]
-    found = {"steps": last, "seeds": seeds, "last quarter": [np.mean(by_seed), np.std(by_seed, ddof=1)]}
+    found = {"steps": last, "seeds": seeds, "last quarter": mean_and_spread(by_seed)}
     for key in ("evaluation/return", "credit/error", "credit/correlation"):
         values = [line[key] for line in end if line.get(key) is not None]
         if values:
-            found[key] = [np.mean(values), np.std(values, ddof=1)]
+            found[key] = mean_and_spread(values)
     return {"machine": config["machine"], "versions": config["versions"], **found}
+
+
+def mean_and_spread(values: list[float]) -> list[float]:
+    """A single seed has no spread: 0."""
+    return [float(np.mean(values)), float(np.std(values, ddof=len(values) > 1))]
 
 
 def curve(directory: Path) -> figures.Curve:

@@ -73,7 +73,8 @@ def test_every_method_improves_and_is_finite(method):
     def turn(learner):
         learner, measured = teams.store(learner, played, factors, chosen), {}
         if learner.credit:
-            learner, measured = teams.fit(learner, jax.random.key(2), chosen)
+            credit, measured = teams.fit(learner, jax.random.key(2), chosen)
+            learner = learner._replace(credit=credit)
         learner, improved = teams.improve(learner, played, factors, jax.random.key(3), jnp.array(1.0), chosen)
         return learner, measured | improved | teams.assess(learner, chosen)
 
@@ -94,7 +95,7 @@ def test_each_team_has_a_decoder_and_a_return_of_its_own():
         means = reward[..., team.start : team.stop].mean(axis=(0, 2))
         assert float(credit.scale.mean_square) == pytest.approx(float((means**2).mean()), rel=1e-4)
     fitted, _ = jax.jit(partial(teams.fit, recipe=chosen))(learner, jax.random.key(0))
-    for before, after in zip(learner.credit, fitted.credit, strict=True):
+    for before, after in zip(learner.credit, fitted, strict=True):
         assert not jax.tree.all(jax.tree.map(jnp.array_equal, before.decoder, after.decoder))
 
 

@@ -49,7 +49,8 @@ class Session:
         factors = self.factors(played)
         self.learner = self.functions.store(self.learner, played, factors)
         if self.learner.credit and number % self.recipe.agents.fit_every == 0:
-            self.learner, fitted = self.functions.fit(self.learner, self.keys(Stream.FIT, number))
+            credit, fitted = self.functions.fit(self.learner, self.keys(Stream.FIT, number))
+            self.learner = self.learner._replace(credit=credit)
             self.latest |= fitted
         left = 1 - self.step / self.settings.steps
         keys = self.keys(Stream.UPDATE, number)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, Scalar
+from jaxtyping import Array, Float, Key, PRNGKeyArray, Scalar
 
 from lare.algorithms import ppo
 from lare.algorithms.ppo import PPO, Policy, PPOSettings
@@ -161,7 +161,9 @@ def store(learner: Learner, played: Played, factors: Array, recipe: Recipe) -> L
     return learner._replace(credit=tuple(credit), replay=replay.extend(learner.replay, rows, reward))
 
 
-def fit(learner: Learner, key: PRNGKeyArray, recipe: Recipe) -> tuple[Learner, dict[str, Float[Array, ""]]]:
+def fit(
+    learner: Learner, key: PRNGKeyArray, recipe: Recipe
+) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
     """Some updates of every team's decoder, each on episodes of its own; the mean of each metric over them."""
     assert recipe.method.fit is not None
     held, settings, way = learner.replay, recipe.agents.credit, recipe.method.fit
@@ -186,7 +188,7 @@ def fit(learner: Learner, key: PRNGKeyArray, recipe: Recipe) -> tuple[Learner, d
         return tuple(fitted), {"credit/loss": jnp.mean(jnp.stack(losses))}
 
     credit, measured = jax.lax.scan(one, learner.credit, jax.random.split(key, recipe.agents.fit_updates))
-    return learner._replace(credit=credit), jax.tree.map(jnp.mean, measured)
+    return credit, jax.tree.map(jnp.mean, measured)
 
 
 def rewards(
@@ -260,18 +262,23 @@ class Compiled(NamedTuple):
 
     play: Callable[..., Played]
     store: Callable[..., Learner]
-    fit: Callable[..., tuple[Learner, dict[str, Float[Array, " seeds"]]]]
+    fit: Callable[..., tuple[tuple[Decomposition, ...], dict[str, Float[Array, " seeds"]]]]
     improve: Callable[..., tuple[Learner, dict[str, Float[Array, " seeds"]]]]
     assess: Callable[..., dict[str, Float[Array, " seeds"]]]
     evaluate: Callable[..., dict[str, Float[Array, " seeds"]]]
 
 
 def compiled(recipe: Recipe) -> Compiled:
-    """`store`, `fit` and `improve` consume the learner that they are given: its memory holds the new one."""
+    """`store` and `improve` consume the learner that they are given: its memory holds the new one."""
+
+    def fit_in_turn(learner: Learner, keys: Key[Array, " seeds"]):
+        # A batch of 256 episodes fills the caches as it is: in lockstep the seeds would only be in each other's way.
+        return jax.lax.map(lambda one: fit(one[0], one[1], recipe), (learner, keys))
+
     return Compiled(
         play=jax.jit(jax.vmap(partial(play, count=recipe.agents.episodes, recipe=recipe))),
         store=jax.jit(jax.vmap(partial(store, recipe=recipe)), donate_argnums=0),
-        fit=jax.jit(jax.vmap(partial(fit, recipe=recipe)), donate_argnums=0),
+        fit=jax.jit(fit_in_turn),
         improve=jax.jit(jax.vmap(partial(improve, recipe=recipe), in_axes=(0, 0, 0, 0, None)), donate_argnums=0),
         assess=jax.jit(jax.vmap(partial(assess, recipe=recipe))),
         evaluate=jax.jit(jax.vmap(partial(evaluate, recipe=recipe))),
