@@ -11,6 +11,7 @@ Every experiment is a run directory RUNS/TASK/LABEL; its settings and metrics ar
 import json
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ def row(directory: Path) -> dict[str, Any]:
     return {"machine": config["machine"], "versions": config["versions"], **found}
 
 
-def mean_and_spread(values: list[float]) -> list[float]:
+def mean_and_spread(values: Sequence[Any]) -> list[float]:
     """A single seed has no spread: 0."""
     return [float(np.mean(values)), float(np.std(values, ddof=len(values) > 1))]
 
