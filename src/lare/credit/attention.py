@@ -1,5 +1,7 @@
 """What AREL and STAS are made of: attention over an axis, and layer normalisation."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,19 +29,16 @@ def attend(
     key: Float[Array, "*batch tokens heads size"],
     value: Float[Array, "*batch tokens heads size"],
     mask: Bool[Array, "tokens tokens"] | None = None,
-    drop: Float[Array, "..."] | None = None,
+    drop: Callable[[Array], Array] = lambda weights: weights,
 ) -> Float[Array, "*batch tokens joined"]:
     """softmax(Q K^T / sqrt(size)) V of each head, heads side by side (Vaswani et al., 2017, Eq. 1).
 
-    Where `mask` is false a token is not looked at. `drop` multiplies the attention, for dropout.
+    Where `mask` is false a token is not looked at. `drop` is done to the attention, for dropout.
     """
     scores = jnp.einsum("...ihd,...jhd->...hij", query, key) / jnp.sqrt(query.shape[-1])
     if mask is not None:
         scores = jnp.where(mask, scores, -1e9)
-    weights = jax.nn.softmax(scores)
-    if drop is not None:
-        weights = weights * drop
-    found = jnp.einsum("...hij,...jhd->...ihd", weights, value)
+    found = jnp.einsum("...hij,...jhd->...ihd", drop(jax.nn.softmax(scores)), value)
     return found.reshape(*found.shape[:-2], -1)
 
 

@@ -9,6 +9,8 @@ Learning draws coalitions, agent numbers and dropout anew at each update. At use
 the coalitions are the same at every call, and so are the rewards that it gives.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -51,11 +53,12 @@ class TimeLayer(eqx.Module):
     def __call__(
         self, x: Float[Array, "*batch steps size"], key: PRNGKeyArray | None
     ) -> Float[Array, "*batch steps size"]:
-        keys = (None, None) if key is None else jax.random.split(key)
-        found = attend(heads(self.query(x)), heads(self.key(x)), heads(self.value(x)), causal(x.shape[-2]))
-        a = dropout(self.merge(found), keys[0])
+        keys = (None,) * 3 if key is None else jax.random.split(key, 3)
+        query, keys_of_x, value = (heads(part(x)) for part in (self.query, self.key, self.value))
+        found = attend(query, keys_of_x, value, causal(x.shape[-2]), partial(dropout, key=keys[0]))
+        a = dropout(self.merge(found), keys[1])
         hidden = self.norms[0](x + a)
-        return self.norms[1](dropout(self.feed_forward(hidden), keys[1]) + 2 * a)
+        return self.norms[1](dropout(self.feed_forward(hidden), keys[2]) + 2 * a)
 
 
 class Coalitions(eqx.Module):
@@ -72,13 +75,21 @@ class Coalitions(eqx.Module):
         self.query = jax.random.uniform(query_key, (agents, SIZE, SIZE), minval=-bound, maxval=bound)
         self.key, self.value, self.merge = (Linear(SIZE, SIZE, key=key) for key in keys)
 
-    def __call__(self, x: Float[Array, "*batch agents size"], key: PRNGKeyArray) -> Float[Array, "*batch agents size"]:
-        agents = x.shape[-2]
+    def __call__(
+        self, x: Float[Array, "*batch agents size"], key: PRNGKeyArray, drop: PRNGKeyArray | None
+    ) -> Float[Array, "*batch agents size"]:
+        agents, last = x.shape[-2], None
+        parts: list[PRNGKeyArray | None] = [None] * COALITIONS
+        if drop is not None:
+            last, *parts = jax.random.split(drop, 1 + COALITIONS)
         query = heads(jnp.einsum("...ad,ade->...ae", x, self.query))
         keys, values = heads(self.key(x)), heads(self.value(x))
         joined = jax.random.bernoulli(key, 0.5, (COALITIONS, agents, agents)) | jnp.eye(agents, dtype=bool)
-        found = jnp.stack([attend(query, keys, values, mask) for mask in joined])
-        return self.merge(jnp.mean(found, axis=0))
+        found = [
+            attend(query, keys, values, mask, partial(dropout, key=part))
+            for mask, part in zip(joined, parts, strict=True)
+        ]
+        return dropout(self.merge(jnp.mean(jnp.stack(found), axis=0)), last)
 
 
 class STAS(eqx.Module):
@@ -106,9 +117,10 @@ class STAS(eqx.Module):
         rows, agents = features.shape[:2]
         x = self.embed(features).reshape(-1, len(self.step), agents, SIZE)
         x = jnp.swapaxes(x, 1, 2) + self.step
-        drawn_key, order_key, *keys = jax.random.split(jax.random.key(0) if key is None else key, 2 + LAYERS)
+        drawn_key, order_key, drop, *keys = jax.random.split(jax.random.key(0) if key is None else key, 3 + LAYERS)
         for layer, layer_key in zip(self.layers, keys, strict=True):
             x = layer(x, None if key is None else layer_key)
         order = jnp.arange(agents) if key is None else jax.random.permutation(order_key, agents)
-        x = self.coalitions(jnp.swapaxes(x, 1, 2) + self.number[order], drawn_key)
+        drop = None if key is None else drop
+        x = self.coalitions(jnp.swapaxes(x, 1, 2) + self.number[order], drawn_key, drop)
         return Decoded(self.last(x)[..., 0].reshape(rows, agents), jnp.zeros(()))
