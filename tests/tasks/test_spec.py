@@ -56,6 +56,12 @@ def test_a_task_of_ones_own_by_path(spec_file):
     )
 
 
+def test_a_path_is_meant_from_where_it_stands(spec_file, tmp_path):
+    spec_file()
+    (tmp_path / "child.toml").write_text('like = "chase.toml"\nname = "Child"\n')
+    assert load_task(tmp_path / "child.toml") == toy_spec(name="Child")
+
+
 def test_like_takes_over_what_is_not_said():
     parent, child = read_task("HalfCheetah-v4"), read_task("HalfCheetahSparse-v4")
     own = {"name", "environment", "measures"}

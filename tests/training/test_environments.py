@@ -14,10 +14,16 @@ def lane(seed=0):
     return made
 
 
+def follow(observation, noise):
+    """The best policy of the toy, with noise."""
+    return observation[:, :1] + noise
+
+
 def test_actions_are_rescaled():
     space = gymnasium.spaces.Box(np.float32([-0.4, 0]), np.float32([0.4, 10]))
     np.testing.assert_allclose(to_bounds(np.float32([-1, 1]), space), [-0.4, 10])
     np.testing.assert_allclose(to_bounds(np.float32([0, 0]), space), [0, 5])
+    np.testing.assert_allclose(to_bounds(np.float32([-3, 1.5]), space), [-0.4, 10])
 
 
 def test_streams_of_random_numbers_are_apart():
@@ -27,7 +33,7 @@ def test_streams_of_random_numbers_are_apart():
 
 def test_collected_steps_follow_each_other_within_an_episode():
     lanes = [lane(0), lane(1)]
-    collected = collect(lanes, lambda observation: observation[:, :1], np.zeros((45, 2, 1), np.float32))
+    collected = collect(lanes, follow, np.zeros((45, 2, 1), np.float32))
     steps = collected.steps
     assert steps.observation.shape == (2, 45, 2)
     inside = ~steps.ended[:, :-1]
@@ -40,20 +46,18 @@ def test_collected_steps_follow_each_other_within_an_episode():
     )
 
 
-def test_noisy_actions_stay_in_bounds():
-    steps = collect([lane()], lambda observation: observation[:, :1], np.full((5, 1, 1), 3, np.float32)).steps
-    np.testing.assert_array_equal(steps.action, 1)
+def test_what_is_chosen_beyond_the_bounds_is_kept_and_the_bound_is_taken():
+    collected = collect([lane()], follow, np.full((5, 1, 1), 3, np.float32))
+    assert (collected.steps.action > 1).all()
+    np.testing.assert_array_equal(collected.environment_action, 2)
 
 
 def test_replaying_actions_leads_back():
     first, second = lane(), lane()
-    collect([first], lambda observation: observation[:, :1], np.zeros((27, 1, 1), np.float32))
+    collect([first], follow, np.zeros((27, 1, 1), np.float32))
     second.episode = first.episode
     assert second.replay(first.actions, first.observation)
-    again = [
-        collect([one], lambda observation: observation[:, :1], np.zeros((5, 1, 1), np.float32)).steps
-        for one in (first, second)
-    ]
+    again = [collect([one], follow, np.zeros((5, 1, 1), np.float32)).steps for one in (first, second)]
     np.testing.assert_array_equal(again[0].next_observation, again[1].next_observation)
     assert not second.replay(first.actions[:3], first.observation)
 

@@ -63,7 +63,7 @@ def test_an_episode_that_goes_on_has_not_ended():
 def test_acting(discrete):
     chosen = ppo("dense", discrete=discrete)
     actor, random = on_policy.actor_of(stored(chosen)), [np.random.default_rng(seed) for seed in (0, 1)]
-    noise = on_policy.noise(random, 0, chosen)
+    noise = on_policy.noise(random, chosen)
     assert noise.shape == (20, 2, 2)
     observation = jnp.ones(3)
     drawn = np.array([on_policy.explore(actor, observation, jnp.asarray(row)) for row in noise[:, 0]])

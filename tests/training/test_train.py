@@ -232,7 +232,7 @@ def test_a_replay_too_small_for_an_episode_is_refused(small, tmp_path):
     with pytest.raises(LareError, match="capacity = 20 is too small: an episode of Chase takes up to 21"):
         lare.train(toy_spec(), small(method="dense", capacity=20), out=tmp_path / "run", listeners=[])
     with pytest.raises(LareError, match="capacity = 100 is too small: a rollout takes up to 140"):
-        lare.train(toy_spec(), small(algorithm="ppo", capacity=100), out=tmp_path / "run", listeners=[])
+        lare.train(toy_spec(), small(algorithm="ppo", method="dense", capacity=100), out=tmp_path / "run", listeners=[])
     assert not (tmp_path / "run").exists()
 
 
@@ -306,7 +306,7 @@ def test_ppo_must_learn_the_toy(method, phi, tmp_path):
 def test_ppo_must_learn_to_choose(method, tmp_path):
     """A random policy gets 5 of 20, the best 20."""
     spec = toy_spec(environment="toys/Pick-v0", observation_size=4, action_size=4)
-    function = verified("def evaluation_func(observation, action):\n    return [observation * action]\n", spec)
+    function = verified("def evaluation_func(o, a):\n    return [(o * a) @ np.ones((4, 1))]\n", spec)
     settings = lare.Settings(
         algorithm="ppo",
         method=method,

@@ -130,8 +130,9 @@ def sample(run: Run, random: bool = False) -> list[Sample]:
         agents = slice(team.start, team.stop)
         size = recipe.factors[place] if recipe.factors else 0
         rows = (np.asarray(played.next_observation)[..., agents, :], factors[..., agents, :size])
-        observation, of_team = (part.reshape(-1, part.shape[-1]) for part in rows)
-        found.append(Sample(team, observation, of_team, np.asarray(played.reward)[..., agents].ravel()))
+        reward = np.asarray(played.reward)[..., agents].ravel()
+        observation, of_team = (part.reshape(len(reward), -1) for part in rows)
+        found.append(Sample(team, observation, of_team, reward))
     return found
 
 

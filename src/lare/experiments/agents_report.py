@@ -77,7 +77,7 @@ def neighbourhoods(taken: Sample) -> Iterable[str]:
         return
     chosen = np.random.default_rng(0).permutation(len(taken.reward))[:PICTURED]
 
-    def plane(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows 2"]:
+    def plane(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "points 2"]:
         rows = columns[chosen]
         rows = (rows - rows.mean(axis=0)) / np.maximum(rows.std(axis=0), 1e-9)
         return TSNE(init="pca", random_state=0).fit_transform(rows)

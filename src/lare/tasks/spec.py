@@ -132,12 +132,18 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     for key in ("like", "teams"):
         named = values.get(key, [])
         for other in named if isinstance(named, list) else [named]:
-            if not isinstance(other, str) or other in (*seen, task):
+            if not isinstance(other, str) or beside(task, other) in (*seen, task):
                 raise LareError(f"task {task!r}: {key} = {named!r} must name other tasks, without a circle")
     if "teams" in values:
-        values["teams"] = [read_values(team, (*seen, task)) for team in values["teams"]]
+        values["teams"] = [read_values(beside(task, team), (*seen, task)) for team in values["teams"]]
     parent = values.pop("like", None)
-    return values if parent is None else read_values(parent, (*seen, task)) | values
+    return values if parent is None else read_values(beside(task, parent), (*seen, task)) | values
+
+
+def beside(task: str, named: str) -> str:
+    """A task that another one names. A path is meant from the folder of the file that it stands in."""
+    near = str(Path(task).parent / named)
+    return near if task not in shipped_tasks() and is_file(near) else named
 
 
 def is_file(name: str) -> bool:

@@ -223,8 +223,8 @@ class Compiled(NamedTuple):
     """The deterministic policy, from actor and observations."""
     explore: Callable[[Any, np.ndarray, np.ndarray], Float[Array, "seeds action"]]
     """The policy that collects, from actor, observations and noise."""
-    noise: Callable[[Sequence[np.random.Generator], int], Float[np.ndarray, "time seeds action"]]
-    """For the steps of a turn, from random numbers for each seed and the environment steps done before."""
+    noise: Callable[[Sequence[np.random.Generator]], Float[np.ndarray, "time seeds action"]]
+    """For the steps of a turn, from a generator for each seed."""
 
 
 def compiled(

@@ -42,7 +42,7 @@ def draw(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> Draws
 def improve(
     learner: Learner, key: PRNGKeyArray, done: Int[Scalar, ""], recipe: Recipe
 ) -> tuple[Learner, dict[str, Float[Array, ""]]]:
-    """A chunk of updates, one for each of its steps; the mean of each metric over them. None as long as actions are random."""
+    """A chunk of updates, one for each of its steps; the mean of each metric over them."""
     draw_key, noise_key = jax.random.split(key)
     assert isinstance(learner.algorithm, td3.TD3)
     held, settings, updates = learner.replay, settings_of(recipe), recipe.turn
@@ -78,7 +78,7 @@ def explore(
     return jnp.clip(td3.act(actor, observation) + noise, -1, 1)
 
 
-def noise(random: Sequence[np.random.Generator], done: int, recipe: Recipe) -> Float[np.ndarray, "time seeds action"]:
+def noise(random: Sequence[np.random.Generator], recipe: Recipe) -> Float[np.ndarray, "time seeds action"]:
     """For a chunk of steps."""
     shape = (recipe.turn, recipe.action_size)
     drawn = np.stack([one.standard_normal(shape) for one in random], 1)

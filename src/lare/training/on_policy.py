@@ -86,7 +86,7 @@ def explore(
     return policy.drawn(standardise(moments, observation), noise)
 
 
-def noise(random: Sequence[np.random.Generator], done: int, recipe: Recipe) -> Float[np.ndarray, "time seeds action"]:
+def noise(random: Sequence[np.random.Generator], recipe: Recipe) -> Float[np.ndarray, "time seeds action"]:
     """For the steps of a rollout: Gumbel's, by which the largest of the disturbed numbers is a choice; or normal."""
     shape = (recipe.turn, recipe.action_size)
     drawn = (one.gumbel(size=shape) if recipe.discrete else one.standard_normal(shape) for one in random)

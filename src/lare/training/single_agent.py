@@ -75,7 +75,7 @@ class Session:
             shape = (self.settings.turn, self.recipe.action_size)
             return lambda _, noise: noise, np.stack([one.uniform(-1, 1, shape) for one in random], 1).astype(np.float32)
         actor, explore = self.functions.actor(self.learner), self.functions.explore
-        return lambda *given: np.asarray(explore(actor, *given)), self.functions.noise(random, self.step)
+        return lambda *given: np.asarray(explore(actor, *given)), self.functions.noise(random)
 
     def factors(self, collected: Collected) -> Float[np.ndarray, "seeds time factors"]:
         """Z of new steps: `phi` on the observations that the task says it judges."""

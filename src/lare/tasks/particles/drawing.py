@@ -1,7 +1,7 @@
 """Pictures of particle tasks: a state, and an episode as a film."""
 
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -51,7 +51,7 @@ def frames(
 
 
 def film(
-    file: Path | BinaryIO,
+    file: Path | BytesIO,
     task: ParticleTask,
     positions: Float[np.ndarray, "steps entities 2"],
     credit: Float[np.ndarray, "steps agents"] | None = None,
