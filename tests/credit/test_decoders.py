@@ -1,5 +1,7 @@
 """What every decoder keeps: shapes, causality, what it draws and when; and the equations of its own."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,17 +17,21 @@ from lare.credit.stas import STAS
 
 EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
 KEY = jax.random.key(1)
-DECODERS = {
-    "step": StepDecoder(FEATURES, (8,), key=KEY),
-    "bottleneck": Bottleneck(FEATURES, (8,), 2, key=KEY),
-    "arel": AREL(FEATURES, STEPS, key=KEY),
-    "stas": STAS(FEATURES, STEPS, AGENTS, key=KEY),
+KINDS = {
+    "step": partial(StepDecoder, FEATURES, (8,)),
+    "bottleneck": partial(Bottleneck, FEATURES, (8,), 2),
+    "arel": partial(AREL, FEATURES, STEPS),
+    "stas": partial(STAS, FEATURES, STEPS, AGENTS),
 }
 
 
-@pytest.fixture(params=DECODERS)
+def made(kind):
+    return KINDS[kind](key=KEY)
+
+
+@pytest.fixture(params=KINDS)
 def decoder(request):
-    return DECODERS[request.param]
+    return made(request.param)
 
 
 def features(seed=0):
@@ -51,7 +57,7 @@ def test_at_use_nothing_is_drawn(decoder):
 
 @pytest.mark.parametrize(("name", "draws"), [("step", False), ("bottleneck", True), ("arel", False), ("stas", True)])
 def test_who_draws_while_learning(name, draws):
-    one, other = (DECODERS[name](features(), jax.random.key(number)).r_hat for number in (1, 2))
+    one, other = (made(name)(features(), jax.random.key(number)).r_hat for number in (1, 2))
     assert (np.abs(one - other).max() > 1e-6) == draws
 
 
@@ -66,14 +72,14 @@ def test_what_comes_later_changes_nothing(decoder):
 
 
 def test_a_bottleneck_costs_its_divergence():
-    bottleneck = DECODERS["bottleneck"]
+    bottleneck = made("bottleneck")
     mean, log_variance = np.split(np.asarray(bottleneck.encoder(features())), 2, axis=-1)
     want = 0.5 * (np.exp(log_variance) + mean**2 - 1 - log_variance).sum(axis=-1).mean()
     assert float(bottleneck(features(), KEY).penalty) == pytest.approx(want, rel=1e-5)
 
 
 def test_arel_gives_every_agent_the_same_and_costs_its_variance():
-    decoded = DECODERS["arel"](features(), None)
+    decoded = made("arel")(features(), None)
     given = by_episode(decoded.r_hat)
     np.testing.assert_array_equal(given, np.broadcast_to(given[..., :1], given.shape))
     want = 20 * given[..., 0].var(axis=1, ddof=1).mean()
@@ -81,8 +87,8 @@ def test_arel_gives_every_agent_the_same_and_costs_its_variance():
 
 
 def test_arel_cares_not_which_agent_is_which():
-    given = DECODERS["arel"](features(), None).r_hat
-    np.testing.assert_allclose(given, DECODERS["arel"](features()[:, ::-1], None).r_hat, rtol=1e-4, atol=1e-5)
+    given = made("arel")(features(), None).r_hat
+    np.testing.assert_allclose(given, made("arel")(features()[:, ::-1], None).r_hat, rtol=1e-4, atol=1e-5)
 
 
 def test_attention_against_plain_sums():

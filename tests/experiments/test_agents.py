@@ -81,6 +81,28 @@ def test_cross_play_needs_two_teams_of_one_task(runs):
     assert str(error.value) == f"{message}CompetitivePP-6, TriangleArea"
 
 
+def test_cross_play_on_the_command_line(runs, command):
+    status, out, err = command("cross-play", runs[0].directory, runs[1].directory, "--episodes", 3)
+    assert (status, err) == (0, "")
+    assert out.count(" ± ") == 4
+    assert out.startswith("return of the predators")
+    assert out.endswith("mean ± standard deviation over 4 pairs of seeds, 3 episodes each\n")
+    status, out, err = command("cross-play", runs[0].directory, runs[2].directory)
+    assert (status, out) == (2, "")
+    assert err.startswith("lare: cross-play needs two runs of one task in which two teams learn, and these are of ")
+
+
+def test_evaluate_on_the_command_line(runs, command, tmp_path):
+    status, out, err = command("evaluate", runs[0].directory, "--episodes", 3, "--video", "film.gif")
+    assert (status, err) == (0, "")
+    *lines, last = out.splitlines()
+    assert [line.split(": ")[0] for line in lines] == [
+        f"CompetitivePP-6-{team}, seed {seed}" for team in ("predator", "prey") for seed in runs[0].seeds
+    ]
+    assert last == "wrote film.gif"
+    assert (tmp_path / "film.gif").exists()
+
+
 def test_a_film_of_a_run(runs, tmp_path):
     record_video(runs[0].directory, tmp_path / "film.gif")
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF8")
