@@ -29,10 +29,8 @@ def main(directories: list[str]) -> None:
                 figures = {name: round(float(np.nanmean(np.abs(values))), 3) for name, values in of_each.items()}
                 figures["best factor"] = round(float(np.nanmax(np.abs(of_each["factors"]))), 3)
                 policy = "random" if random else f"{run.config.settings.method}, trained"
-                found[f"{role.name}, {policy}"] = figures | {
-                    "steps": run.config.settings.steps,
-                    "draw": run.config.settings.draw,
-                }
+                settings = run.config.settings
+                found[f"{role.name}, {policy}, draw {settings.draw}"] = figures | {"steps": settings.steps}
                 print(f"{role.name:28s} {policy:20s} {figures}")
     write("correlation", {"absolute correlation with the true reward": found})
 

@@ -110,7 +110,7 @@ def small_many():
             "steps": 200,
             "seeds": 2,
             "evaluate_every": 100,
-            "evaluation_episodes": 2,
+            "evaluation_episodes": 4,
             "ippo": PPOSettings(hidden=(8,), minibatch=100, epochs=1),
             "agents": AgentSettings(episodes=4, fit_every=1, fit_updates=2, capacity=6, credit=credit),
         }

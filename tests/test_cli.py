@@ -168,7 +168,7 @@ def test_the_ablation_without_pre_verification_keeps_what_runs(command):
             "--resume goes on with the run's own settings: give it no task and no other settings",
         ),
         ("train Reacher-v4 --function none.py", "there is no function file none.py"),
-        ("train Reacher-v4 --steps 120", "steps = 120 is not a multiple of chunk = 50"),
+        ("train Reacher-v4 --steps 120", "steps = 120 is not a multiple of chunk = 50: take 100"),
         ("train Reacher-v4 --seed -1", "seed = -1: input should be greater than or equal to 0"),
         (
             "train Reacher-v4 --method magic",
@@ -176,7 +176,12 @@ def test_the_ablation_without_pre_verification_keeps_what_runs(command):
             "lare-rrdu, lare-rd-shared",
         ),
         ("train CN-6 --algorithm ppo", "ppo is for a single agent, and CN-6 is a task of many"),
-        ("train CN-6 --steps 1000", "steps = 1000 is not a multiple of 82 episodes of 25 steps"),
+        (
+            "train CN-6 --steps 1000",
+            "steps = 1000 is not a multiple of 2050 (agents.episodes = 82, of 25 steps each): take 2050",
+        ),
+        ("train CN-6 --agents.capacity 50", "agents.capacity = 50 is less than the 82 episodes of an update"),
+        ("train CN-6 --ippo.hidden -1", "hidden.0 = -1: input should be greater than or equal to 1"),
         ("train CompetitivePP-6-prey", "CompetitivePP-6-prey is one team of CompetitivePP-6: train that"),
         (
             "train CompetitivePP-6 --function phi.py",

@@ -156,3 +156,17 @@ def test_must_learn_to_follow(discrete):
     observation = jax.random.uniform(jax.random.key(5), (1, 256, 3), minval=-1, maxval=1)
     learned = float(jnp.mean(reward_of(observation, state.online.actor.mode(observation))))
     assert learned > (0.93 if discrete else -0.03)
+
+
+def test_values_may_move_from_what_the_critic_said():
+    """The anchor of the value clip is the critic's own output, whatever unit the newest returns give it."""
+    settings = PPOSettings(hidden=(8,))
+    state = ppo.init(jax.random.key(0), 3, 2, False, settings)
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(2, 6, 4, 3)).astype(np.float32)
+    action, reward = rng.normal(size=(6, 4, 2)).astype(np.float32), 100 + rng.normal(size=(6, 4)).astype(np.float32)
+    rollout = ppo.Rollout(*map(jnp.asarray, (rows[0], action, reward, rows[1], np.ones((6, 4)), np.zeros((6, 4)))))
+    batch, returns = ppo.prepare(state, rollout, settings)
+    np.testing.assert_allclose(batch.value, state.online.critic(rollout.observation.reshape(-1, 3))[:, 0], rtol=1e-5)
+    assert float(returns.mean[0]) > 50
+    np.testing.assert_allclose([batch.target.mean(), batch.target.std()], [0, 1], atol=1e-2)

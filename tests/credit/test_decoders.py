@@ -19,7 +19,7 @@ EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
 KEY = jax.random.key(1)
 KINDS = {
     "step": partial(StepDecoder, FEATURES, (8,)),
-    "bottleneck": partial(Bottleneck, FEATURES, (8,), 2),
+    "bottleneck": partial(Bottleneck, FEATURES, (8,), 2, 0.1),
     "arel": partial(AREL, FEATURES, STEPS),
     "stas": partial(STAS, FEATURES, STEPS, AGENTS),
 }
@@ -74,7 +74,7 @@ def test_what_comes_later_changes_nothing(decoder):
 def test_a_bottleneck_costs_its_divergence():
     bottleneck = made("bottleneck")
     mean, log_variance = np.split(np.asarray(bottleneck.encoder(features())), 2, axis=-1)
-    want = 0.5 * (np.exp(log_variance) + mean**2 - 1 - log_variance).sum(axis=-1).mean()
+    want = 0.1 * 0.5 * (np.exp(log_variance) + mean**2 - 1 - log_variance).sum(axis=-1).mean()
     assert float(bottleneck(features(), KEY).penalty) == pytest.approx(want, rel=1e-5)
 
 
@@ -82,8 +82,27 @@ def test_arel_gives_every_agent_the_same_and_costs_its_variance():
     decoded = made("arel")(features(), None)
     given = by_episode(decoded.r_hat)
     np.testing.assert_array_equal(given, np.broadcast_to(given[..., :1], given.shape))
-    want = 20 * given[..., 0].var(axis=1, ddof=1).mean()
+    want = 20 / STEPS**2 * given[..., 0].var(axis=1, ddof=1).mean()
     assert float(decoded.penalty) == pytest.approx(want, rel=1e-4)
+
+
+@pytest.mark.parametrize(("normalise", "sum_form"), [(False, True), (False, False), (True, False), (True, True)])
+def test_arels_loss_is_the_published_one_in_other_units(normalise, sum_form):
+    """(R - sum_t y_t)^2 + 20 Var_t(y), as published, divided by T^2 for the mean form and by the square of the scale."""
+    settings = CreditSettings(normalise=normalise, sum_form=sum_form)
+    method = next(method for method in TABLE if method.name == "arel")
+    state = decomposition.init(KEY, FEATURES, method, settings, STEPS, AGENTS)
+    mean_reward = jnp.asarray([3.0, -1.0, 2.0, 0.5])
+    state = decomposition.observe_steps(state, features())
+    state = decomposition.observe_returns(state, mean_reward, jnp.ones(EPISODES, bool))
+    y = by_episode(decomposition.proxy_rewards(state, features(), settings))[..., 0]
+    published = ((STEPS * mean_reward - y.sum(axis=1)) ** 2).mean() + 20 * y.var(axis=1, ddof=1).mean()
+    episode = jnp.repeat(jnp.arange(EPISODES), STEPS)
+    length, ones = jnp.full(EPISODES, STEPS), jnp.ones(EPISODES)
+    batch = Episodes(features(), episode, length, mean_reward, ones)
+    loss = decomposition.update(state, batch, KEY, method.fit, settings)[1]["credit/loss"]
+    unit = float(jnp.mean(mean_reward**2)) if normalise else 1.0
+    assert float(loss) * unit * (1 if sum_form else STEPS**2) == pytest.approx(float(published), rel=1e-4)
 
 
 def test_arel_cares_not_which_agent_is_which():

@@ -35,9 +35,8 @@ def test_the_rollout_is_the_newest_steps(method):
     newest = jax.tree.map(lambda leaf: leaf[-20:], given)
     np.testing.assert_array_equal(taken.action[:, 0], newest.action)
     np.testing.assert_array_equal(taken.ended[:, 0], newest.ended)
-    scaled = standardise(learner.observations, jnp.asarray(newest.next_observation))
-    wanted = np.where(newest.ended[:, None], np.asarray(scaled), np.asarray(taken.next_observation[:, 0]))
-    np.testing.assert_allclose(taken.next_observation[:, 0], wanted, rtol=1e-5)
+    # Nothing has been seen as yet: observations are as they are.
+    np.testing.assert_allclose(taken.observation[:, 0], newest.observation, rtol=1e-5)
     reward = np.asarray(taken.reward[:, 0])
     if chosen.method.reward is Reward.TRUE:
         np.testing.assert_allclose(reward, newest.reward, rtol=1e-6)
@@ -47,6 +46,21 @@ def test_the_rollout_is_the_newest_steps(method):
         assert not reward[~newest.ended].any()
     else:
         assert reward.std() > 0
+
+
+def test_observations_are_normalised_by_what_was_known_when_acting():
+    chosen = ppo("dense")
+    learner, given = stored(chosen), steps_of(0)
+    assert float(learner.observations.seen) == 0
+    learner, _ = jax.jit(partial(on_policy.improve, recipe=chosen))(learner, jax.random.key(0), jnp.array(0))
+    np.testing.assert_allclose(learner.observations.mean, given.observation[-20:].mean(axis=0), rtol=1e-3, atol=1e-5)
+    before = learner.observations
+    learner = common.store(learner, jax.tree.map(lambda leaf: leaf[:20] + leaf[:20], given), chosen)
+    np.testing.assert_array_equal(learner.observations.mean, before.mean)
+    taken = on_policy.rollout(learner, chosen)
+    np.testing.assert_allclose(
+        taken.observation[:, 0], standardise(before, jnp.asarray(2 * given.observation[:20])), rtol=1e-4, atol=1e-5
+    )
 
 
 def test_an_episode_that_goes_on_has_not_ended():

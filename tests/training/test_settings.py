@@ -31,8 +31,12 @@ def test_what_is_given_stands():
         ("CN-6", {"algorithm": "td3"}, "td3 is for a single agent, and CN-6 is a task of many"),
         ("Reacher-v4", {"algorithm": "ippo"}, "ippo is for many agents, and Reacher-v4 is a task of one"),
         ("Reacher-v4", {"method": "arel"}, "arel assigns credit among agents, and Reacher-v4 is a task of one"),
-        ("CN-6", {"steps": 1000}, "steps = 1000 is not a multiple of 82 episodes of 25 steps"),
-        ("Reacher-v4", {"steps": 1001}, "steps = 1001 is not a multiple of chunk = 50"),
+        (
+            "CN-6",
+            {"steps": 5000},
+            "steps = 5000 is not a multiple of 2050 (agents.episodes = 82, of 25 steps each): take 4100",
+        ),
+        ("Reacher-v4", {"steps": 1001}, "steps = 1001 is not a multiple of chunk = 50: take 1000"),
     ],
 )
 def test_what_does_not_go_together_is_refused(task, settings, message):

@@ -29,7 +29,6 @@ def recipe(method, task="TriangleArea", **changes):
             episodes=COUNT, fit_updates=2, capacity=6, credit=CreditSettings(hidden=(8,), steps=50, drawn_steps=5)
         ),
         "factors": {"TriangleArea": (2,), "CompetitivePP-6": (3, 2)}[task] if latent else (),
-        "evaluation_episodes": 2,
     }
     return Recipe(**(values | changes))
 
@@ -130,7 +129,7 @@ def test_seeds_in_lockstep_are_seeds_alone():
     functions = teams.compiled(chosen)
     keys = jax.vmap(jax.random.key)(jnp.arange(3))
     start = jax.vmap(partial(teams.init, recipe=chosen))(keys)
-    played = functions.play(start.algorithm.online.actor, keys)
+    played = functions.play(start.algorithm.online.actor, keys, COUNT)
     one = jax.tree.map(lambda leaf: leaf[1], start)
     alone = jax.jit(partial(teams.play, count=COUNT, recipe=chosen))(one.algorithm.online.actor, keys[1])
     for a, b in zip(jax.tree.leaves(played), jax.tree.leaves(alone), strict=True):

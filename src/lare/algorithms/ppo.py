@@ -27,9 +27,9 @@ from lare.normalise import Moments, deviation, no_moments, observe
 
 
 class PPOSettings(Checked):
-    """Figures of PPO; the defaults are those of the PPO paper for MuJoCo."""
+    """Figures of PPO; what `lare train` uses where nothing is said stands in `training/settings.py`."""
 
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (64, 64)
     """Widths of the hidden layers of actor and critic."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Adam's step size, for actor and critic."""
@@ -143,8 +143,9 @@ class Minibatch(NamedTuple):
     """Of the action, by the policy that took it."""
     advantage: Float[Array, " batch"]
     value: Float[Array, " batch"]
-    """By the critic before the update; like `target`, in deviations of the return."""
+    """What the critic said before the update, as it said it: that is what may move by no more than `value_clip`."""
     target: Float[Array, " batch"]
+    """In deviations of the return, the newest included."""
 
 
 def init(key: PRNGKeyArray, observation_size: int, action_size: int, discrete: bool, settings: PPOSettings) -> PPO:
@@ -240,13 +241,11 @@ def prepare(state: PPO, rollout: Rollout, settings: PPOSettings) -> tuple[Miniba
     target = (advantage + value).reshape(-1)
     returns = observe(state.returns, target[:, None])
     centred = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
-
-    def scaled(values: Float[Array, "*batch"]) -> Float[Array, " steps"]:
-        return (values.reshape(-1) - returns.mean) / unit(returns)
-
     observation, action = (x.reshape(-1, x.shape[-1]) for x in (rollout.observation, rollout.action))
     log_probability = state.online.actor.log_probability(observation, action)
-    return Minibatch(observation, action, log_probability, centred.reshape(-1), scaled(value), scaled(target)), returns
+    said = state.online.critic(observation)[:, 0]
+    target = (target - returns.mean) / unit(returns)
+    return Minibatch(observation, action, log_probability, centred.reshape(-1), said, target), returns
 
 
 def minibatches(key: PRNGKeyArray, steps: int, settings: PPOSettings) -> Int[Array, "updates batch"]:

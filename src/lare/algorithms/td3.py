@@ -26,7 +26,7 @@ from lare.networks import MLP, descend, move_towards, start_adam
 class TD3Settings(Checked):
     """The figures of the TD3 paper; none of them depends on the task."""
 
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of actor and critics."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Adam's step size, for actor and critics."""

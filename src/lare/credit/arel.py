@@ -3,7 +3,9 @@
 Attention over the steps of each agent and over the agents of each step, in turns; the sum over the agents then gives one
 reward a step, which every agent gets:
 
-    r_hat_{i,t} = y_t = w . sum_i h_{i,t},    penalty = 20 E Var_t(y)
+    r_hat_{i,t} = y_t = w . sum_i h_{i,t},    penalty = 20 / T^2 E Var_t(y)
+
+(Published: 20 E Var_t(y) beside the squared error of the sum of T rewards; here, beside that of their mean.)
 
 The published adapter of LaRe's authors reads y_t, repeated over the agents, in another order than it was written, and so
 scatters it over agents and time. Here all agents get y_t at t.
@@ -81,5 +83,5 @@ class AREL(eqx.Module):
             x = jnp.swapaxes(agent(jnp.swapaxes(x, 1, 2), None), 1, 2)
         first, second, last = self.read_out
         y = last(jnp.sum(second(first(x)), axis=1))[..., 0]
-        penalty = VARIANCE_PENALTY * jnp.mean(jnp.var(y, axis=1, ddof=1))
+        penalty = VARIANCE_PENALTY / steps**2 * jnp.mean(jnp.var(y, axis=1, ddof=1))
         return Decoded(jnp.broadcast_to(y.reshape(rows, 1), (rows, agents)), penalty)

@@ -41,15 +41,17 @@ class StepDecoder(eqx.Module):
 class Bottleneck(eqx.Module):
     """VIB: a variational information bottleneck (Alemi et al., 2017) before the decoder; LaRe, appendix F.2.
 
-    z ~ N(mu(x), sigma(x)^2),    r_hat = f_psi(z),    penalty = E KL(N(mu, sigma^2) || N(0, 1))
+    z ~ N(mu(x), sigma(x)^2),    r_hat = f_psi(z),    penalty = beta E KL(N(mu, sigma^2) || N(0, 1))
 
     At use z is mu(x).
     """
 
     encoder: MLP
     network: MLP
+    beta: float = eqx.field(static=True)
 
-    def __init__(self, features: int, hidden: tuple[int, ...], size: int, *, key: PRNGKeyArray):
+    def __init__(self, features: int, hidden: tuple[int, ...], size: int, beta: float, *, key: PRNGKeyArray):
+        self.beta = beta
         encoder_key, network_key = jax.random.split(key)
         self.encoder = MLP(features, (256,), 2 * size, key=encoder_key)
         self.network = MLP(size, hidden, 1, key=network_key)
@@ -60,4 +62,4 @@ class Bottleneck(eqx.Module):
         if key is not None:
             z = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
         divergence = 0.5 * jnp.sum(jnp.exp(log_variance) + mean**2 - 1 - log_variance, axis=-1)
-        return Decoded(self.network(z)[..., 0], jnp.mean(divergence))
+        return Decoded(self.network(z)[..., 0], self.beta * jnp.mean(divergence))

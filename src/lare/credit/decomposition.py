@@ -34,7 +34,7 @@ Network = StepDecoder | Bottleneck | AREL | STAS
 class CreditSettings(Checked):
     """How the decoder is fitted."""
 
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the decoder's hidden layers."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Adam's step size."""
@@ -47,9 +47,11 @@ class CreditSettings(Checked):
     drawn_steps: Annotated[int, Field(ge=2)] = 64
     """K: steps drawn from an episode by RRD and its kin."""
     steps: Annotated[int, Field(ge=2)] = 256
-    """Steps in one update of the decoder: K steps of 256 // K episodes, or whole episodes that make up about 256."""
+    """Steps in one update of the decoder: K steps of so many episodes, or whole episodes that make up about as many."""
     bottleneck: Annotated[int, Field(ge=1)] = 4
     """Size of the code in the middle of VIB."""
+    divergence: Annotated[float, Field(ge=0)] = 1e-3
+    """Weight of the code's divergence beside the squared error."""
 
 
 class Episodes(NamedTuple):
@@ -82,7 +84,7 @@ def init(
         case Decoder.STEP:
             decoder = StepDecoder(features, settings.hidden, key=key)
         case Decoder.BOTTLENECK:
-            decoder = Bottleneck(features, settings.hidden, settings.bottleneck, key=key)
+            decoder = Bottleneck(features, settings.hidden, settings.bottleneck, settings.divergence, key=key)
         case Decoder.AREL:
             decoder = AREL(features, steps, key=key)
         case Decoder.STAS:
@@ -131,7 +133,7 @@ def update(
     def loss_of(decoder: Network) -> Float[Array, ""]:
         decoded = decode(decoder, state, episodes.features, settings, key)
         r_hat = jnp.mean(decoded.r_hat.reshape(len(episodes.features), -1), axis=1)
-        return losses_of(r_hat) + decoded.penalty
+        return losses_of(r_hat) + decoded.penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
 
     def losses_of(r_hat: Float[Array, " rows"]) -> Float[Array, ""]:
         if fit is Fit.ALL_STEPS:

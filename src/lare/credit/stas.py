@@ -30,6 +30,11 @@ def dropout(x: Float[Array, "..."], key: PRNGKeyArray | None) -> Float[Array, ".
     return x * jax.random.bernoulli(key, 1 - DROPOUT, x.shape) / (1 - DROPOUT)
 
 
+def gelu(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """X times the probability that a standard normal is less (Hendrycks and Gimpel, 2016), not approximated."""
+    return jax.nn.gelu(x, approximate=False)
+
+
 def heads(x: Float[Array, "*batch size"]) -> Float[Array, "*batch heads part"]:
     return x.reshape(*x.shape[:-1], HEADS, SIZE // HEADS)
 
@@ -47,7 +52,7 @@ class TimeLayer(eqx.Module):
     def __init__(self, *, key: PRNGKeyArray):
         *keys, last = jax.random.split(key, 5)
         self.query, self.key, self.value, self.merge = (Linear(SIZE, SIZE, key=key) for key in keys)
-        self.feed_forward = MLP(SIZE, (SIZE,), SIZE, key=last, activation=jax.nn.gelu)
+        self.feed_forward = MLP(SIZE, (SIZE,), SIZE, key=last, activation=gelu)
         self.norms = LayerNorm(SIZE, 1e-12), LayerNorm(SIZE, 1e-12)
 
     def __call__(
@@ -64,15 +69,15 @@ class TimeLayer(eqx.Module):
 class Coalitions(eqx.Module):
     """Attention over agents, each with queries of its own, as the mean over random coalitions."""
 
-    query: Float[Array, "agents size size"]
+    query: Linear
+    """One for each agent, stacked."""
     key: Linear
     value: Linear
     merge: Linear
 
     def __init__(self, agents: int, *, key: PRNGKeyArray):
         query_key, *keys = jax.random.split(key, 4)
-        bound = SIZE**-0.5
-        self.query = jax.random.uniform(query_key, (agents, SIZE, SIZE), minval=-bound, maxval=bound)
+        self.query = eqx.filter_vmap(lambda key: Linear(SIZE, SIZE, key=key))(jax.random.split(query_key, agents))
         self.key, self.value, self.merge = (Linear(SIZE, SIZE, key=key) for key in keys)
 
     def __call__(
@@ -82,14 +87,14 @@ class Coalitions(eqx.Module):
         parts: list[PRNGKeyArray | None] = [None] * COALITIONS
         if drop is not None:
             last, *parts = jax.random.split(drop, 1 + COALITIONS)
-        query = heads(jnp.einsum("...ad,ade->...ae", x, self.query))
+        query = heads(jnp.einsum("...ad,ade->...ae", x, self.query.weight) + self.query.bias)
         keys, values = heads(self.key(x)), heads(self.value(x))
         joined = jax.random.bernoulli(key, 0.5, (COALITIONS, agents, agents)) | jnp.eye(agents, dtype=bool)
         found = [
             attend(query, keys, values, mask, partial(dropout, key=part))
             for mask, part in zip(joined, parts, strict=True)
         ]
-        return dropout(self.merge(jnp.mean(jnp.stack(found), axis=0)), last)
+        return jnp.mean(dropout(self.merge(jnp.stack(found)), last), axis=0)
 
 
 class STAS(eqx.Module):

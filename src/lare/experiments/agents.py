@@ -17,6 +17,7 @@ from lare.tasks.particles import drawing
 from lare.tasks.particles.table import find_particle_task
 from lare.tasks.particles.task import STEPS, Team
 from lare.training import teams
+from lare.training.environments import Stream
 from lare.training.many_agents import Session, load_learner, restore
 from lare.training.run import Run
 from lare.training.seeds import seed_keys
@@ -67,11 +68,10 @@ def first_seed(learner: Learner) -> Learner:
 def returns(run: Run, episodes: int) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
     """The sum over its agents of the true rewards, for each team, by its name."""
     recipe, learner, _, _ = load_learner(run)
-    play = jax.jit(jax.vmap(partial(teams.play, count=episodes, recipe=recipe)))
-    keys = seed_keys(jnp.asarray(run.seeds), 0)
-    earned = np.asarray(play(learner.algorithm.online.actor, keys).reward).sum(axis=1)
+    keys = seed_keys(jnp.asarray(run.seeds), Stream.EVALUATION_EPISODES + 1)  # from the starts of its evaluations
+    played = teams.compiled(recipe).play(learner.algorithm.online.actor, keys, episodes)
     return {
-        role.name: earned[..., team.start : team.stop].sum(axis=-1)
+        role.name: np.asarray(teams.returns(played.reward, team))
         for role, team in zip(run.config.task.roles, recipe.task.teams, strict=True)
     }
 
@@ -163,8 +163,10 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
     """Let the first team of each run meet the other team of each: four matches, all from the same starts.
 
     Raises:
-        LareError: the runs are not of one task with two teams.
+        LareError: the runs are not of one task with two teams, or there is to be no episode.
     """
+    if episodes < 1:
+        raise LareError(f"episodes = {episodes}: at least one is needed")
     names = {run.config.task.name for run in runs}
     if len(names) > 1 or len(runs[0].config.task.teams) != 2:
         raise LareError(
@@ -176,8 +178,7 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
 
     @jax.jit
     def total(mixed: Mixed, key: PRNGKeyArray) -> Float[Array, ""]:
-        reward = teams.play(mixed, key, episodes, recipe).reward
-        return jnp.sum(reward[..., :stop]) / episodes
+        return jnp.mean(teams.returns(teams.play(mixed, key, episodes, recipe).reward, recipe.task.teams[0]))
 
     def policies(place: int) -> list[Policy]:
         actors = loaded[place][1].algorithm.online.actor

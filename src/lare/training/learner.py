@@ -21,7 +21,7 @@ from lare.algorithms import ppo, td3
 from lare.credit import accuracy, decomposition
 from lare.credit.decomposition import CreditSettings, Decomposition, Episodes
 from lare.credit.methods import Encoder, Fit, Method, Reward
-from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe, observe_scale
+from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe_scale
 from lare.training import replay
 from lare.training.replay import Draw, Replay, Step
 
@@ -117,11 +117,7 @@ def store(learner: Learner, steps: Step, recipe: Recipe) -> Learner:
     if credit is not None:
         credit = decomposition.observe_steps(credit, features(steps, recipe.method))
         credit = decomposition.observe_returns(credit, mean_reward, finished)
-    observations = learner.observations
-    if observations is not None:
-        observations = observe(observations, jnp.asarray(steps.observation))
-    scale = observe_scale(learner.scale, mean_reward, finished)
-    return learner._replace(credit=credit, scale=scale, observations=observations, replay=held)
+    return learner._replace(credit=credit, scale=observe_scale(learner.scale, mean_reward, finished), replay=held)
 
 
 class CreditDraws(NamedTuple):

@@ -16,7 +16,7 @@ from lare.training.environments import Stream
 from lare.training.run import Run
 from lare.training.seeds import lines, seed_keys
 from lare.training.settings import Plan
-from lare.training.teams import Compiled, Learner, Played, Recipe, compiled, init
+from lare.training.teams import Compiled, Learner, Played, Recipe, compiled, init, returns
 
 
 @dataclass
@@ -45,7 +45,8 @@ class Session:
     def advance(self) -> None:
         """One update: play, factors, replay, sometimes the decoder, the policy."""
         number = self.step // self.settings.turn
-        played = self.functions.play(self.learner.algorithm.online.actor, self.keys(Stream.TRAINING_EPISODES, number))
+        keys = self.keys(Stream.TRAINING_EPISODES, number)
+        played = self.functions.play(self.learner.algorithm.online.actor, keys, self.settings.agents.episodes)
         factors = self.factors(played)
         self.learner = self.functions.store(self.learner, played, factors)
         if self.learner.credit and number % self.recipe.agents.fit_every == 0:
@@ -71,10 +72,16 @@ class Session:
         return found
 
     def report(self, rate: float) -> list[dict[str, Any]]:
-        """Evaluate, always from the same starts; one line of metrics.jsonl for each seed."""
-        measured = self.functions.evaluate(
-            self.learner.algorithm.online.actor, self.keys(Stream.EVALUATION_EPISODES, 0)
-        )
+        """Evaluate, always from the same starts; one line of metrics.jsonl for each seed.
+
+        The return is that of the first team; where there are several, each has its own beside it.
+        """
+        keys = self.keys(Stream.EVALUATION_EPISODES, 0)
+        played = self.functions.play(self.learner.algorithm.online.actor, keys, self.settings.evaluation_episodes)
+        earned = {team.name: jnp.mean(returns(played.reward, team), axis=-1) for team in self.recipe.task.teams}
+        first, *others = earned.values()
+        measured = {"evaluation/return": first}
+        measured |= {f"evaluation/return_{name}": values for name, values in earned.items() if others}
         measured |= self.functions.assess(self.learner) | self.latest
         return lines(self.run.seeds, self.step, measured, rate)
 
@@ -95,9 +102,8 @@ def recipe_for(run: Run) -> Recipe:
         task=find_particle_task(name),
         method=find_method(plan.method),
         ppo=plan.ippo,
-        agents=plan.agents,
+        agents=plan.agents.model_copy(update={"capacity": plan.episodes}),
         factors=tuple(2 * size if run.judges == "both" else size for size in sizes),
-        evaluation_episodes=plan.evaluation_episodes,
     )
 
 

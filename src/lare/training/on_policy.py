@@ -3,7 +3,8 @@
 Algorithm 1 of the LaRe paper, lines 6 to 8, for an algorithm that learns from what its newest policy met. The decoder goes
 on learning from all that is stored.
 
-Observations reach the networks by their running mean and deviation, the newest steps included.
+Observations reach the networks by their running mean and deviation; those of a rollout are taken in when it has been learned
+from, so that the policy that is updated is the policy that acted.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 from lare.algorithms import ppo
 from lare.algorithms.ppo import Policy
 from lare.credit.decomposition import Decomposition
-from lare.normalise import Moments, standardise
+from lare.normalise import Moments, observe, standardise
 from lare.training import learner as common
 from lare.training import replay
 from lare.training.learner import Compiled, CreditDraws, Learner, Recipe, draw_credit, rewards
@@ -45,15 +46,25 @@ def fit(learner: Learner, key: PRNGKeyArray, recipe: Recipe) -> tuple[Learner, d
     return learner._replace(credit=credit), jax.tree.map(jnp.mean, measured)
 
 
+def seen(observation: Float[Array, "*batch observation"], moments: Moments) -> Float[Array, "*batch observation"]:
+    """Observations as the networks get them: as they are, as long as there are no statistics."""
+    return jnp.where(moments.seen > 0, standardise(moments, observation), observation)
+
+
+def newest(held: replay.Replay, recipe: Recipe) -> Int[Array, " time"]:
+    """Numbers of the steps of the last rollout."""
+    return held.transitions - recipe.turn + jnp.arange(recipe.turn)
+
+
 def rollout(learner: Learner, recipe: Recipe) -> ppo.Rollout:
     """The newest steps of the replay, a single lane, with what the method pays for them."""
     held, (_, moments) = learner.replay, actor_of(learner)
-    number = held.transitions - recipe.turn + jnp.arange(recipe.turn)
+    number = newest(held, recipe)
     steps = replay.read(held, number)
     # Where a step's successor belongs to another episode, or to none yet, its own has ended.
     episode = held.episode[number % replay.capacity(held)]
     ended = jnp.append(episode[1:] != episode[:-1], ~held.running)
-    before, after = (standardise(moments, rows) for rows in (steps.observation, steps.next_observation))
+    before, after = (seen(rows, moments) for rows in (steps.observation, steps.next_observation))
     reward = rewards(steps, learner, recipe)
     row = ppo.Rollout(before, steps.action, reward, after, steps.continues, ended.astype(jnp.float32))
     return jax.tree.map(lambda leaf: leaf[:, None], row)
@@ -69,13 +80,15 @@ def improve(
     algorithm, (learner, fitted) = learner.algorithm, fit(learner, fit_key, recipe)
     left = 1 - done / recipe.steps
     algorithm, improved = ppo.update(algorithm, rollout(learner, recipe), key, left, recipe.algorithm)
-    return learner._replace(algorithm=algorithm), fitted | improved
+    _, moments = actor_of(learner)
+    taken_in = observe(moments, replay.read(learner.replay, newest(learner.replay, recipe)).observation)
+    return learner._replace(algorithm=algorithm, observations=taken_in), fitted | improved
 
 
 def act(actor: Actor, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch action"]:
     """The likeliest action."""
     policy, moments = actor
-    return policy.mode(standardise(moments, observation))
+    return policy.mode(seen(observation, moments))
 
 
 def explore(
@@ -83,7 +96,7 @@ def explore(
 ) -> Float[Array, " action"]:
     """An action of the policy, drawn by given noise."""
     policy, moments = actor
-    return policy.drawn(standardise(moments, observation), noise)
+    return policy.drawn(seen(observation, moments), noise)
 
 
 def noise(random: Sequence[np.random.Generator], recipe: Recipe) -> Float[np.ndarray, "time seeds action"]:

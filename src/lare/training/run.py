@@ -61,8 +61,12 @@ def describe(task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) ->
     longest = time_limit(task)
     if plan.algorithm != "ippo" and plan.rows < longest + 2:
         raise LareError(f"capacity = {plan.rows} is too small: an episode of {task.name} takes up to {longest + 1}")
-    if plan.algorithm == "ppo" and plan.rows < 2 * plan.turn + longest:
-        raise LareError(f"capacity = {plan.rows} is too small: a rollout takes up to {2 * plan.turn + longest}")
+    if plan.algorithm == "ppo" and plan.capacity < 2 * plan.turn + longest:
+        raise LareError(f"capacity = {plan.capacity} is too small: a rollout takes up to {2 * plan.turn + longest}")
+    if plan.algorithm == "ippo" and plan.agents.capacity < plan.agents.episodes:
+        raise LareError(
+            f"agents.capacity = {plan.agents.capacity} is less than the {plan.agents.episodes} episodes of an update"
+        )
     return Config(
         lare=lare.__version__,
         settings=plan,

@@ -9,6 +9,7 @@ from lare.algorithms.td3 import TD3Settings
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
 from lare.errors import Checked, LareError
+from lare.tasks.particles.task import STEPS
 from lare.tasks.spec import Judges, TaskSpec
 
 LARGEST_SEED = 2**31 - 1
@@ -61,7 +62,7 @@ class Settings(Checked):
     """What `lare train` and `lare.train` are given. What is None is decided by the task and the algorithm."""
 
     method: str | None = None
-    """How credit is assigned (see `lare methods`); lare-rrdu for td3, lare-rd for ippo, unless given."""
+    """How credit is assigned (see `lare methods`); lare-rrdu for a single agent, lare-rd for many, unless given."""
     algorithm: Algorithm | None = None
     """The reinforcement learning algorithm: ippo for tasks of many agents, td3, or ppo, for all others."""
     steps: Annotated[int | None, Field(ge=1)] = None
@@ -119,20 +120,21 @@ class Plan(Settings):
             ("td3.warmup", self.td3.warmup if self.algorithm == "td3" else 0),
         ):
             if steps % self.turn:
-                raise ValueError(f"{name} = {steps} is not a multiple of {self.what_a_turn_is}")
+                near = max(1, round(steps / self.turn)) * self.turn
+                raise ValueError(f"{name} = {steps} is not a multiple of {self.what_a_turn_is}: take {near}")
         return self
 
     @property
     def turn(self) -> int:
         """Environment steps of a seed between two calls of the compiled training step."""
-        return {"td3": self.chunk, "ppo": self.rollout.steps, "ippo": self.agents.episodes * EPISODE}[self.algorithm]
+        return {"td3": self.chunk, "ppo": self.rollout.steps, "ippo": self.agents.episodes * STEPS}[self.algorithm]
 
     @property
     def what_a_turn_is(self) -> str:
         return {
             "td3": f"chunk = {self.chunk}",
             "ppo": f"rollout.steps = {self.rollout.steps}",
-            "ippo": f"{self.agents.episodes} episodes of {EPISODE} steps",
+            "ippo": f"{self.turn} (agents.episodes = {self.agents.episodes}, of {STEPS} steps each)",
         }[self.algorithm]
 
     @property
@@ -141,13 +143,14 @@ class Plan(Settings):
         return {"td3": self.td3, "ppo": self.ppo, "ippo": self.ippo}[self.algorithm]
 
     @property
+    def episodes(self) -> int:
+        """Episodes of many agents to make room for: no more than the run can fill, and at least those of an update."""
+        return min(self.agents.capacity, self.steps // STEPS)
+
+    @property
     def rows(self) -> int:
         """Observations to make room for: no more than the run can fill."""
         return min(self.capacity, 2 * self.steps + 2)
-
-
-EPISODE = 25
-"""Steps in an episode of every particle task."""
 
 
 def decide(settings: Settings, task: TaskSpec) -> Plan:
@@ -170,7 +173,7 @@ def decide(settings: Settings, task: TaskSpec) -> Plan:
         turn = settings.rollout.steps
         usual |= {"steps": max(1, 1_000_000 // turn) * turn, "evaluate_every": 5 * turn}
     if algorithm == "ippo":
-        turn = settings.agents.episodes * EPISODE
+        turn = settings.agents.episodes * STEPS
         usual |= {"method": "lare-rd", "steps": 1000 * turn, "evaluate_every": 10 * turn, "evaluation_episodes": 50}
     given = {name: getattr(settings, name) for name in type(settings).model_fields}
     plan = Plan(**usual | {name: value for name, value in given.items() if value is not None})

@@ -42,7 +42,6 @@ class Recipe:
     agents: AgentSettings
     factors: tuple[int, ...]
     """Of each team's latent function; empty for a method that needs none."""
-    evaluation_episodes: int
 
     @property
     def features(self) -> tuple[int, ...]:
@@ -164,7 +163,7 @@ def store(learner: Learner, played: Played, factors: Array, recipe: Recipe) -> L
 def fit(
     learner: Learner, key: PRNGKeyArray, recipe: Recipe
 ) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
-    """Some updates of every team's decoder, each on episodes of its own; the mean of each metric over them."""
+    """Some updates of every team's decoder, each on episodes drawn anew; the mean of each metric over them."""
     assert recipe.method.fit is not None
     held, settings, way = learner.replay, recipe.agents.credit, recipe.method.fit
     count = max(1, settings.steps // STEPS)
@@ -235,7 +234,7 @@ def assess(learner: Learner, recipe: Recipe) -> dict[str, Float[Array, ""]]:
     """How near the newest decoders' proxy rewards come to the true ones, over the episodes of the newest update."""
     if not learner.credit:
         return {}
-    newest = replay.newest(learner.replay, min(recipe.agents.episodes, recipe.agents.capacity))
+    newest = replay.newest(learner.replay, recipe.agents.episodes)
     reward = learner.replay.reward[newest]
     r_hat = rewards(learner, learner.replay.features[newest], reward, recipe).ravel()
     everything = jnp.ones(r_hat.shape, bool)
@@ -245,41 +244,36 @@ def assess(learner: Learner, recipe: Recipe) -> dict[str, Float[Array, ""]]:
     }
 
 
-def evaluate(policy: Policy, key: PRNGKeyArray, recipe: Recipe) -> dict[str, Float[Array, ""]]:
-    """Mean true return of each team, the sum over its agents; the first team's is also the return."""
-    reward = play(policy, key, recipe.evaluation_episodes, recipe).reward
-    first, *others = recipe.task.teams
-
-    def total(team: Team) -> Float[Array, ""]:
-        return jnp.sum(reward[..., team.start : team.stop]) / recipe.evaluation_episodes
-
-    named = {f"evaluation/return_{team.name}": total(team) for team in (first, *others) if others}
-    return {"evaluation/return": total(first)} | named
+def returns(reward: Float[Array, "*seeds steps episodes agents"], team: Team) -> Float[Array, "*seeds episodes"]:
+    """True returns of a team: the sums over its agents."""
+    return jnp.sum(reward[..., team.start : team.stop], axis=(-3, -1))
 
 
 class Compiled(NamedTuple):
     """The functions of a run, compiled, with a leading seed axis on every array but `left`."""
 
     play: Callable[..., Played]
+    """From policies, keys, and how many episodes of each."""
     store: Callable[..., Learner]
     fit: Callable[..., tuple[tuple[Decomposition, ...], dict[str, Float[Array, " seeds"]]]]
     improve: Callable[..., tuple[Learner, dict[str, Float[Array, " seeds"]]]]
     assess: Callable[..., dict[str, Float[Array, " seeds"]]]
-    evaluate: Callable[..., dict[str, Float[Array, " seeds"]]]
 
 
 def compiled(recipe: Recipe) -> Compiled:
     """`store` and `improve` consume the learner that they are given: its memory holds the new one."""
+
+    def play_all(policy: Policy, keys: Key[Array, " seeds"], count: int) -> Played:
+        return jax.vmap(partial(play, count=count, recipe=recipe))(policy, keys)
 
     def fit_in_turn(learner: Learner, keys: Key[Array, " seeds"]):
         # A batch of 256 episodes fills the caches as it is: in lockstep the seeds would only be in each other's way.
         return jax.lax.map(lambda one: fit(one[0], one[1], recipe), (learner, keys))
 
     return Compiled(
-        play=jax.jit(jax.vmap(partial(play, count=recipe.agents.episodes, recipe=recipe))),
+        play=jax.jit(play_all, static_argnums=2),
         store=jax.jit(jax.vmap(partial(store, recipe=recipe)), donate_argnums=0),
         fit=jax.jit(fit_in_turn),
         improve=jax.jit(jax.vmap(partial(improve, recipe=recipe), in_axes=(0, 0, 0, 0, None)), donate_argnums=0),
         assess=jax.jit(jax.vmap(partial(assess, recipe=recipe))),
-        evaluate=jax.jit(jax.vmap(partial(evaluate, recipe=recipe))),
     )
