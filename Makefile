@@ -12,7 +12,7 @@ demo: setup ## Train HalfCheetah on episodic rewards with recorded replies, and 
 	@$(BIN)/lare report runs/demo
 
 test: check ## Lint, format, types, tests
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: setup
 	$(BIN)/ruff check .

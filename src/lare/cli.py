@@ -246,14 +246,15 @@ def cross_play(
     runs = open_run(first), open_run(second)
     matches = play(runs, episodes)
     ours, theirs = (role.name.removeprefix(f"{runs[0].config.task.name}-") for role in runs[0].config.task.roles)
-    named = [f"{run.config.settings.method} ({run.directory})" for run in runs]
-    table = Table(f"return of the {ours}s", *(f"{theirs}s of {name}" for name in named), box=None, pad_edge=False)
-    for name, row in zip(named, (matches[:2], matches[2:]), strict=True):
+    table = Table(f"{ours} of, against {theirs} of", str(first), str(second), box=None, pad_edge=False)
+    for name, row in zip((first, second), (matches[:2], matches[2:]), strict=True):
         shown = (f"{match.returns.mean():.1f} ± {match.returns.std(ddof=match.returns.size > 1):.1f}" for match in row)
-        table.add_row(f"{ours}s of {name}", *shown)
+        table.add_row(str(name), *shown)
     Console().print(table)
-    pairs = matches[0].returns.size
-    say(f"mean ± standard deviation over {pairs} {'pairs' if pairs > 1 else 'pair'} of seeds, {episodes} episodes each")
+    say(
+        f"Returns of the {ours} team: mean ± standard deviation over all pairs of a seed of one run and a seed of the other, "
+        f"{episodes} episodes each."
+    )
 
 
 def report(

@@ -84,9 +84,9 @@ def test_cross_play_needs_two_teams_of_one_task(runs):
 def test_cross_play_on_the_command_line(runs, command):
     status, out, err = command("cross-play", runs[0].directory, runs[1].directory, "--episodes", 3)
     assert (status, err) == (0, "")
-    assert out.count(" ± ") == 4
-    assert out.startswith("return of the predators")
-    assert out.endswith("mean ± standard deviation over 4 pairs of seeds, 3 episodes each\n")
+    assert out.count(" ± ") == 5  # four, and the line that says what they are
+    assert out.startswith("predator of, against prey of")
+    assert out.endswith("over all pairs of a seed of one run and a seed of the other, 3 episodes each.\n")
     status, out, err = command("cross-play", runs[0].directory, runs[2].directory)
     assert (status, out) == (2, "")
     assert err.startswith("lare: cross-play needs two runs of one task in which two teams learn, and these are of ")
@@ -108,7 +108,8 @@ def test_a_film_of_a_run(runs, tmp_path):
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF8")
 
 
-def test_the_report(runs, tmp_path):
+def test_the_report(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr("lare.experiments.agents_report.PICTURED", 100)
     page = lare.write_report([run.directory for run in runs], tmp_path / "report.html").read_text()
     assert page.count("data:image/gif;base64,") == 3
     for heading in (

@@ -2,6 +2,7 @@
 
 import signal
 
+import jax
 import numpy as np
 import pytest
 
@@ -20,6 +21,8 @@ OF_CHOICE = "TriangleArea"
 
 def check(run, teams):
     lines = run.metrics()
+    learner = many_agents.load_learner(run)[1]
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((learner.algorithm, learner.credit)))
     assert [(line["step"], line["seed"]) for line in lines] == [(step, seed) for step in (100, 200) for seed in (0, 1)]
     keys = ["evaluation/return", *(f"evaluation/return_{team}" for team in teams)]
     assert all(np.isfinite(line[key]) for line in lines for key in keys)

@@ -13,6 +13,11 @@ def test_a_single_agent_gets_td3():
     assert (plan.algorithm, plan.method, plan.steps, plan.evaluate_every) == ("td3", "lare-rrdu", 1_000_000, 5000)
 
 
+def test_a_single_agent_that_chooses_gets_ppo():
+    plan = decide(Settings(), toy_spec(environment="toys/Pick-v0", observation_size=4, action_size=4))
+    assert (plan.algorithm, plan.method, plan.steps, plan.evaluate_every) == ("ppo", "lare-rrdu", 1_000_000, 10_000)
+
+
 def test_many_agents_get_ippo():
     plan = decide(Settings(), read_task("CN-6"))
     assert (plan.algorithm, plan.method, plan.steps, plan.turn) == ("ippo", "lare-rd", 2_050_000, 2050)

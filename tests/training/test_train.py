@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -17,7 +18,7 @@ from lare.algorithms.td3 import TD3Settings
 from lare.credit.methods import TABLE, Encoder
 from lare.errors import LareError
 from lare.latent.function import verified
-from lare.training import checkpoint
+from lare.training import checkpoint, single_agent
 from lare.training.environments import EnvironmentFault
 from lare.training.run import open_run
 from lare.training.settings import RolloutSettings
@@ -37,6 +38,8 @@ def test_every_method_trains_and_reports(method, algorithm, small, phi, tmp_path
         (s, seed) for s in (60, 120, 180, 240) for seed in (0, 1)
     ]
     assert all(np.isfinite(line["evaluation/return"]) for line in lines)
+    learner = single_agent.load_learner(run)[1]
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((learner.algorithm, learner.credit)))
     has_decoder = any(row.name == method and row.encoder for row in TABLE)
     assert ("credit/error" in lines[-1]) == ("credit/correlation" in lines[-1]) == has_decoder
     assert (run.directory / "latent_function.py").exists() == any(

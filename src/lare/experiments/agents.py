@@ -15,13 +15,13 @@ from lare.errors import LareError
 from lare.experiments.credit import correlations
 from lare.tasks.particles import drawing
 from lare.tasks.particles.table import find_particle_task
-from lare.tasks.particles.task import STEPS, Team
+from lare.tasks.particles.task import Team
 from lare.training import teams
 from lare.training.environments import Stream
 from lare.training.many_agents import Session, load_learner, restore
 from lare.training.run import Run
 from lare.training.seeds import seed_keys
-from lare.training.teams import Learner, Played, Recipe
+from lare.training.teams import Learner, Played
 
 SAMPLED = 40
 """Episodes for statistics."""
@@ -87,30 +87,16 @@ def watch(run: Run, key: int = 0) -> Watched:
     """Play one episode."""
     session, _ = restore(run)
     recipe, learner = session.recipe, first_seed(session.learner)
-    played, position = play_and_look(learner.algorithm.online.actor, jax.random.key(key), recipe)
+    play = jax.jit(partial(teams.play, count=1, recipe=recipe))
+    played = play(learner.algorithm.online.actor, jax.random.key(key))
     proxy = None
     if learner.credit:
         factors = factors_of(session, played)
         rows = teams.features(played, jnp.asarray(factors), recipe)
-        r_hat = teams.rewards(learner, rows, jnp.swapaxes(played.reward, 0, 1), recipe)
+        reward = jnp.swapaxes(played.reward, 0, 1)
+        r_hat = jax.jit(partial(teams.rewards, recipe=recipe))(learner, rows, reward)
         proxy = np.asarray(r_hat)[0]
-    return Watched(np.asarray(position), np.asarray(played.reward)[:, 0], proxy)
-
-
-def play_and_look(policy: Policy, key: PRNGKeyArray, recipe: Recipe) -> tuple[Played, Float[Array, "steps entities 2"]]:
-    """One episode, and where everything was after each of its steps."""
-    task = recipe.task
-    start_key, *keys = jax.random.split(key, 1 + 2 * STEPS)
-    step, observe, reward = jax.jit(task.step), jax.jit(task.observe), jax.jit(task.reward)
-    state = jax.jit(task.reset)(start_key)
-    rows, position = [], []
-    for action_key, step_key in zip(keys[:STEPS], keys[STEPS:], strict=True):
-        before = observe(state)
-        action = policy.sample(teams.seen(before, recipe), action_key)
-        state = step(state, jnp.argmax(action, axis=-1), step_key)
-        rows.append(Played(before, action, observe(state), reward(state)))
-        position.append(state.position)
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[:, None], *rows), jnp.stack(position)
+    return Watched(np.asarray(played.position)[:, 0], np.asarray(played.reward)[:, 0], proxy)
 
 
 def factors_of(session: Session, played: Played) -> Float[np.ndarray, "steps episodes agents factors"]:

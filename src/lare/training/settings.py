@@ -10,7 +10,7 @@ from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
 from lare.errors import Checked, LareError
 from lare.tasks.particles.task import STEPS
-from lare.tasks.spec import Judges, TaskSpec
+from lare.tasks.spec import Judges, TaskSpec, is_discrete
 
 LARGEST_SEED = 2**31 - 1
 
@@ -64,7 +64,8 @@ class Settings(Checked):
     method: str | None = None
     """How credit is assigned (see `lare methods`); lare-rrdu for a single agent, lare-rd for many, unless given."""
     algorithm: Algorithm | None = None
-    """The reinforcement learning algorithm: ippo for tasks of many agents, td3, or ppo, for all others."""
+    """The reinforcement learning algorithm: ippo for tasks of many agents, ppo for one that chooses among
+    actions, td3 for all others."""
     steps: Annotated[int | None, Field(ge=1)] = None
     """Environment steps of each seed (all agents act in one): 1,000,000 for a single agent, 2,050,000 for ippo."""
     seeds: Annotated[int, Field(ge=1)] = 1
@@ -162,7 +163,7 @@ def decide(settings: Settings, task: TaskSpec) -> Plan:
     if task.whole is not None:
         raise LareError(f"{task.name} is one team of {task.whole}: train that")
     many = task.particles is not None
-    algorithm = settings.algorithm or ("ippo" if many else "td3")
+    algorithm = settings.algorithm or ("ippo" if many else "ppo" if is_discrete(task) else "td3")
     if many != (algorithm == "ippo"):
         raise LareError(
             f"{algorithm} is for {'many agents' if algorithm == 'ippo' else 'a single agent'}, and {task.name} is a task "

@@ -80,6 +80,8 @@ class Played(NamedTuple):
     next_observation: Float[Array, "*seeds steps episodes agents observation"]
     reward: Float[Array, "*seeds steps episodes agents"]
     """True."""
+    position: Float[Array, "*seeds steps episodes entities 2"]
+    """Of everything, after each step."""
 
 
 def init(key: PRNGKeyArray, recipe: Recipe) -> Learner:
@@ -120,7 +122,7 @@ def play(policy: Any, key: PRNGKeyArray, count: int, recipe: Recipe) -> Played:
         keys = jax.random.split(step_key, count)
         state = jax.vmap(task.step)(state, jnp.argmax(action, axis=-1), keys)
         after = jax.vmap(task.observe)(state)
-        return (state, after), Played(observation, action, after, jax.vmap(task.reward)(state))
+        return (state, after), Played(observation, action, after, jax.vmap(task.reward)(state), state.position)
 
     return jax.lax.scan(one, (start, jax.vmap(task.observe)(start)), jax.random.split(key, STEPS))[1]
 
