@@ -85,9 +85,7 @@ def test_judges(judges, small, phi, tmp_path):
         assert z[0, column] == pytest.approx(-((2 * action[0, 0] - observation[row, 0]) ** 2), rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "method"), [("td3", "rd"), ("td3", "lare-rrdu"), ("ppo", "rrdu")]
-)
+@pytest.mark.parametrize(("algorithm", "method"), [("td3", "rd"), ("td3", "lare-rrdu"), ("ppo", "rrdu")])
 def test_a_killed_run_resumes_bit_for_bit(algorithm, method, small, phi, tmp_path):
     """SIGKILL in a process of its own, in the middle of an episode and between two checkpoints."""
     settings = small(method=method, algorithm=algorithm, rollout=RolloutSettings(steps=12, fit_updates=2))
