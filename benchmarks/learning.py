@@ -80,7 +80,9 @@ def keep(directory: Path) -> None:
     for metrics in sorted(directory.glob("*/*/metrics.jsonl")):
         place = KEPT / metrics.parent.relative_to(directory)
         config, lines = read(metrics.parent)
-        if lines and lines[-1]["step"] == config["settings"]["steps"]:
+        settings = config["settings"]
+        ended = {line["seed"] for line in lines if line["step"] == settings["steps"]}
+        if len(ended) == settings["seeds"]:
             place.mkdir(parents=True, exist_ok=True)
             for name in ("config.json", "metrics.jsonl"):
                 shutil.copyfile(metrics.parent / name, place / name)

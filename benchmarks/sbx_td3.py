@@ -56,7 +56,11 @@ def main(
     """
     out.mkdir(parents=True)
     (out / "config.json").write_text(
-        json.dumps({"algorithm": "SBX TD3", "task": task, **provenance()}, indent=1) + "\n"
+        json.dumps(
+            {"algorithm": "SBX TD3", "task": task, "settings": {"steps": steps, "seeds": seeds}, **provenance()},
+            indent=1,
+        )
+        + "\n"
     )
     environment = gymnasium.make(task)
     assert isinstance(environment.action_space, gymnasium.spaces.Box)
