@@ -24,7 +24,7 @@ def main(directories: list[str]) -> None:
             for role, taken in zip(run.config.task.roles, sample(run, random=random), strict=True):
                 of_each = {
                     "observation": correlations(taken.observation, taken.reward),
-                    "factors": correlations(taken.factors, taken.reward),
+                    "factors": taken.correlations,
                 }
                 figures = {name: round(float(np.nanmean(np.abs(values))), 3) for name, values in of_each.items()}
                 figures["best factor"] = round(float(np.nanmax(np.abs(of_each["factors"]))), 3)

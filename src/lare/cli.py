@@ -245,7 +245,8 @@ def cross_play(
 
     runs = open_run(first), open_run(second)
     matches = play(runs, episodes)
-    ours, theirs = (role.name.removeprefix(f"{runs[0].config.task.name}-") for role in runs[0].config.task.roles)
+    task = runs[0].config.task
+    ours, theirs = (task.team(role) for role in task.teams)
     table = Table(f"{ours} of, against {theirs} of", str(first), str(second), box=None, pad_edge=False)
     for name, row in zip((first, second), (matches[:2], matches[2:]), strict=True):
         shown = (f"{match.returns.mean():.1f} ± {match.returns.std(ddof=match.returns.size > 1):.1f}" for match in row)

@@ -20,8 +20,8 @@ from lare.training import teams
 from lare.training.environments import Stream
 from lare.training.many_agents import Session, load_learner, restore
 from lare.training.run import Run
-from lare.training.seeds import seed_keys
-from lare.training.teams import Learner, Played
+from lare.training.seeds import of_seed, seed_keys
+from lare.training.teams import Played
 
 SAMPLED = 40
 """Episodes for statistics."""
@@ -61,10 +61,6 @@ class Sample:
         return correlations(self.factors, self.reward)
 
 
-def first_seed(learner: Learner) -> Learner:
-    return jax.tree.map(lambda leaf: leaf[0], learner)
-
-
 def returns(run: Run, episodes: int) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
     """The sum over its agents of the true rewards, for each team, by its name."""
     recipe, learner, _, _ = load_learner(run)
@@ -86,7 +82,7 @@ def frames(run: Run) -> list[UInt8[np.ndarray, "height width 3"]]:
 def watch(run: Run, key: int = 0) -> Watched:
     """Play one episode."""
     session, _ = restore(run)
-    recipe, learner = session.recipe, first_seed(session.learner)
+    recipe, learner = session.recipe, of_seed(session.learner)
     play = jax.jit(partial(teams.play, count=1, recipe=recipe))
     played = play(learner.algorithm.online.actor, jax.random.key(key))
     proxy = None
@@ -107,7 +103,7 @@ def factors_of(session: Session, played: Played) -> Float[np.ndarray, "steps epi
 def sample(run: Run, random: bool = False) -> list[Sample]:
     """Steps of each team, under the first seed's policy, or under random actions."""
     session, _ = restore(run)
-    recipe, policy = session.recipe, first_seed(session.learner).algorithm.online.actor
+    recipe, policy = session.recipe, of_seed(session.learner).algorithm.online.actor
     if random:  # a network of zeros prefers nothing
         policy = jax.tree.map(jnp.zeros_like, policy)
     played = jax.jit(partial(teams.play, count=SAMPLED, recipe=recipe))(policy, jax.random.key(1))
@@ -168,7 +164,7 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
 
     def policies(place: int) -> list[Policy]:
         actors = loaded[place][1].algorithm.online.actor
-        return [jax.tree.map(lambda leaf, seed=seed: leaf[seed], actors) for seed in range(len(runs[place].seeds))]
+        return [of_seed(actors, seed) for seed in range(len(runs[place].seeds))]
 
     matches = []
     for ours, first in enumerate(runs):

@@ -51,14 +51,13 @@ def of_team(run: Run, place: int, taken: Sample) -> Iterable[str]:
     """A team's factors and its latent function."""
     name, function = run.config.task.roles[place].name, run.functions[place]
     yield f"<h3>The factors of {escape(name)}</h3>"
+    of_factors, of_observation = taken.correlations, correlations(taken.observation, taken.reward)
     rows = [
         (factor, meaning, "-" if np.isnan(value) else f"{value:.2f}")
-        for (factor, meaning), value in zip(factor_labels(run, place), taken.correlations, strict=True)
+        for (factor, meaning), value in zip(factor_labels(run, place), of_factors, strict=True)
     ]
     yield table(("factor", "meaning, in the model's words", "correlation with the true reward"), rows, (2,))
-    raw, latent = (
-        np.nanmean(np.abs(correlations(columns, taken.reward))) for columns in (taken.observation, taken.factors)
-    )
+    raw, latent = (np.nanmean(np.abs(values)) for values in (of_observation, of_factors))
     yield note(
         f"Absolute correlation with the true reward, mean over dimensions: {raw:.2f} of the {taken.observation.shape[1]} "
         f"numbers that an agent observes, {latent:.2f} of the {taken.factors.shape[1]} factors."

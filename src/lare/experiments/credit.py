@@ -11,6 +11,7 @@ from lare.credit import decomposition
 from lare.training import replay
 from lare.training.learner import RECENT, Learner, Recipe, features
 from lare.training.run import Run
+from lare.training.seeds import of_seed
 from lare.training.single_agent import load_learner
 
 
@@ -40,21 +41,16 @@ def factor_labels(run: Run, place: int = 0) -> list[tuple[str, str]]:
 def credit_of(run: Run) -> Credit | None:
     """None for a method without a decoder, and as long as no episode has finished."""
     recipe, learner, _, _ = load_learner(run)
-    if learner.credit is None or not int(replay.finished(first_seed(learner).replay)):
+    one = of_seed(learner)
+    if one.credit is None or not int(replay.finished(one.replay)):
         return None
-    one = first_seed(learner)
     episode = one.replay.episodes - 1
     begin = int(one.replay.first[episode % len(one.replay.first)])
     steps = replay.read(one.replay, jnp.arange(begin, int(replay.end_of(one.replay, episode))))
-    assert one.credit is not None
     proxy = decomposition.proxy_rewards(one.credit, features(steps, recipe.method), recipe.credit)
     return Credit(
         np.asarray(steps.reward), np.asarray(proxy), np.asarray(steps.factors), factor_correlations(learner, recipe)
     )
-
-
-def first_seed(learner: Learner) -> Learner:
-    return jax.tree.map(lambda leaf: leaf[0], learner)
 
 
 def correlations(

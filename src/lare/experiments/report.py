@@ -16,7 +16,6 @@ from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
 from lare.experiments.credit import credit_of, factor_labels
 from lare.experiments.html import function_text, note, table
-from lare.tasks.spec import TaskSpec
 from lare.training.run import Run, open_run
 from lare.training.settings import Settings, decide
 
@@ -122,17 +121,14 @@ def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
     return table(head, rows, range(2, 7)) + note(explained)
 
 
-def team_names(task: TaskSpec) -> list[str]:
-    return [role.name.removeprefix(f"{task.name}-") for role in task.teams]
-
-
 def learning(task: str, runs: dict[str, Run]) -> Iterable[str]:
     """Curves of one task, all its runs in each."""
     yield f"<h2>Learning {escape(task)}</h2>"
     shown = ["evaluation/return", "credit/error", "credit/correlation"]
     spec = next(iter(runs.values())).config.task
     shown[1:1] = [f"evaluation/{name}" for name in spec.measures]
-    teams = {f"evaluation/return_{team}": f"true return of the team of {team}" for team in team_names(spec)}
+    names = [spec.team(role) for role in spec.teams]
+    teams = {f"evaluation/return_{team}": f"true return of the team of {team}" for team in names}
     shown[0:1] = teams or shown[0:1]
     titles = {
         **teams,

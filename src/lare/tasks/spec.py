@@ -76,6 +76,10 @@ class TaskSpec(Checked):
         """The specs that latent functions are designed for: those of the teams, or this one."""
         return self.teams or (self,)
 
+    def team(self, role: "TaskSpec") -> str:
+        """What a team is called within the task."""
+        return role.name.removeprefix(f"{self.name}-")
+
     @property
     def digest(self) -> str:
         """SHA-256 of everything that the spec says."""

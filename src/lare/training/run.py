@@ -88,7 +88,7 @@ def isolation(task: TaskSpec, function: LatentFunction) -> str:
 
 def function_file(task: TaskSpec, role: TaskSpec) -> str:
     """Where the latent function of a role is kept."""
-    return FUNCTION if role is task else f"latent_function_{role.name.removeprefix(f'{task.name}-')}.py"
+    return FUNCTION if role is task else f"latent_function_{task.team(role)}.py"
 
 
 @dataclass(frozen=True)

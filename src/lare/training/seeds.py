@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -13,6 +13,14 @@ from jaxtyping import Array, Int, Key
 def seed_keys(seeds: Int[Array, " seeds"], number: int | Array) -> Key[Array, " seeds"]:
     """A key for each seed that depends on the seed and `number` alone: there is no state to save."""
     return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), number))(seeds)
+
+
+State = TypeVar("State")
+
+
+def of_seed(state: State, place: int = 0) -> State:
+    """The part of a training state that belongs to one seed."""
+    return jax.tree.map(lambda leaf: leaf[place], state)
 
 
 def lines(seeds: Sequence[int], step: int, measured: Mapping[str, Any], rate: float) -> list[dict[str, Any]]:
