@@ -90,7 +90,8 @@ def write_video(path: Path, frames: list, fps: int) -> None:
     try:
         if path.suffix == ".gif":
             # Browsers play a GIF at 50 frames a second at most.
-            imageio.imwrite(path, frames[:: max(1, round(fps / 25))], duration=40, loop=0)
+            every = max(1, round(fps / 25))
+            imageio.imwrite(path, frames[::every], duration=1000 * every // fps, loop=0)
         else:
             imageio.imwrite(path, frames, fps=fps)
     except (OSError, ValueError, ImportError, TypeError) as error:
