@@ -75,3 +75,29 @@ def test_without_an_episode_nothing_is_learned():
     after, metrics = decomposition.update(state, episodes, KEY, Fit.ALL_STEPS, settings)
     assert float(metrics["credit/loss"]) == 0.0
     assert jax.tree.all(jax.tree.map(jnp.array_equal, state.decoder, after.decoder))
+
+
+@pytest.mark.parametrize("sum_form", [False, True], ids=["mean", "sum"])
+@pytest.mark.parametrize("method", ["rd", "rrd", "rrdu", "arel"])
+def test_a_gradient_in_parts_is_that_of_the_whole(method, sum_form):
+    agents, count, row = 3, 8, METHODS[method]
+    settings = CreditSettings(hidden=(8,), sum_form=sum_form)
+    rows = LENGTH if row.fit is Fit.ALL_STEPS else 5
+    features = jax.random.normal(KEY, (count * rows, agents, FEATURES))
+    target = jax.random.normal(KEY, (count,))
+    state = decomposition.init(KEY, FEATURES, row, settings, LENGTH, agents)
+    state = decomposition.observe_returns(state, target, jnp.ones(count, bool))
+
+    def episodes(parts):
+        episode = jnp.tile(jnp.repeat(jnp.arange(count // parts), rows), parts)
+        whole = Episodes(features, episode, jnp.full(count, LENGTH), target, jnp.ones(count))
+        return jax.tree.map(lambda leaf: leaf.reshape(parts, -1, *leaf.shape[1:]), whole)
+
+    one, _ = jax.jit(lambda: decomposition.update_in_parts(state, episodes(1), KEY, row.fit, settings))()
+    four, _ = jax.jit(lambda: decomposition.update_in_parts(state, episodes(4), KEY, row.fit, settings))()
+    assert jax.tree.map(jnp.shape, one) == jax.tree.map(jnp.shape, four)
+    for whole, parts in zip(jax.tree.leaves(one.optimizer), jax.tree.leaves(four.optimizer), strict=True):
+        np.testing.assert_allclose(whole, parts, rtol=1e-4, atol=1e-6)
+    alone, _ = decomposition.update(state, jax.tree.map(lambda leaf: leaf[0], episodes(1)), KEY, row.fit, settings)
+    for whole, parts in zip(jax.tree.leaves(one.optimizer), jax.tree.leaves(alone.optimizer), strict=True):
+        np.testing.assert_allclose(whole, parts, rtol=1e-4, atol=1e-6)

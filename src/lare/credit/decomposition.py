@@ -123,10 +123,10 @@ def proxy_rewards(
     return magnitude(state.scale) * r_hat if settings.normalise else r_hat
 
 
-def update(
+def loss_and_gradient(
     state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
-) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """One step of gradient descent on the loss that `fit` names."""
+) -> tuple[Float[Array, ""], Network]:
+    """The loss that `fit` names, and its gradient by the decoder's weights."""
     target = episodes.mean_reward / magnitude(state.scale) if settings.normalise else episodes.mean_reward
     weight = losses.episode_weight(episodes.length, episodes.counts, settings.sum_form)
 
@@ -144,7 +144,39 @@ def update(
             return losses.squared_error(jnp.mean(drawn, axis=1), target, weight)
         return losses.unbiased_squared_error(drawn, target, episodes.length, weight)
 
-    loss, gradient = jax.value_and_grad(loss_of)(state.decoder)
+    return jax.value_and_grad(loss_of)(state.decoder)
+
+
+def update(
+    state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    """One step of gradient descent."""
+    return step(state, *loss_and_gradient(state, episodes, key, fit, settings), settings)
+
+
+def update_in_parts(
+    state: Decomposition, parts: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    """One step by the mean of the gradients of several parts: equally many episodes each, all of which count.
+
+    `parts` has a leading axis. The gradient is that of all the episodes together, but no intermediate is larger than a
+    part of them, so that all stay in the processor's cache.
+    """
+    keys = jax.random.split(key, len(parts.length))
+
+    def add(total: tuple[Array, Network], part: tuple[Episodes, PRNGKeyArray]):
+        return jax.tree.map(jnp.add, total, loss_and_gradient(state, *part, fit, settings)), None
+
+    none = jnp.zeros(()), jax.tree.map(jnp.zeros_like, state.decoder)
+    total, _ = jax.lax.scan(add, none, (parts, keys))
+    loss, gradient = jax.tree.map(lambda one: one / len(keys), total)
+    return step(state, loss, gradient, settings)
+
+
+def step(
+    state: Decomposition, loss: Float[Array, ""], gradient: Network, settings: CreditSettings
+) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    """Adam by a gradient, with the decay of the weights added to it."""
     gradient = jax.tree.map(lambda slope, weight: slope + settings.weight_decay * weight, gradient, state.decoder)
     decoder, optimizer = descend(state.decoder, gradient, state.optimizer, settings.learning_rate)
     return state._replace(decoder=decoder, optimizer=optimizer), {"credit/loss": loss}
