@@ -11,7 +11,7 @@ import pytest
 
 from lare import cli
 from lare.algorithms.ppo import PPOSettings
-from lare.algorithms.td3 import TD3Settings
+from lare.algorithms.table import ALGORITHMS
 from lare.credit.decomposition import CreditSettings
 from lare.latent.function import LatentFunction, verified
 from lare.tasks.spec import TaskSpec
@@ -90,7 +90,10 @@ def small():
             "chunk": 12,
             "evaluate_every": 60,
             "evaluation_episodes": 2,
-            "td3": TD3Settings(hidden=(8,), batch_size=8, warmup=36),
+            **{
+                name: ALGORITHMS[name].settings.model_copy(update={"hidden": (8,), "batch_size": 8, "warmup": 36})
+                for name in ("td3", "ddpg", "sac")
+            },
             "ppo": PPOSettings(hidden=(8,), minibatch=16, epochs=2),
             "rollout": RolloutSettings(steps=60, fit_updates=2),
             "credit": CreditSettings(hidden=(8,), drawn_steps=4, steps=16),

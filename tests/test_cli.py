@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from lare import cli
+from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import METHODS
 from lare.latent.checks import CHECKS
 from lare.llm.prompts import candidate
@@ -38,6 +39,12 @@ def test_methods_are_listed(command):
     status, out, err = command("methods")
     assert (status, err) == (0, "")
     assert [line.split()[0] for line in out.splitlines()[1:] if not line.startswith(" ")] == list(METHODS)
+
+
+def test_algorithms_are_listed(command):
+    status, out, err = command("algorithms")
+    assert (status, err) == (0, "")
+    assert [line.split()[0] for line in out.splitlines()[1:] if not line.startswith(" ")] == list(ALGORITHMS)
 
 
 @pytest.mark.parametrize("kind", ["factors", "reward"])

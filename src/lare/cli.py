@@ -50,6 +50,19 @@ def methods() -> None:
     Console().print(table)
 
 
+def algorithms() -> None:
+    """List the reinforcement learning algorithms, and where each comes from."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from lare.algorithms.table import TABLE
+
+    table = Table("algorithm", "learns", "what it is", "source", box=None, pad_edge=False)
+    for algorithm in TABLE:
+        table.add_row(algorithm.name, algorithm.kind, algorithm.summary, algorithm.source)
+    Console().print(table)
+
+
 def prompt(task: Task, kind: Kind = "factors") -> None:
     """Print the request that a language model gets for a task.
 
@@ -339,6 +352,7 @@ DESCRIPTION = "Train reinforcement learning on episodic rewards, through latent 
 COMMANDS = {
     "tasks": tasks,
     "methods": methods,
+    "algorithms": algorithms,
     "new-task": new_task,
     "prompt": prompt,
     "design": design,

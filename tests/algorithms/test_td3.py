@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from lare.algorithms import td3
-from lare.algorithms.td3 import TD3Settings, Transitions
+from lare.algorithms.critics import Transitions
+from lare.algorithms.table import DDPG
+from lare.algorithms.td3 import TD3Settings
 
 SETTINGS = TD3Settings(hidden=(8, 8), batch_size=16)
 
@@ -63,7 +65,7 @@ def test_smoothing_noise_is_clipped(state, batch):
 
 def test_policy_and_targets_wait_for_their_turn(state, batch):
     update = jax.jit(lambda turn: td3.update(state, batch, jax.random.key(2), turn, SETTINGS)[0])
-    waited, acted = update(jnp.array(False)), update(jnp.array(True))
+    waited, acted = update(jnp.array(0)), update(jnp.array(1))
     same = lambda a, b: jax.tree.all(jax.tree.map(jnp.array_equal, a, b))  # noqa: E731
     assert same(waited.online.actor, state.online.actor)
     assert same(waited.target, state.target)
@@ -76,7 +78,7 @@ def test_policy_and_targets_wait_for_their_turn(state, batch):
 
 
 def test_critic_loss_is_the_sum_of_both_squared_errors(state, batch):
-    _, metrics = td3.update(state, batch, jax.random.key(2), jnp.array(False), SETTINGS)
+    _, metrics = td3.update(state, batch, jax.random.key(2), jnp.array(0), SETTINGS)
     y = np.asarray(td3.target_values(state.target, batch, jax.random.key(2), SETTINGS))
     x = np.concatenate([batch.observation, batch.action], axis=1)
     want = sum(((forward(one_of(state.online.critics, i), x)[:, 0] - y) ** 2).mean() for i in range(2))
@@ -93,3 +95,16 @@ def test_networks_start_as_published(state):
     weight = np.asarray(state.online.actor.layers[1].weight)
     assert np.abs(weight).max() <= 8**-0.5
     assert np.abs(weight).max() > 0.9 * 8**-0.5
+
+
+def test_ddpg_is_one_critic_without_noise_or_delay(batch):
+    settings = DDPG.model_copy(update={"hidden": (8, 8)})
+    start = td3.init(jax.random.key(0), 3, 2, settings)
+    assert {leaf.shape[0] for leaf in jax.tree.leaves(start.online.critics)} == {1}
+    y = td3.target_values(start.target, batch, jax.random.key(1), settings)
+    action = np.tanh(forward(start.target.actor, np.asarray(batch.next_observation)))
+    x = np.concatenate([batch.next_observation, action], axis=1)
+    future = forward(one_of(start.target.critics, 0), x)[:, 0]
+    np.testing.assert_allclose(y, batch.reward + 0.99 * batch.continues * future, rtol=1e-5, atol=1e-6)
+    after, _ = td3.update(start, batch, jax.random.key(2), jnp.array(0), settings)
+    assert not jax.tree.all(jax.tree.map(jnp.array_equal, after.target, start.target))

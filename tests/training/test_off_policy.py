@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lare.algorithms import td3
+from lare.algorithms.critics import Transitions
 from lare.credit.decomposition import CreditSettings
 from lare.training import learner as common
 from lare.training import off_policy, replay
@@ -24,11 +26,9 @@ def test_relabelling_is_by_the_newest_decoder():
     losses = []
     for decoder in (learner.credit, after.credit):
         reward = common.rewards(batch, learner._replace(credit=decoder), chosen)
-        seen = off_policy.td3.Transitions(
-            batch.observation, batch.action, reward, batch.next_observation, batch.continues
-        )
+        seen = Transitions(batch.observation, batch.action, reward, batch.next_observation, batch.continues)
         key = jax.random.split(noise_key, 1)[0]
-        _, measured = off_policy.td3.update(learner.algorithm, seen, key, jnp.array(False), chosen.algorithm)
+        _, measured = td3.update(learner.algorithm, seen, key, jnp.array(0), chosen.algorithm)
         losses.append(float(measured["critic/loss"]))
     assert float(metrics["critic/loss"]) == pytest.approx(losses[1], rel=1e-4)
     assert losses[0] != pytest.approx(losses[1], rel=1e-2)

@@ -14,7 +14,7 @@ import pytest
 
 import lare
 from lare.algorithms.ppo import PPOSettings
-from lare.algorithms.td3 import TD3Settings
+from lare.algorithms.table import ALGORITHMS, Kind
 from lare.credit.methods import TABLE, Encoder
 from lare.errors import LareError
 from lare.latent.function import verified
@@ -26,9 +26,10 @@ from lare.training.train import Interrupted
 from toys import PHI, At, figures, toy_spec
 
 METHODS = [method.name for method in TABLE if not method.for_many_only]
+ONE_AGENT = [row.name for row in ALGORITHMS.values() if row.kind is not Kind.MANY_AGENTS]
 
 
-@pytest.mark.parametrize("algorithm", ["td3", "ppo"])
+@pytest.mark.parametrize("algorithm", ONE_AGENT)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_trains_and_reports(method, algorithm, small, phi, tmp_path):
     settings = small(method=method, algorithm=algorithm)
@@ -85,7 +86,9 @@ def test_judges(judges, small, phi, tmp_path):
         assert z[0, column] == pytest.approx(-((2 * action[0, 0] - observation[row, 0]) ** 2), rel=1e-4)
 
 
-@pytest.mark.parametrize(("algorithm", "method"), [("td3", "rd"), ("td3", "lare-rrdu"), ("ppo", "rrdu")])
+@pytest.mark.parametrize(
+    ("algorithm", "method"), [("td3", "rd"), ("td3", "lare-rrdu"), ("ppo", "rrdu"), ("sac", "rrd")]
+)
 def test_a_killed_run_resumes_bit_for_bit(algorithm, method, small, phi, tmp_path):
     """SIGKILL in a process of its own, in the middle of an episode and between two checkpoints."""
     settings = small(method=method, algorithm=algorithm, rollout=RolloutSettings(steps=12, fit_updates=2))
@@ -274,15 +277,20 @@ def test_config_says_what_the_run_depends_on(small, phi, tmp_path):
         open_run(run.directory)
 
 
-@pytest.mark.parametrize("method", ["dense", "lare-rrdu", "lare-rd", "rrdu"])
-def test_must_learn_the_toy(method, phi, tmp_path):
+@pytest.mark.parametrize(
+    ("algorithm", "method"),
+    [*(("td3", method) for method in ("dense", "lare-rrdu", "lare-rd", "rrdu")), ("ddpg", "rrdu"), ("sac", "dense")],
+)
+def test_must_learn_the_toy(algorithm, method, phi, tmp_path):
     """A random policy gets -33 a seed, standing still -7; the optimum is 0."""
+    small = {"hidden": (32, 32), "learning_rate": 3e-3, "batch_size": 64, "gamma": 0.5, "warmup": 500}
     settings = lare.Settings(
+        algorithm=algorithm,
         method=method,
         steps=2000,
         chunk=20,
         evaluate_every=2000,
-        td3=TD3Settings(hidden=(32, 32), learning_rate=3e-3, batch_size=64, gamma=0.5, warmup=500),
+        **{algorithm: ALGORITHMS[algorithm].settings.model_copy(update=small)},
         credit=lare.training.settings.CreditSettings(hidden=(32, 32), learning_rate=3e-3, drawn_steps=8, steps=64),
     )
     run = lare.train(toy_spec(), settings, function=phi, out=tmp_path / "run", listeners=[])

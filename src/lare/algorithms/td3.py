@@ -6,19 +6,20 @@
     pi  <- ascend  mean Q_1(s, pi(s))                       every policy_delay-th update, and then
     Q', pi' <- (1 - tau) (Q', pi') + tau (Q, pi)
 
-The algorithm knows rewards, never where they come from. Actions lie in [-1, 1] in every dimension; whoever talks to the
-environment rescales them, so that the paper's noise "times the action bound" is plain noise here.
+With one critic, no noise on the target action and no delay this is DDPG (Lillicrap et al., 2016, algorithm 1), but for its
+noise on the actions that are taken, which is white here. Actions lie in [-1, 1], so that the paper's noise "times the action
+bound" is plain noise.
 """
 
 from typing import Annotated, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 from pydantic import Field
 
+from lare.algorithms.critics import Transitions, critics, squared_errors, value, values
 from lare.errors import Checked
 from lare.networks import MLP, descend, move_towards, start_adam
 
@@ -28,6 +29,8 @@ class TD3Settings(Checked):
 
     hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of actor and critics."""
+    critics: Annotated[int, Field(ge=1)] = 2
+    """How many there are; the smallest of their values counts."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Adam's step size, for actor and critics."""
     batch_size: Annotated[int, Field(ge=1)] = 256
@@ -48,21 +51,10 @@ class TD3Settings(Checked):
     """Environment steps with uniformly random actions before the first update."""
 
 
-class Transitions(NamedTuple):
-    """A batch of transitions, as an algorithm sees them."""
-
-    observation: Float[Array, "batch observation"]
-    action: Float[Array, "batch action"]
-    reward: Float[Array, " batch"]
-    next_observation: Float[Array, "batch observation"]
-    continues: Float[Array, " batch"]
-    """0 where the episode terminated, else 1: the end of the time is not a termination, the bootstrap goes on."""
-
-
 class Networks(NamedTuple):
     actor: MLP
     critics: MLP
-    """Both critics in one pytree, stacked on a leading axis of 2."""
+    """All critics in one pytree, stacked on a leading axis."""
 
 
 class TD3(NamedTuple):
@@ -78,10 +70,7 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, settings: T
     actor_key, critic_key = jax.random.split(key)
     actor = MLP(observation_size, settings.hidden, action_size, key=actor_key)
 
-    def critic(key: PRNGKeyArray) -> MLP:
-        return MLP(observation_size + action_size, settings.hidden, 1, key=key)
-
-    online = Networks(actor, eqx.filter_vmap(critic)(jax.random.split(critic_key, 2)))
+    online = Networks(actor, critics(critic_key, observation_size, action_size, settings.hidden, settings.critics))
     # The targets are copies: two names for one buffer could not be donated to the compiled update.
     target = jax.tree.map(jnp.copy, online)
     rate = settings.learning_rate
@@ -93,24 +82,20 @@ def act(actor: MLP, observation: Float[Array, "*batch observation"]) -> Float[Ar
     return jnp.tanh(actor(observation))
 
 
-def value(
-    critic: MLP, observation: Float[Array, "*batch observation"], action: Float[Array, "*batch action"]
-) -> Float[Array, "*batch"]:
-    """Q(s, a) by one critic."""
-    return critic(jnp.concatenate([observation, action], axis=-1))[..., 0]
-
-
-def values(
-    critics: MLP, observation: Float[Array, "batch observation"], action: Float[Array, "batch action"]
-) -> Float[Array, "2 batch"]:
-    """Q_1 and Q_2."""
-    return jax.vmap(value, (0, None, None))(critics, observation, action)
+def explore(
+    actor: MLP,
+    observation: Float[Array, "*batch observation"],
+    noise: Float[Array, "*batch action"],
+    settings: TD3Settings,
+) -> Float[Array, "*batch action"]:
+    """The policy, disturbed by standard normal noise."""
+    return jnp.clip(act(actor, observation) + settings.exploration_noise * noise, -1, 1)
 
 
 def target_values(
     target: Networks, batch: Transitions, key: PRNGKeyArray, settings: TD3Settings
 ) -> Float[Array, " batch"]:
-    """y: the smaller of the target critics' values, at the target policy's smoothed action."""
+    """y: the smallest of the target critics' values, at the target policy's smoothed action."""
     noise = settings.policy_noise * jax.random.normal(key, batch.action.shape)
     noise = jnp.clip(noise, -settings.noise_clip, settings.noise_clip)
     action = jnp.clip(act(target.actor, batch.next_observation) + noise, -1, 1)
@@ -119,24 +104,21 @@ def target_values(
 
 
 def update(
-    state: TD3, batch: Transitions, key: PRNGKeyArray, update_policy: Bool[Array, ""], settings: TD3Settings
+    state: TD3, batch: Transitions, key: PRNGKeyArray, number: Int[Scalar, ""], settings: TD3Settings
 ) -> tuple[TD3, dict[str, Float[Array, ""]]]:
-    """One critic update, and one of actor and targets where `update_policy` says so.
+    """One critic update, and at every `policy_delay`-th one of actor and targets.
 
-    `update_policy` is an argument, not a counter in the state, so that under `vmap` over seeds it stays one value for
+    `number`, from 0, is an argument, not a counter in the state, so that under `vmap` over seeds it stays one value for
     all of them and the delayed half is skipped rather than computed and thrown away.
     """
     rate = settings.learning_rate
     target = target_values(state.target, batch, key, settings)
 
-    def critic_loss(critics: MLP) -> Float[Array, ""]:
-        return jnp.sum(jnp.mean((values(critics, batch.observation, batch.action) - target) ** 2, axis=1))
-
     def actor_loss(actor: MLP, critics: MLP) -> Float[Array, ""]:
         first = jax.tree.map(lambda leaf: leaf[0], critics)
         return -jnp.mean(value(first, batch.observation, act(actor, batch.observation)))
 
-    loss, gradient = jax.value_and_grad(critic_loss)(state.online.critics)
+    loss, gradient = jax.value_and_grad(squared_errors)(state.online.critics, batch, target)
     critics, critic_optimizer = descend(state.online.critics, gradient, state.critic_optimizer, rate)
 
     def delayed(actor: MLP, target: Networks, actor_optimizer: optax.OptState):
@@ -144,7 +126,12 @@ def update(
         return actor, move_towards(target, Networks(actor, critics), settings.tau), actor_optimizer
 
     actor, targets, actor_optimizer = jax.lax.cond(
-        update_policy, delayed, lambda *kept: kept, state.online.actor, state.target, state.actor_optimizer
+        (number + 1) % settings.policy_delay == 0,
+        delayed,
+        lambda *kept: kept,
+        state.online.actor,
+        state.target,
+        state.actor_optimizer,
     )
     state = TD3(Networks(actor, critics), targets, actor_optimizer, critic_optimizer)
     return state, {"critic/loss": loss, "critic/value": jnp.mean(target)}

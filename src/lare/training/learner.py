@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lare.algorithms import ppo, td3
+from lare.algorithms import ppo, sac, td3
+from lare.algorithms.table import AlgorithmSettings
 from lare.credit import accuracy, decomposition
 from lare.credit.decomposition import CreditSettings, Decomposition, Episodes
 from lare.credit.methods import Encoder, Fit, Method, Reward
@@ -34,7 +35,7 @@ class Recipe:
     """What is to be trained and how: everything that the compiled functions hold fixed."""
 
     method: Method
-    algorithm: td3.TD3Settings | ppo.PPOSettings
+    algorithm: AlgorithmSettings
     credit: CreditSettings
     scale_rewards: bool
     """Divide the rewards that the algorithm sees by the running root mean square of R/T."""
@@ -55,7 +56,7 @@ class Recipe:
     @property
     def warmup(self) -> int:
         """Environment steps with random actions before the first update."""
-        return self.algorithm.warmup if isinstance(self.algorithm, td3.TD3Settings) else 0
+        return 0 if isinstance(self.algorithm, ppo.PPOSettings) else self.algorithm.warmup
 
     @property
     def features(self) -> int:
@@ -66,7 +67,7 @@ class Recipe:
 class Learner(NamedTuple):
     """The whole training state of one seed."""
 
-    algorithm: td3.TD3 | ppo.PPO
+    algorithm: td3.TD3 | sac.SAC | ppo.PPO
     credit: Decomposition | None
     scale: Scale
     observations: Moments | None
@@ -77,11 +78,15 @@ class Learner(NamedTuple):
 def init(key: PRNGKeyArray, recipe: Recipe) -> Learner:
     algorithm_key, credit_key = jax.random.split(key)
     sizes = recipe.observation_size, recipe.action_size
-    if isinstance(recipe.algorithm, ppo.PPOSettings):
-        algorithm = ppo.init(algorithm_key, *sizes, recipe.discrete, recipe.algorithm)
-        observations = no_moments(recipe.observation_size)
-    else:
-        algorithm, observations = td3.init(algorithm_key, *sizes, recipe.algorithm), None
+    observations = None
+    match recipe.algorithm:
+        case ppo.PPOSettings():
+            algorithm = ppo.init(algorithm_key, *sizes, recipe.discrete, recipe.algorithm)
+            observations = no_moments(recipe.observation_size)
+        case sac.SACSettings():
+            algorithm = sac.init(algorithm_key, *sizes, recipe.algorithm)
+        case td3.TD3Settings():
+            algorithm = td3.init(algorithm_key, *sizes, recipe.algorithm)
     return Learner(
         algorithm,
         None

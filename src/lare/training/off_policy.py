@@ -1,17 +1,21 @@
 """The fused training step: draw, fit the decoder, relabel by it, update the algorithm; many times in one compiled call.
 
-Algorithm 1 of the LaRe paper, lines 6 to 8, for algorithms that learn from a replay: TD3.
+Algorithm 1 of the LaRe paper, lines 6 to 8, for algorithms that learn from a replay. Each is a module with the same
+functions: `act`, `explore` and `update`.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
-from lare.algorithms import td3
+from lare.algorithms import sac, td3
+from lare.algorithms.critics import Transitions
+from lare.algorithms.table import OffPolicySettings
 from lare.credit.decomposition import Decomposition
 from lare.networks import MLP
 from lare.training import learner as common
@@ -27,9 +31,14 @@ class Draws(NamedTuple):
     credit: CreditDraws | None
 
 
-def settings_of(recipe: Recipe) -> td3.TD3Settings:
-    assert isinstance(recipe.algorithm, td3.TD3Settings)
+def settings_of(recipe: Recipe) -> OffPolicySettings:
+    assert isinstance(recipe.algorithm, OffPolicySettings)
     return recipe.algorithm
+
+
+def module_of(settings: OffPolicySettings) -> Any:
+    """The algorithm that such settings are for."""
+    return sac if isinstance(settings, sac.SACSettings) else td3
 
 
 def draw(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> Draws:
@@ -44,10 +53,9 @@ def improve(
 ) -> tuple[Learner, dict[str, Float[Array, ""]]]:
     """A chunk of updates, one for each of its steps; the mean of each metric over them."""
     draw_key, noise_key = jax.random.split(key)
-    assert isinstance(learner.algorithm, td3.TD3)
     held, settings, updates = learner.replay, settings_of(recipe), recipe.turn
 
-    def one(carry: tuple[td3.TD3, Decomposition | None], turn: tuple[Int[Scalar, ""], Draws, PRNGKeyArray]):
+    def one(carry: tuple[Any, Decomposition | None], turn: tuple[Int[Scalar, ""], Draws, PRNGKeyArray]):
         algorithm, credit = carry
         number, draws, key = turn
         measured = {}
@@ -55,9 +63,8 @@ def improve(
             credit, measured = common.fit(credit, held, draws.credit, jax.random.fold_in(key, 1), recipe)
         batch = replay.read(held, draws.batch)
         reward = rewards(batch, learner._replace(credit=credit), recipe)
-        batch = td3.Transitions(batch.observation, batch.action, reward, batch.next_observation, batch.continues)
-        update_policy = (number + 1) % settings.policy_delay == 0
-        algorithm, learned = td3.update(algorithm, batch, key, update_policy, settings)
+        batch = Transitions(batch.observation, batch.action, reward, batch.next_observation, batch.continues)
+        algorithm, learned = module_of(settings).update(algorithm, batch, key, number, settings)
         return (algorithm, credit), measured | learned
 
     numbers = done - settings.warmup + jnp.arange(updates)
@@ -67,24 +74,19 @@ def improve(
 
 
 def actor_of(learner: Learner) -> MLP:
-    assert isinstance(learner.algorithm, td3.TD3)
+    assert isinstance(learner.algorithm, td3.TD3 | sac.SAC)
     return learner.algorithm.online.actor
 
 
-def explore(
-    actor: MLP, observation: Float[Array, " observation"], noise: Float[Array, " action"]
-) -> Float[Array, " action"]:
-    """The policy with noise on its actions."""
-    return jnp.clip(td3.act(actor, observation) + noise, -1, 1)
-
-
 def noise(random: Sequence[np.random.Generator], recipe: Recipe) -> Float[np.ndarray, "time seeds action"]:
-    """For a chunk of steps."""
+    """Standard normal, for a chunk of steps."""
     shape = (recipe.turn, recipe.action_size)
-    drawn = np.stack([one.standard_normal(shape) for one in random], 1)
-    return (settings_of(recipe).exploration_noise * drawn).astype(np.float32)
+    return np.stack([one.standard_normal(shape) for one in random], 1).astype(np.float32)
 
 
 def compiled(recipe: Recipe) -> Compiled:
     """The functions of a run."""
-    return common.compiled(recipe, improve, actor_of, td3.act, explore, noise)
+    settings = settings_of(recipe)
+    module = module_of(settings)
+    explore = partial(module.explore, settings=settings)
+    return common.compiled(recipe, improve, actor_of, module.act, explore, noise)

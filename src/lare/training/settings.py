@@ -1,10 +1,12 @@
 """Every setting of a run. Together with the task and the latent functions they say all that a run depends on."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
 from lare.algorithms.ppo import PPOSettings
+from lare.algorithms.sac import SACSettings
+from lare.algorithms.table import ALGORITHMS, DDPG, IPPO, PPO, AlgorithmSettings, Kind, Name
 from lare.algorithms.td3 import TD3Settings
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
@@ -13,8 +15,6 @@ from lare.tasks.particles.task import STEPS
 from lare.tasks.spec import Judges, TaskSpec, is_discrete
 
 LARGEST_SEED = 2**31 - 1
-
-Algorithm = Literal["td3", "ppo", "ippo"]
 
 
 class AgentSettings(Checked):
@@ -33,22 +33,6 @@ class AgentSettings(Checked):
     )
 
 
-IPPO = PPOSettings(
-    learning_rate=1e-4,
-    gamma=1.0,
-    minibatch=128,
-    clip=0.5,
-    entropy=0.01,
-    gradient_norm=10.0,
-    anneal=True,
-)
-"""The paper's figures for the particle tasks."""
-
-
-PPO = PPOSettings(hidden=(256, 256), entropy=0.01, anneal=True)
-"""The published figures for the MuJoCo tasks; a Gaussian takes the place of their Beta policy."""
-
-
 class RolloutSettings(Checked):
     """What ppo does between two updates of the policy of a single agent."""
 
@@ -63,7 +47,7 @@ class Settings(Checked):
 
     method: str | None = None
     """How credit is assigned (see `lare methods`); lare-rrdu for a single agent, lare-rd for many, unless given."""
-    algorithm: Algorithm | None = None
+    algorithm: Name | None = None
     """The reinforcement learning algorithm: ippo for tasks of many agents, ppo for one that chooses among
     actions, td3 for all others."""
     steps: Annotated[int | None, Field(ge=1)] = None
@@ -77,17 +61,19 @@ class Settings(Checked):
     draw: Annotated[int, Field(ge=0)] = 0
     """Which recorded reply of the language model to take phi from (0 to 4); independent of the seed."""
     chunk: Annotated[int, Field(ge=1)] = 50
-    """td3: environment steps, and then as many updates, between two calls of the compiled training step."""
+    """Off-policy: environment steps, and then as many updates, between two calls of the compiled training step."""
     evaluate_every: Annotated[int | None, Field(ge=1)] = None
-    """Environment steps between two evaluations; a checkpoint is written at each: 5000 for td3, 10 updates for ippo, 5
-    for ppo."""
+    """Environment steps between two evaluations; a checkpoint is written at each: 5000 off-policy, 10 updates for
+    ippo, 5 for ppo."""
     evaluation_episodes: Annotated[int | None, Field(ge=1)] = None
     """Episodes in one evaluation: 10 for a single agent, 50 for ippo."""
     capacity: Annotated[int, Field(ge=4)] = 1_000_000
-    """td3, ppo: observations that the replay of a seed holds; an episode of T steps takes T + 1."""
+    """Single agents: observations that the replay of a seed holds; an episode of T steps takes T + 1."""
     scale_rewards: bool = False
-    """td3, ppo: divide the rewards that the algorithm sees by the running root mean square of R/T."""
+    """Single agents: divide the rewards that the algorithm sees by the running root mean square of R/T."""
     td3: TD3Settings = TD3Settings()
+    ddpg: TD3Settings = DDPG
+    sac: SACSettings = SACSettings()
     ppo: PPOSettings = PPO
     rollout: RolloutSettings = RolloutSettings()
     credit: CreditSettings = CreditSettings()
@@ -108,7 +94,7 @@ class Plan(Settings):
     """Settings with everything decided: what a run goes by. Narrower than what was given; and frozen, so that is sound."""
 
     method: str = "lare-rrdu"  # pyright: ignore[reportIncompatibleVariableOverride]
-    algorithm: Algorithm = "td3"  # pyright: ignore[reportIncompatibleVariableOverride]
+    algorithm: Name = "td3"  # pyright: ignore[reportIncompatibleVariableOverride]
     steps: int = 1_000_000  # pyright: ignore[reportIncompatibleVariableOverride]
     evaluate_every: int = 5000  # pyright: ignore[reportIncompatibleVariableOverride]
     evaluation_episodes: int = 10  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -118,7 +104,7 @@ class Plan(Settings):
         for name, steps in (
             ("steps", self.steps),
             ("evaluate_every", self.evaluate_every),
-            ("td3.warmup", self.td3.warmup if self.algorithm == "td3" else 0),
+            (f"{self.algorithm}.warmup", getattr(self.of_algorithm, "warmup", 0)),
         ):
             if steps % self.turn:
                 near = max(1, round(steps / self.turn)) * self.turn
@@ -128,20 +114,28 @@ class Plan(Settings):
     @property
     def turn(self) -> int:
         """Environment steps of a seed between two calls of the compiled training step."""
-        return {"td3": self.chunk, "ppo": self.rollout.steps, "ippo": self.agents.episodes * STEPS}[self.algorithm]
+        match ALGORITHMS[self.algorithm].kind:
+            case Kind.OFF_POLICY:
+                return self.chunk
+            case Kind.ON_POLICY:
+                return self.rollout.steps
+            case Kind.MANY_AGENTS:
+                return self.agents.episodes * STEPS
 
     @property
     def what_a_turn_is(self) -> str:
-        return {
-            "td3": f"chunk = {self.chunk}",
-            "ppo": f"rollout.steps = {self.rollout.steps}",
-            "ippo": f"{self.turn} (agents.episodes = {self.agents.episodes}, of {STEPS} steps each)",
-        }[self.algorithm]
+        match ALGORITHMS[self.algorithm].kind:
+            case Kind.OFF_POLICY:
+                return f"chunk = {self.chunk}"
+            case Kind.ON_POLICY:
+                return f"rollout.steps = {self.rollout.steps}"
+            case Kind.MANY_AGENTS:
+                return f"{self.turn} (agents.episodes = {self.agents.episodes}, of {STEPS} steps each)"
 
     @property
-    def of_algorithm(self) -> TD3Settings | PPOSettings:
+    def of_algorithm(self) -> AlgorithmSettings:
         """The figures of the algorithm."""
-        return {"td3": self.td3, "ppo": self.ppo, "ippo": self.ippo}[self.algorithm]
+        return getattr(self, self.algorithm)
 
     @property
     def episodes(self) -> int:
@@ -164,16 +158,17 @@ def decide(settings: Settings, task: TaskSpec) -> Plan:
         raise LareError(f"{task.name} is one team of {task.whole}: train that")
     many = task.particles is not None
     algorithm = settings.algorithm or ("ippo" if many else "ppo" if is_discrete(task) else "td3")
-    if many != (algorithm == "ippo"):
+    kind = ALGORITHMS[algorithm].kind
+    if many != (kind is Kind.MANY_AGENTS):
         raise LareError(
-            f"{algorithm} is for {'many agents' if algorithm == 'ippo' else 'a single agent'}, and {task.name} is a task "
+            f"{algorithm} is for {'a single agent' if many else 'many agents'}, and {task.name} is a task "
             f"of {'many' if many else 'one'}"
         )
     usual: dict[str, Any] = {"algorithm": algorithm}
-    if algorithm == "ppo":
+    if kind is Kind.ON_POLICY:
         turn = settings.rollout.steps
         usual |= {"steps": max(1, 1_000_000 // turn) * turn, "evaluate_every": 5 * turn}
-    if algorithm == "ippo":
+    if kind is Kind.MANY_AGENTS:
         turn = settings.agents.episodes * STEPS
         usual |= {"method": "lare-rd", "steps": 1000 * turn, "evaluate_every": 10 * turn, "evaluation_episodes": 50}
     given = {name: getattr(settings, name) for name in type(settings).model_fields}

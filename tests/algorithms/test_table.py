@@ -1,0 +1,15 @@
+"""The table of algorithms, and what is made of it elsewhere."""
+
+from typing import get_args
+
+from lare.algorithms.table import ALGORITHMS, TABLE, Name
+from lare.training.settings import Settings
+
+
+def test_names_are_those_of_the_types():
+    assert tuple(ALGORITHMS) == get_args(Name)
+    assert len(ALGORITHMS) == len(TABLE)
+
+
+def test_every_algorithm_has_settings_of_its_own_that_start_as_published():
+    assert all(getattr(Settings(), row.name) == row.settings for row in TABLE)
