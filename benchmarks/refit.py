@@ -74,7 +74,8 @@ def main(directories: list[str]) -> None:
         run = open_run(directory)
         recipe, everyone, _, _ = load_learner(run)
         learner = jax.tree.map(lambda leaf: leaf[0], everyone)
-        own, unit = learner.scale, Scale(jnp.ones(()), jnp.ones(()))
+        own = learner.scale
+        unit = own._replace(mean_square=jnp.ones(()))
         assert recipe.method.fit is not None
         cases = {
             "as it is": (recipe.method.fit, own),

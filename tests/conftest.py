@@ -16,7 +16,7 @@ from lare.credit.decomposition import CreditSettings
 from lare.latent.function import LatentFunction, verified
 from lare.tasks.spec import TaskSpec
 from lare.training.settings import AgentSettings, RolloutSettings, Settings
-from toys import PHI, Chase, toy_spec
+from toys import PHI, REWARD, Chase, toy_spec
 
 # Most of a small run's time is compilation, and many tests compile the same. JAX may have been imported already, and
 # some tests start processes of their own.
@@ -77,6 +77,12 @@ def command(monkeypatch, capsys, tmp_path):
 @pytest.fixture(scope="session")
 def phi() -> LatentFunction:
     return verified(PHI, toy_spec())
+
+
+@pytest.fixture(scope="session")
+def reward() -> LatentFunction:
+    """What a language model might write for `--kind reward`."""
+    return verified(REWARD, toy_spec(), "reward")
 
 
 @pytest.fixture(scope="session")

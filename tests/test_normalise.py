@@ -59,3 +59,13 @@ def test_scale_is_the_root_mean_square_of_what_counts():
 def test_scale_is_one_as_long_as_every_return_was_zero():
     scale = normalise.observe_scale(normalise.no_scale(), jnp.zeros(4), jnp.ones(4, bool))
     assert float(normalise.magnitude(scale)) == 1.0
+
+
+def test_the_range_of_what_counted():
+    scale = normalise.observe_scale(normalise.no_scale(), jnp.array([3.0, 9.0, -5.0]), jnp.array([True, False, False]))
+    assert (float(scale.lowest), float(scale.highest)) == (3, 3)
+    np.testing.assert_array_equal(normalise.within_range(scale, jnp.array([3.0, 4.0])), [0, 0])
+    scale = normalise.observe_scale(scale, jnp.array([1.0, 5.0, 99.0]), jnp.array([True, True, False]))
+    np.testing.assert_array_equal(normalise.within_range(scale, jnp.array([1.0, 2.0, 5.0])), [0, 0.25, 1])
+    untouched = normalise.observe_scale(normalise.no_scale(), jnp.array([3.0]), jnp.array([False]))
+    assert (float(untouched.lowest), float(untouched.highest)) == (0, 0)

@@ -44,6 +44,13 @@ def evaluation_func(observation, action):
 """
 
 
+REWARD = """import numpy as np
+
+def evaluation_func(observation, action):
+    return [-np.square(action - observation[:, 0:1])]
+"""
+
+
 def phi(body: str) -> str:
     """A latent function of some lines; the first of them is line 2."""
     return "def evaluation_func(observation, action):\n" + textwrap.indent(body, "    ")

@@ -47,21 +47,38 @@ def standardise(moments: Moments, rows: Float[Array, "*batch features"]) -> Floa
 
 
 class Scale(NamedTuple):
-    """Root mean square of the mean reward of an episode, R/T."""
+    """Of what size the mean reward of an episode is, R/T."""
 
     seen: Float[Array, ""]
     mean_square: Float[Array, ""]
+    lowest: Float[Array, ""]
+    highest: Float[Array, ""]
 
 
 def no_scale() -> Scale:
-    return Scale(jnp.zeros(()), jnp.zeros(()))
+    return Scale(*(jnp.zeros(()) for _ in Scale._fields))
 
 
 def observe_scale(scale: Scale, values: Float[Array, " batch"], counts: Bool[Array, " batch"]) -> Scale:
     """Take in those of `values` where `counts` is true."""
     count = scale.seen + jnp.sum(counts)
     excess = jnp.sum(jnp.where(counts, values**2 - scale.mean_square, 0))
-    return Scale(count, scale.mean_square + excess / jnp.maximum(count, 1))
+    known = scale.seen > 0
+    lowest = jnp.min(values, where=counts, initial=jnp.inf)
+    highest = jnp.max(values, where=counts, initial=-jnp.inf)
+    some = count > 0
+    return Scale(
+        count,
+        scale.mean_square + excess / jnp.maximum(count, 1),
+        jnp.where(some, jnp.where(known, jnp.minimum(scale.lowest, lowest), lowest), 0),
+        jnp.where(some, jnp.where(known, jnp.maximum(scale.highest, highest), highest), 0),
+    )
+
+
+def within_range(scale: Scale, values: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """(x - lowest) / (highest - lowest); 0 as long as they are the same."""
+    width = scale.highest - scale.lowest
+    return jnp.where(width > 0, (values - scale.lowest) / jnp.where(width > 0, width, 1), 0)
 
 
 def magnitude(scale: Scale) -> Float[Array, ""]:

@@ -55,7 +55,7 @@ def test_parts_of_episodes_stay_inside_them():
     assert (np.asarray(drawn.steps) < first + length).all()
 
 
-@pytest.mark.parametrize("method", ["dense", "episodic", "lare-rrdu"])
+@pytest.mark.parametrize("method", ["dense", "episodic", "lare-rrdu", "ircr", "llm-reward"])
 @pytest.mark.parametrize("scale_rewards", [False, True])
 def test_rewards(method, scale_rewards):
     chosen = recipe(method, scale_rewards=scale_rewards)
@@ -70,8 +70,56 @@ def test_rewards(method, scale_rewards):
         returns = [part.sum() for part in np.split(given.reward, np.cumsum(LENGTHS)[:-1])]
         np.testing.assert_allclose(got[given.ended], returns, rtol=1e-4, atol=1e-6)
         assert not got[~given.ended].any()
+    elif chosen.method.reward is Reward.DESIGNED:
+        np.testing.assert_allclose(got, given.factors[:, 0], rtol=1e-5)
+    elif chosen.method.reward is Reward.UNIFORM:
+        means = np.array([part.mean() for part in np.split(given.reward, np.cumsum(LENGTHS)[:-1])])
+        want = np.repeat((means - means.min()) / (means.max() - means.min()), LENGTHS)
+        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
     else:
         assert got.std() > 0
+
+
+def test_an_episode_under_way_is_worth_half_as_much_as_the_best():
+    chosen = recipe("ircr")
+    given = steps_of(0)
+    begun = common.store(stored(chosen), jax.tree.map(lambda rows: rows[:2], given), chosen)
+    drawn = replay.read(begun.replay, jnp.array([0, sum(LENGTHS), sum(LENGTHS) + 1]))
+    np.testing.assert_array_equal(common.rewards(drawn, begun, chosen)[1:], [0.5, 0.5])
+    assert float(common.rewards(drawn, begun, chosen)[0]) != 0.5
+
+
+@pytest.mark.parametrize("pieces", [1, 3])
+def test_closed_forms_are_fitted_to_the_episodes_that_have_ended(pieces):
+    chosen = recipe("lare-linear")
+    given, learner = steps_of(2), common.init(jax.random.key(0), recipe("lare-linear"))
+    for rows in np.array_split(np.arange(sum(LENGTHS)), pieces):
+        learner = common.store(learner, jax.tree.map(lambda leaf, rows=rows: leaf[rows], given), chosen)
+    parts = np.cumsum(LENGTHS)[:-1]
+    v = np.array(
+        [
+            np.append(z.mean(axis=0), r.mean())
+            for z, r in zip(np.split(given.factors, parts), np.split(given.reward, parts), strict=True)
+        ]
+    )
+    np.testing.assert_allclose(learner.credit.totals.mean, v.mean(axis=0), rtol=1e-4, atol=1e-6)
+    centred = v - v.mean(axis=0)
+    np.testing.assert_allclose(learner.credit.totals.products, centred.T @ centred, rtol=1e-3, atol=1e-5)
+    unit = v[:, :2].std(axis=0)
+    x = centred[:, :2] / unit
+    want = np.linalg.solve(x.T @ x + np.eye(2), x.T @ centred[:, 2]) / unit
+    np.testing.assert_allclose(learner.credit.decoder.weight, want, rtol=1e-3)
+
+
+def test_forgetting_the_episode_under_way_leaves_the_fit():
+    chosen = recipe("lare-linear")
+    learner = stored(chosen)
+    begun = common.store(learner, jax.tree.map(lambda rows: rows[:2], steps_of(2)), chosen)
+    back = common.forget_episode(begun)
+    assert float(begun.credit.totals.steps) == 2
+    for a, b in zip(jax.tree.leaves(back.credit.totals), jax.tree.leaves(learner.credit.totals), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert int(back.replay.transitions) == int(learner.replay.transitions)
 
 
 def test_every_fit_has_a_method():

@@ -37,6 +37,11 @@ def test_what_is_given_stands():
         ("Reacher-v4", {"algorithm": "ippo"}, "ippo is for many agents, and Reacher-v4 is a task of one"),
         ("Reacher-v4", {"method": "arel"}, "arel assigns credit among agents, and Reacher-v4 is a task of one"),
         (
+            "Reacher-v4",
+            {"method": "llm-reward", "judges": "both"},
+            "llm-reward is one reward a step: it judges the observation before or after, not both",
+        ),
+        (
             "CN-6",
             {"steps": 5000},
             "steps = 5000 is not a multiple of 2050 (agents.episodes = 82, of 25 steps each): take 4100",

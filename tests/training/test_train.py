@@ -15,7 +15,7 @@ import pytest
 import lare
 from lare.algorithms.ppo import PPOSettings
 from lare.algorithms.table import ALGORITHMS, Kind
-from lare.credit.methods import TABLE, Encoder
+from lare.credit.methods import METHODS, Encoder
 from lare.errors import LareError
 from lare.latent.function import verified
 from lare.training import checkpoint, single_agent
@@ -25,15 +25,16 @@ from lare.training.settings import RolloutSettings
 from lare.training.train import Interrupted
 from toys import PHI, At, figures, toy_spec
 
-METHODS = [method.name for method in TABLE if not method.for_many_only]
+OF_ONE = [method.name for method in METHODS.values() if not method.for_many_only]
 ONE_AGENT = [row.name for row in ALGORITHMS.values() if row.kind is not Kind.MANY_AGENTS]
 
 
 @pytest.mark.parametrize("algorithm", ONE_AGENT)
-@pytest.mark.parametrize("method", METHODS)
-def test_every_method_trains_and_reports(method, algorithm, small, phi, tmp_path):
-    settings = small(method=method, algorithm=algorithm)
-    run = lare.train(toy_spec(), settings, function=phi, out=tmp_path / "run", listeners=[])
+@pytest.mark.parametrize("method", OF_ONE)
+def test_every_method_trains_and_reports(method, algorithm, small, phi, reward, tmp_path):
+    settings, row = small(method=method, algorithm=algorithm), METHODS[method]
+    function = reward if row.kind == "reward" else phi
+    run = lare.train(toy_spec(), settings, function=function, out=tmp_path / "run", listeners=[])
     lines = run.metrics()
     assert [(line["step"], line["seed"]) for line in lines] == [
         (s, seed) for s in (60, 120, 180, 240) for seed in (0, 1)
@@ -41,11 +42,8 @@ def test_every_method_trains_and_reports(method, algorithm, small, phi, tmp_path
     assert all(np.isfinite(line["evaluation/return"]) for line in lines)
     learner = single_agent.load_learner(run)[1]
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((learner.algorithm, learner.credit)))
-    has_decoder = any(row.name == method and row.encoder for row in TABLE)
-    assert ("credit/error" in lines[-1]) == ("credit/correlation" in lines[-1]) == has_decoder
-    assert (run.directory / "latent_function.py").exists() == any(
-        row.name == method and row.encoder is Encoder.LATENT for row in TABLE
-    )
+    assert ("credit/error" in lines[-1]) == ("credit/correlation" in lines[-1]) == row.has_proxy
+    assert (run.directory / "latent_function.py").exists() == (row.encoder is Encoder.LATENT)
     if algorithm == "td3":
         assert lare.write_report([run.directory]).read_text().count("<svg") >= 1
 
@@ -73,6 +71,35 @@ def test_the_isolation_stands_in_the_config(small, phi, tmp_path):
     run = lare.train(toy_spec(), small(steps=60), function=phi, out=tmp_path / "run", listeners=[])
     assert run.config.isolation == phi.evaluator(2, 1).isolation
     assert run.config.isolation.startswith("a process of its own (")
+
+
+@pytest.mark.parametrize(
+    ("method", "arrays", "message"),
+    [
+        (
+            "llm-reward",
+            2,
+            "llm-reward needs a function with one array, the reward, and this one has 2: lare design TASK --kind reward "
+            "writes one",
+        ),
+        ("lare-signs", 17, "lare-signs tries all signs of at most 16 factors, and there are 17"),
+    ],
+)
+def test_a_method_that_can_do_nothing_with_so_many_factors(method, arrays, message, small, tmp_path):
+    rows = ", ".join(f"o[:, 0:1] * {1 + place}" for place in range(arrays))
+    function = verified(f"def evaluation_func(o, a):\n    return [{rows}]\n", toy_spec())
+    with pytest.raises(LareError) as error:
+        lare.train(toy_spec(), small(method=method), function=function, out=tmp_path / "run", listeners=[])
+    assert str(error.value) == message
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_number_of_candidates_is_a_setting(small, tmp_path):
+    """Without self-prompting: the first recorded candidate is the function."""
+    settings = small(steps=60, candidates=1)
+    run = lare.train("Reacher-v4", settings, out=tmp_path / "run", listeners=[])
+    assert run.function.source == lare.design(lare.load_task("Reacher-v4"), candidates=1).source
+    assert run.function.source != lare.design(lare.load_task("Reacher-v4")).source
 
 
 @pytest.mark.parametrize("judges", ["before", "after", "both"])
@@ -279,7 +306,11 @@ def test_config_says_what_the_run_depends_on(small, phi, tmp_path):
 
 @pytest.mark.parametrize(
     ("algorithm", "method"),
-    [*(("td3", method) for method in ("dense", "lare-rrdu", "lare-rd", "rrdu")), ("ddpg", "rrdu"), ("sac", "dense")],
+    [
+        *(("td3", method) for method in ("dense", "lare-rrdu", "lare-rd", "rrdu")),
+        ("ddpg", "lare-linear"),
+        ("sac", "dense"),
+    ],
 )
 def test_must_learn_the_toy(algorithm, method, phi, tmp_path):
     """A random policy gets -33 a seed, standing still -7; the optimum is 0."""

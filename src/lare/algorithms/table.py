@@ -35,8 +35,6 @@ class Algorithm:
     kind: Kind
     settings: AlgorithmSettings
     """The published figures."""
-    discrete: bool
-    """Whether it can choose among actions."""
     summary: str
     source: str
 
@@ -52,7 +50,6 @@ TABLE = (
         "td3",
         Kind.OFF_POLICY,
         TD3Settings(),
-        False,
         "two critics against overestimation, a delayed deterministic policy",
         "Fujimoto et al., ICML 2018",
     ),
@@ -60,7 +57,6 @@ TABLE = (
         "ddpg",
         Kind.OFF_POLICY,
         DDPG,
-        False,
         "one critic and a deterministic policy",
         "Lillicrap et al., ICLR 2016",
     ),
@@ -68,7 +64,6 @@ TABLE = (
         "sac",
         Kind.OFF_POLICY,
         SACSettings(),
-        False,
         "maximum entropy, with a learned temperature",
         "Haarnoja et al., 2018 (arXiv 1812.05905)",
     ),
@@ -76,7 +71,6 @@ TABLE = (
         "ppo",
         Kind.ON_POLICY,
         PPO,
-        True,
         "clipped policy steps on the newest rollout",
         "Schulman et al., 2017; a Gaussian takes the place of LaRe's Beta policy",
     ),
@@ -84,7 +78,6 @@ TABLE = (
         "ippo",
         Kind.MANY_AGENTS,
         IPPO,
-        True,
         "ppo for every agent, with one actor and one critic for all",
         "de Witt et al., 2020; the figures of LaRe",
     ),

@@ -20,6 +20,7 @@ from pydantic import Field
 
 from lare.credit import losses
 from lare.credit.arel import AREL
+from lare.credit.closed_form import Linear, Totals, best_signs, forget_running, no_totals, ridge_regression, take_in
 from lare.credit.decoders import Bottleneck, Decoded, StepDecoder
 from lare.credit.methods import Decoder, Fit, Method
 from lare.credit.stas import STAS
@@ -27,7 +28,7 @@ from lare.errors import Checked
 from lare.networks import descend, start_adam
 from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe, observe_scale, standardise
 
-Network = StepDecoder | Bottleneck | AREL | STAS
+Network = StepDecoder | Bottleneck | AREL | STAS | Linear
 """A decoder of any kind."""
 
 
@@ -48,6 +49,8 @@ class CreditSettings(Checked):
     """K: steps drawn from an episode by RRD and its kin."""
     steps: Annotated[int, Field(ge=2)] = 256
     """Steps in one update of the decoder: K steps of so many episodes, or whole episodes that make up about as many."""
+    ridge: Annotated[float, Field(gt=0)] = 1.0
+    """lambda of the ridge regression: so many episodes' worth of belief in no difference between steps."""
     bottleneck: Annotated[int, Field(ge=1)] = 4
     """Size of the code in the middle of VIB."""
     divergence: Annotated[float, Field(ge=0)] = 1e-3
@@ -72,8 +75,11 @@ class Decomposition(NamedTuple):
 
     decoder: Network
     optimizer: optax.OptState
+    """Empty for a decoder that is fitted in closed form."""
     moments: Moments
     scale: Scale
+    totals: Totals | None
+    """For a decoder that is fitted in closed form."""
 
 
 def init(
@@ -89,7 +95,11 @@ def init(
             decoder = AREL(features, steps, key=key)
         case Decoder.STAS:
             decoder = STAS(features, steps, agents, key=key)
-    return Decomposition(decoder, start_adam(decoder, settings.learning_rate), no_moments(features), no_scale())
+        case Decoder.LINEAR:
+            decoder = Linear(jnp.zeros(features), jnp.zeros(()))
+            return Decomposition(decoder, (), no_moments(features), no_scale(), no_totals(features))
+    optimizer = start_adam(decoder, settings.learning_rate)
+    return Decomposition(decoder, optimizer, no_moments(features), no_scale(), None)
 
 
 def observe_steps(state: Decomposition, features: Float[Array, "*batch features"]) -> Decomposition:
@@ -104,6 +114,31 @@ def observe_returns(
     return state._replace(scale=observe_scale(state.scale, mean_reward, finished))
 
 
+def fit_in_closed_form(
+    state: Decomposition,
+    features: Float[Array, "time features"],
+    mean_reward: Float[Array, " time"],
+    ended: Bool[Array, " time"],
+    fit: Fit,
+    settings: CreditSettings,
+) -> Decomposition:
+    """Take in steps that follow each other, and fit the decoder to all episodes that have ended."""
+    assert state.totals is not None
+    totals = take_in(state.totals, features, mean_reward, ended)
+    decoder = best_signs(totals) if fit is Fit.SIGNS else ridge_regression(totals, settings.ridge)
+    return state._replace(decoder=decoder, totals=totals)
+
+
+def forget_episode(state: Decomposition) -> Decomposition:
+    """Without the episode that is under way."""
+    return state if state.totals is None else state._replace(totals=forget_running(state.totals))
+
+
+def normalised(state: Decomposition, settings: CreditSettings) -> bool:
+    """Whether the decoder works in units of its own. One that was fitted in closed form has no need to."""
+    return settings.normalise and state.totals is None
+
+
 def decode(
     decoder: Network,
     state: Decomposition,
@@ -112,7 +147,7 @@ def decode(
     key: PRNGKeyArray | None = None,
 ) -> Decoded:
     """f_psi in units of the scale."""
-    return decoder(standardise(state.moments, features) if settings.normalise else features, key)
+    return decoder(standardise(state.moments, features) if normalised(state, settings) else features, key)
 
 
 def proxy_rewards(
@@ -120,7 +155,7 @@ def proxy_rewards(
 ) -> Float[Array, "rows *agents"]:
     """r_hat of some steps, by the decoder as it stands."""
     r_hat = decode(state.decoder, state, features, settings).r_hat
-    return magnitude(state.scale) * r_hat if settings.normalise else r_hat
+    return magnitude(state.scale) * r_hat if normalised(state, settings) else r_hat
 
 
 def loss_and_gradient(

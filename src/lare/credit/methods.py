@@ -8,6 +8,7 @@ return, paid at the last step. The rows serve one agent and many; those that nee
 import difflib
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Literal
 
 from lare.errors import LareError
 
@@ -32,6 +33,15 @@ class Fit(StrEnum):
     """RRD: K steps drawn from each episode."""
     DRAWN_STEPS_UNBIASED = "drawn steps, unbiased"
     """RRD-unbiased: the same, less the variance that the drawing adds."""
+    RIDGE = "ridge regression"
+    """In closed form, on all episodes (equations in `closed_form.py`)."""
+    SIGNS = "best signs"
+    """The same, over the signs of a sum."""
+
+    @property
+    def closed_form(self) -> bool:
+        """Whether nothing descends a gradient."""
+        return self in (Fit.RIDGE, Fit.SIGNS)
 
 
 class Decoder(StrEnum):
@@ -45,6 +55,8 @@ class Decoder(StrEnum):
     """Attention over time and agents; one reward a step for all agents."""
     STAS = "stas"
     """Attention over time, then over random coalitions of agents."""
+    LINEAR = "linear"
+    """A weighted sum."""
 
 
 class Reward(StrEnum):
@@ -53,6 +65,11 @@ class Reward(StrEnum):
     TRUE = "true"
     EPISODIC = "episodic"
     PROXY = "proxy"
+    """What the decoder says."""
+    UNIFORM = "uniform"
+    """The mean reward of the episode, between the lowest and the highest so far."""
+    DESIGNED = "designed"
+    """What a reward function of the language model says."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +87,16 @@ class Method:
     """Whether every agent gets the mean of all agents' proxy rewards: credit over time alone."""
 
     @property
+    def has_proxy(self) -> bool:
+        """Whether it gives every step a reward of its own making."""
+        return self.reward not in (Reward.TRUE, Reward.EPISODIC)
+
+    @property
+    def kind(self) -> Literal["factors", "reward"]:
+        """What a language model is asked for, where the encoder is its function."""
+        return "reward" if self.reward is Reward.DESIGNED else "factors"
+
+    @property
     def for_many_only(self) -> bool:
         """Whether it says nothing where there is a single agent."""
         return self.shared or self.decoder in (Decoder.AREL, Decoder.STAS)
@@ -83,6 +110,14 @@ VIB = "Alemi et al., ICLR 2017; LaRe, appendix F.2"
 TABLE = (
     Method("dense", Reward.TRUE, None, None, "the true reward of every step: the upper end", "-"),
     Method("episodic", Reward.EPISODIC, None, None, "the return, paid at the last step: the lower end", "-"),
+    Method(
+        "ircr",
+        Reward.UNIFORM,
+        None,
+        None,
+        "every step of an episode alike, between the worst and the best episode",
+        "Gangwani et al., IRCR, NeurIPS 2020",
+    ),
     Method("rd", Reward.PROXY, Encoder.RAW, Fit.ALL_STEPS, "return decomposition on raw features", RD),
     Method("rrd", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS, "randomized return decomposition", RRD),
     Method("rrdu", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS_UNBIASED, "RRD without the bias of the drawing", RRD),
@@ -118,6 +153,32 @@ TABLE = (
     ),
     Method("lare-rd", Reward.PROXY, Encoder.LATENT, Fit.ALL_STEPS, "return decomposition on latent rewards", LARE),
     Method("lare-rrdu", Reward.PROXY, Encoder.LATENT, Fit.DRAWN_STEPS_UNBIASED, "RRD-unbiased on latent rewards", LARE),
+    Method(
+        "lare-linear",
+        Reward.PROXY,
+        Encoder.LATENT,
+        Fit.RIDGE,
+        "ridge regression on latent rewards, with a confidence radius",
+        "LaRe, appendix B; Efroni et al., AAAI 2021",
+        Decoder.LINEAR,
+    ),
+    Method(
+        "lare-signs",
+        Reward.PROXY,
+        Encoder.LATENT,
+        Fit.SIGNS,
+        "without a reward model: the sum of the factors, with the best signs",
+        LARE,
+        Decoder.LINEAR,
+    ),
+    Method(
+        "llm-reward",
+        Reward.DESIGNED,
+        Encoder.LATENT,
+        None,
+        "the reward that the language model wrote; nothing is fitted",
+        "LaRe, appendix F.4; Ma et al., Eureka, ICLR 2024",
+    ),
     Method(
         "lare-rd-shared",
         Reward.PROXY,

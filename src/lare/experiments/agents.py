@@ -86,7 +86,7 @@ def watch(run: Run, key: int = 0) -> Watched:
     play = jax.jit(partial(teams.play, count=1, recipe=recipe))
     played = play(learner.algorithm.online.actor, jax.random.key(key))
     proxy = None
-    if learner.credit:
+    if recipe.method.has_proxy:
         factors = factors_of(session, played)
         rows = teams.features(played, jnp.asarray(factors), recipe)
         reward = jnp.swapaxes(played.reward, 0, 1)

@@ -7,12 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lare.credit import decomposition
+from lare.credit import closed_form
+from lare.credit.methods import Fit
 from lare.training import replay
-from lare.training.learner import RECENT, Learner, Recipe, features
+from lare.training.learner import RECENT, Learner, Recipe, proxy_rewards
 from lare.training.run import Run
 from lare.training.seeds import of_seed
 from lare.training.single_agent import load_learner
+
+DELTA = 0.5
+"""Of the confidence radius: a band that holds with a probability of 95%."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,8 @@ class Credit:
     """True."""
     proxy: Float[np.ndarray, " steps"]
     """By the decoder of the last checkpoint."""
+    uncertainty: Float[np.ndarray, " steps"] | None
+    """By how much, at most, the proxy reward is off: with a probability of 1 - DELTA / 10, for a decoder in closed form."""
     factors: Float[np.ndarray, "steps factors"]
     correlations: Float[np.ndarray, " factors"]
     """Pearson's, of each factor with the true reward, over the last steps of all seeds. NaN where one never varies."""
@@ -39,18 +45,21 @@ def factor_labels(run: Run, place: int = 0) -> list[tuple[str, str]]:
 
 
 def credit_of(run: Run) -> Credit | None:
-    """None for a method without a decoder, and as long as no episode has finished."""
+    """None for a method without proxy rewards, and as long as no episode has finished."""
     recipe, learner, _, _ = load_learner(run)
     one = of_seed(learner)
-    if one.credit is None or not int(replay.finished(one.replay)):
+    if not recipe.method.has_proxy or not int(replay.finished(one.replay)):
         return None
     episode = one.replay.episodes - 1
     begin = int(one.replay.first[episode % len(one.replay.first)])
     steps = replay.read(one.replay, jnp.arange(begin, int(replay.end_of(one.replay, episode))))
-    proxy = decomposition.proxy_rewards(one.credit, features(steps, recipe.method), recipe.credit)
-    return Credit(
-        np.asarray(steps.reward), np.asarray(proxy), np.asarray(steps.factors), factor_correlations(learner, recipe)
-    )
+    proxy = proxy_rewards(steps, one, recipe)
+    uncertainty = None
+    if one.credit is not None and one.credit.totals is not None and recipe.method.fit is Fit.RIDGE:
+        totals, length = one.credit.totals, len(steps.reward)
+        uncertainty = np.asarray(closed_form.uncertainty(totals, steps.factors, length, recipe.credit.ridge, DELTA))
+    reward, proxy, factors = (np.asarray(part) for part in (steps.reward, proxy, steps.factors))
+    return Credit(reward, proxy, uncertainty, factors, factor_correlations(learner, recipe))
 
 
 def correlations(

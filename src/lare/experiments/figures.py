@@ -62,9 +62,16 @@ def curves(by_name: Mapping[str, Curve], label: str, *, from_zero: bool = False)
     return svg(figure)
 
 
-def credit(reward: Float[np.ndarray, " steps"], proxy: Float[np.ndarray, " steps"]) -> str:
+def credit(
+    reward: Float[np.ndarray, " steps"],
+    proxy: Float[np.ndarray, " steps"],
+    uncertainty: Float[np.ndarray, " steps"] | None = None,
+) -> str:
     """Proxy and true reward of an episode, step by step."""
     figure, (axes,) = new_figure()
+    if uncertainty is not None:
+        band = (proxy - uncertainty, proxy + uncertainty)
+        axes.fill_between(np.arange(len(proxy)), *band, color=COLOURS[0], alpha=0.2, linewidth=0)
     axes.plot(reward, color="#999999", linewidth=1.6, label="true reward")
     axes.plot(proxy, color=COLOURS[0], linewidth=0.9, label="proxy reward")
     axes.set(xlabel="step of the episode", ylabel="reward")

@@ -14,7 +14,7 @@ from lare.credit.methods import find_method
 from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
-from lare.experiments.credit import credit_of, factor_labels
+from lare.experiments.credit import DELTA, credit_of, factor_labels
 from lare.experiments.html import function_text, note, table
 from lare.training.run import Run, open_run
 from lare.training.settings import Settings, decide
@@ -159,10 +159,16 @@ def one_agent_details(run: Run) -> Iterable[str]:
     credit = credit_of(run)
     if credit is not None:
         yield f"<h3>Credit over one episode ({len(credit.reward)} steps)</h3>"
-        yield figures.credit(credit.reward, credit.proxy)
+        yield figures.credit(credit.reward, credit.proxy, credit.uncertainty)
         yield note(
             "The last training episode of the first seed, exploration included, judged by the newest decoder. "
             f"Return {credit.reward.sum():.1f}, sum of the proxy rewards {credit.proxy.sum():.1f}."
+            + (
+                ""
+                if credit.uncertainty is None
+                else f" The band holds the true reward with a probability of {1 - DELTA / 10:.0%} where rewards are linear "
+                "in the factors (Proposition 1 of the paper)."
+            )
         )
     if run.function is not None:
         yield from factors(run, credit)

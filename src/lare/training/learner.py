@@ -22,7 +22,7 @@ from lare.algorithms.table import AlgorithmSettings
 from lare.credit import accuracy, decomposition
 from lare.credit.decomposition import CreditSettings, Decomposition, Episodes
 from lare.credit.methods import Encoder, Fit, Method, Reward
-from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe_scale
+from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe_scale, within_range
 from lare.training import replay
 from lare.training.replay import Draw, Replay, Step
 
@@ -90,7 +90,7 @@ def init(key: PRNGKeyArray, recipe: Recipe) -> Learner:
     return Learner(
         algorithm,
         None
-        if recipe.method.encoder is None
+        if recipe.method.reward is not Reward.PROXY
         else decomposition.init(
             credit_key, recipe.features, recipe.method, recipe.credit, steps=recipe.longest_episode, agents=1
         ),
@@ -122,7 +122,18 @@ def store(learner: Learner, steps: Step, recipe: Recipe) -> Learner:
     if credit is not None:
         credit = decomposition.observe_steps(credit, features(steps, recipe.method))
         credit = decomposition.observe_returns(credit, mean_reward, finished)
+        if recipe.method.fit is not None and recipe.method.fit.closed_form:
+            ended = jnp.asarray(steps.ended)
+            at_its_end = mean_reward[jnp.cumsum(ended) - 1]
+            seen, fit, settings = features(steps, recipe.method), recipe.method.fit, recipe.credit
+            credit = decomposition.fit_in_closed_form(credit, seen, at_its_end, ended, fit, settings)
     return learner._replace(credit=credit, scale=observe_scale(learner.scale, mean_reward, finished), replay=held)
+
+
+def forget_episode(learner: Learner) -> Learner:
+    """Without the episode that is under way."""
+    credit = None if learner.credit is None else decomposition.forget_episode(learner.credit)
+    return learner._replace(credit=credit, replay=replay.drop_running(learner.replay))
 
 
 class CreditDraws(NamedTuple):
@@ -134,8 +145,8 @@ class CreditDraws(NamedTuple):
 
 
 def draw_credit(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> CreditDraws | None:
-    """Decide for some updates of the decoder what each of them reads; None for a method that fits nothing."""
-    if recipe.method.fit is None:
+    """Decide for some updates of the decoder what each of them reads; None for a method that has none."""
+    if recipe.method.fit is None or recipe.method.fit.closed_form:
         return None
     if recipe.method.fit is Fit.ALL_STEPS:
         whole = partial(draw_whole_episodes, held, recipe=recipe)
@@ -184,27 +195,37 @@ def fit(
 
 
 def rewards(batch: Draw, learner: Learner, recipe: Recipe) -> Float[Array, " batch"]:
-    """What the algorithm is trained on; proxy rewards always by the decoder as it stands."""
+    """What the algorithm is trained on."""
     match recipe.method.reward:
         case Reward.TRUE:
             reward = batch.reward
         case Reward.EPISODIC:
             reward = batch.episodic_reward
-        case Reward.PROXY:
-            assert learner.credit is not None
-            reward = decomposition.proxy_rewards(learner.credit, features(batch, recipe.method), recipe.credit)
+        case _:
+            reward = proxy_rewards(batch, learner, recipe)
     return reward / magnitude(learner.scale) if recipe.scale_rewards else reward
 
 
+def proxy_rewards(batch: Draw, learner: Learner, recipe: Recipe) -> Float[Array, " batch"]:
+    """r_hat of a method that has one, always by the decoder as it stands."""
+    if recipe.method.reward is Reward.DESIGNED:
+        return batch.factors[:, 0]
+    if recipe.method.reward is Reward.UNIFORM:
+        # What an episode under way is worth is not known yet.
+        return jnp.where(batch.finished, within_range(learner.scale, batch.mean_reward), 0.5)
+    assert learner.credit is not None
+    return decomposition.proxy_rewards(learner.credit, features(batch, recipe.method), recipe.credit)
+
+
 def assess(learner: Learner, steps: int, recipe: Recipe) -> dict[str, Float[Array, ""]]:
-    """How near the newest decoder's proxy rewards come to the true ones, over the last `steps` steps."""
-    if learner.credit is None:
+    """How near the newest proxy rewards come to the true ones, over the last `steps` steps."""
+    if not recipe.method.has_proxy:
         return {}
     held = learner.replay
     number = held.transitions - 1 - jnp.arange(steps)
     counts = number >= replay.oldest_transition(held)
     recent = replay.read(held, jnp.where(counts, number, replay.oldest_transition(held)))
-    r_hat = decomposition.proxy_rewards(learner.credit, features(recent, recipe.method), recipe.credit)
+    r_hat = proxy_rewards(recent, learner, recipe)
     return {
         "credit/error": accuracy.mean_error(r_hat, recent.reward, counts),
         "credit/correlation": accuracy.correlation(r_hat, recent.reward, counts),

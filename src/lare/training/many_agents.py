@@ -49,7 +49,7 @@ class Session:
         played = self.functions.play(self.learner.algorithm.online.actor, keys, self.settings.agents.episodes)
         factors = self.factors(played)
         self.learner = self.functions.store(self.learner, played, factors)
-        if self.learner.credit and number % self.recipe.agents.fit_every == 0:
+        if self.recipe.descends and number % self.recipe.agents.fit_every == 0:
             credit, fitted = self.functions.fit(self.learner, self.keys(Stream.FIT, number))
             self.learner = self.learner._replace(credit=credit)
             self.latest |= fitted

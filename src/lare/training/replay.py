@@ -78,6 +78,10 @@ class Draw(NamedTuple):
     """The whole return at the last step of a finished episode, else 0."""
     next_observation: Float[Array, "*batch observation"]
     continues: Float[Array, "*batch"]
+    mean_reward: Float[Array, "*batch"]
+    """R/T of the step's episode; of what there is of it where it has not finished."""
+    finished: Bool[Array, "*batch"]
+    """Whether it has."""
 
 
 def empty(capacity: int, observation_size: int, action_size: int, factors: int) -> Replay:
@@ -169,15 +173,19 @@ def read(replay: Replay, number: Int[Array, "*batch"]) -> Draw:
     rows = capacity(replay)
     row = replay.row[number % rows] % rows
     episode = replay.episode[number % rows]
-    last = (number + 1 == end_of(replay, episode)) & (episode < replay.episodes)
+    end, finished = end_of(replay, episode), episode < replay.episodes
+    total = replay.episode_return[episode % len(replay.first)]
+    length = end - replay.first[episode % len(replay.first)]
     return Draw(
         observation=replay.observation[row],
         action=replay.action[row],
         factors=replay.factors[row],
         reward=replay.reward[row],
-        episodic_reward=jnp.where(last, replay.episode_return[episode % len(replay.first)], 0),
+        episodic_reward=jnp.where((number + 1 == end) & finished, total, 0),
         next_observation=replay.observation[(row + 1) % rows],
         continues=1.0 - replay.terminated[row],
+        mean_reward=total / jnp.maximum(length, 1),
+        finished=finished,
     )
 
 

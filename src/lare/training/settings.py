@@ -9,8 +9,9 @@ from lare.algorithms.sac import SACSettings
 from lare.algorithms.table import ALGORITHMS, DDPG, IPPO, PPO, AlgorithmSettings, Kind, Name
 from lare.algorithms.td3 import TD3Settings
 from lare.credit.decomposition import CreditSettings
-from lare.credit.methods import find_method
+from lare.credit.methods import Reward, find_method
 from lare.errors import Checked, LareError
+from lare.latent.design import CANDIDATES
 from lare.tasks.particles.task import STEPS
 from lare.tasks.spec import Judges, TaskSpec, is_discrete
 
@@ -60,6 +61,8 @@ class Settings(Checked):
     """Which observation the factors judge a step by; what the task says, unless given."""
     draw: Annotated[int, Field(ge=0)] = 0
     """Which recorded reply of the language model to take phi from (0 to 4); independent of the seed."""
+    candidates: Annotated[int, Field(ge=1)] = CANDIDATES
+    """How many candidates phi is made of; 1: without self-prompting. The shipped recordings hold 1 and 5."""
     chunk: Annotated[int, Field(ge=1)] = 50
     """Off-policy: environment steps, and then as many updates, between two calls of the compiled training step."""
     evaluate_every: Annotated[int | None, Field(ge=1)] = None
@@ -174,6 +177,9 @@ def decide(settings: Settings, task: TaskSpec) -> Plan:
     given = {name: getattr(settings, name) for name in type(settings).model_fields}
     plan = Plan(**usual | {name: value for name, value in given.items() if value is not None})
     method = find_method(plan.method)
+    judges = plan.judges or task.judges
+    if method.reward is Reward.DESIGNED and judges == "both":
+        raise LareError(f"{method.name} is one reward a step: it judges the observation before or after, not both")
     if method.for_many_only and not many:
         raise LareError(f"{method.name} assigns credit among agents, and {task.name} is a task of one")
     return plan

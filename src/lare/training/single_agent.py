@@ -28,7 +28,7 @@ from lare.training.environments import (
     generator,
     make_episodic,
 )
-from lare.training.learner import Compiled, Learner, Recipe, init
+from lare.training.learner import Compiled, Learner, Recipe, forget_episode, init
 from lare.training.run import Run
 from lare.training.seeds import lines, seed_keys
 from lare.training.settings import Plan
@@ -123,7 +123,7 @@ class Session:
                     "not come back to the same observation by the same actions"
                 )
         if any(dropped):
-            self.learner = self.learner._replace(replay=drop(self.learner.replay, jnp.asarray(dropped)))
+            self.learner = drop(self.learner, jnp.asarray(dropped))
         return messages
 
     def close(self) -> None:
@@ -137,13 +137,13 @@ def flat(rows: np.ndarray) -> np.ndarray:
 
 
 @jax.jit
-def drop(held: replay.Replay, dropped: Array) -> replay.Replay:
+def drop(learner: Learner, dropped: Array) -> Learner:
     """Forget the running episodes of the seeds where `dropped` is true."""
 
     def choose(shorter: Array, whole: Array) -> Array:
         return jnp.where(dropped.reshape(-1, *[1] * (whole.ndim - 1)), shorter, whole)
 
-    return jax.tree.map(choose, jax.vmap(replay.drop_running)(held), held)
+    return jax.tree.map(choose, jax.vmap(forget_episode)(learner), learner)
 
 
 def compiled(recipe: Recipe) -> Compiled:

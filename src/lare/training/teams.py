@@ -25,6 +25,7 @@ from lare.algorithms.ppo import PPO, Policy, PPOSettings
 from lare.credit import accuracy, decomposition
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Encoder, Fit, Method, Reward
+from lare.normalise import no_scale, observe_scale, within_range
 from lare.tasks.particles.task import ACTIONS, STEPS, ParticleTask, Team
 from lare.tasks.particles.world import State
 from lare.training import episodes as replay
@@ -60,6 +61,11 @@ class Recipe:
                 return (self.task.observation_size,) * len(self.task.teams)
             case Encoder.TAKEN:
                 return (self.task.observation_size + ACTIONS,) * len(self.task.teams)
+
+    @property
+    def descends(self) -> bool:
+        """Whether the decoders are fitted by gradient descent."""
+        return self.method.fit is not None and not self.method.fit.closed_form
 
     @property
     def policy_input(self) -> int:
@@ -163,7 +169,14 @@ def store(learner: Learner, played: Played, factors: Array, recipe: Recipe) -> L
     for one, team, size in zip(learner.credit, recipe.task.teams, recipe.features, strict=bool(learner.credit)):
         one = decomposition.observe_steps(one, of_team(rows, team, size))
         means = mean_rewards(reward, team)
-        credit.append(decomposition.observe_returns(one, means, jnp.ones_like(means, bool)))
+        whole = jnp.ones_like(means, bool)
+        one = decomposition.observe_returns(one, means, whole)
+        if recipe.method.fit is not None and recipe.method.fit.closed_form:
+            # An episode's steps and agents count alike: as one step, it is their mean.
+            seen = jnp.mean(of_team(rows, team, size).reshape(len(means), -1, size), axis=1)
+            fit, settings = recipe.method.fit, recipe.agents.credit
+            one = decomposition.fit_in_closed_form(one, seen, means, whole, fit, settings)
+        credit.append(one)
     return learner._replace(credit=tuple(credit), replay=replay.extend(learner.replay, rows, reward))
 
 
@@ -216,10 +229,24 @@ def rewards(
                 credit = learner.credit[place]
                 part = decomposition.proxy_rewards(credit, of_team(rows, team, size), recipe.agents.credit)
                 part = part.reshape(shape)
+            case Reward.UNIFORM:
+                part = jnp.broadcast_to(uniform(learner.replay, reward, team)[:, None, None], shape)
+            case Reward.DESIGNED:
+                part = rows[..., team.start : team.stop, 0]
         if recipe.method.shared:
             part = jnp.broadcast_to(jnp.mean(part, axis=-1, keepdims=True), shape)
         parts.append(part)
     return jnp.concatenate(parts, axis=-1)
+
+
+def uniform(
+    held: EpisodeReplay, reward: Float[Array, "episodes steps agents"], team: Team
+) -> Float[Array, " episodes"]:
+    """R/T of episodes, between the lowest and the highest of those that are stored."""
+    means = mean_rewards(held.reward, team)
+    known = jnp.arange(len(means)) < held.next_row
+    scale = observe_scale(no_scale(), means, known)
+    return within_range(scale, mean_rewards(reward, team))
 
 
 def improve(
@@ -241,7 +268,7 @@ def improve(
 
 def assess(learner: Learner, recipe: Recipe) -> dict[str, Float[Array, ""]]:
     """How near the newest decoders' proxy rewards come to the true ones, over the episodes of the newest update."""
-    if not learner.credit:
+    if not recipe.method.has_proxy:
         return {}
     newest = replay.newest(learner.replay, recipe.agents.episodes)
     reward = learner.replay.reward[newest]

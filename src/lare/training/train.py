@@ -4,10 +4,12 @@ import contextlib
 import signal
 import threading
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lare.credit.methods import Encoder, find_method
+from lare.credit.closed_form import LARGEST_CHOICE
+from lare.credit.methods import Encoder, Fit, Method, Reward, find_method
 from lare.errors import LareError
 from lare.latent.design import design
 from lare.latent.function import LatentFunction, per_role
@@ -57,12 +59,27 @@ def chosen_functions(
     task: TaskSpec, plan: Plan, given: LatentFunction | Sequence[LatentFunction] | None
 ) -> tuple[LatentFunction, ...]:
     """One for each role of the task, designed where none was given; none for a method that needs none."""
-    if find_method(plan.method).encoder is not Encoder.LATENT:
+    method = find_method(plan.method)
+    if method.encoder is not Encoder.LATENT:
         return ()
     if given is None:
-        return tuple(design(role, draw=plan.draw) for role in task.roles)
+        asked = partial(design, kind=method.kind, draw=plan.draw, candidates=plan.candidates)
+        return tuple(asked(role) for role in task.roles)
     functions = [given] if isinstance(given, LatentFunction) else given
+    for function in functions:
+        check_size(method, function.size * (2 if (plan.judges or task.judges) == "both" else 1))
     return tuple(function for function, _ in per_role(functions, task))
+
+
+def check_size(method: Method, factors: int) -> None:
+    """Raise `LareError` where a method can do nothing with so many factors."""
+    if method.reward is Reward.DESIGNED and factors != 1:
+        raise LareError(
+            f"{method.name} needs a function with one array, the reward, and this one has {factors}: "
+            "lare design TASK --kind reward writes one"
+        )
+    if method.fit is Fit.SIGNS and factors > LARGEST_CHOICE:
+        raise LareError(f"{method.name} tries all signs of at most {LARGEST_CHOICE} factors, and there are {factors}")
 
 
 def resume(directory: str | Path, *, tensorboard: bool = False, listeners: Sequence[Listener] | None = None) -> Run:

@@ -1,0 +1,152 @@
+"""Decoders that are linear in the factors, fitted to returns in closed form from running statistics of whole episodes.
+
+    r_hat = w . z + b
+
+With z_k the mean of the factors over the steps of episode k, and R_k/T its mean reward:
+
+    ridge    w = argmin sum_k (R_k/T - w . z_k - b)^2 + lambda |S w|^2    (LaRe, appendix B, the estimator of Proposition 1)
+    signs    w = argmin sum_k (R_k/T - w . z_k)^2  over  w in {-1, 1}^d,  b = 0    (LaRe without the reward model)
+
+S holds the deviations of the z_k, so that the scale of a factor changes nothing. Nothing here descends a gradient: what has
+been learned after k episodes is exact, and costs the same for each new episode.
+
+The estimator comes with a confidence radius. In units of S and of the largest |R/T|, with A = lambda I + sum_k x_k x_k^T over
+x_k = S^-1 (z_k - their mean), Proposition 1 says that with probability 1 - delta/10, for all k at once,
+
+    |w - w_hat|_A <= l_k = sqrt(d / 4 T log((1 + k L^2 / lambda) / (delta / 10))) + sqrt(lambda d)
+
+(its T-fold noise in a return is 1/T of that in a mean; L is the largest |x_k|), and so |r - r_hat| <= l_k |x|_{A^-1} where
+rewards are linear in the factors.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from lare.credit.decoders import Decoded
+
+LARGEST_CHOICE = 16
+"""Factors whose signs are searched through, all 2^d of them."""
+
+
+class Linear(eqx.Module):
+    """r_hat = w . z + b, on the factors as they are."""
+
+    weight: Float[Array, " features"]
+    bias: Float[Array, ""]
+
+    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
+        return Decoded(features @ self.weight + self.bias, jnp.zeros(()))
+
+
+class Totals(NamedTuple):
+    """Running statistics of v_k = (z_k, R_k/T) over episodes, and of the episode that is under way."""
+
+    episodes: Float[Array, ""]
+    mean: Float[Array, " features_and_reward"]
+    products: Float[Array, "features_and_reward features_and_reward"]
+    """sum_k (v_k - mean)(v_k - mean)^T"""
+    farthest: Float[Array, ""]
+    """The largest |R/T|."""
+    running: Float[Array, " features"]
+    """Sum of the factors since the episode began."""
+    steps: Float[Array, ""]
+    """Steps since then."""
+
+
+def no_totals(features: int) -> Totals:
+    zero, size = jnp.zeros(()), features + 1
+    return Totals(zero, jnp.zeros(size), jnp.zeros((size, size)), jnp.copy(zero), jnp.zeros(features), jnp.copy(zero))
+
+
+def take_in(
+    totals: Totals,
+    features: Float[Array, "time features"],
+    mean_reward: Float[Array, " time"],
+    ended: Bool[Array, " time"],
+) -> Totals:
+    """Take in steps that follow each other; `mean_reward` is R/T where an episode has `ended`.
+
+    The products grow by Welford's update (1962): no catastrophic cancellation.
+    """
+
+    def one(totals: Totals, step: tuple[Float[Array, " features"], Float[Array, ""], Bool[Array, ""]]):
+        row, reward, last = step
+        running, steps = totals.running + row, totals.steps + 1
+        v = jnp.append(running / steps, reward)
+        count = totals.episodes + 1
+        gap = v - totals.mean
+        mean = totals.mean + gap / count
+        over = Totals(
+            count,
+            mean,
+            totals.products + jnp.outer(gap, v - mean),
+            jnp.maximum(totals.farthest, jnp.abs(reward)),
+            jnp.zeros_like(running),
+            jnp.zeros_like(steps),
+        )
+        goes_on = totals._replace(running=running, steps=steps)
+        return jax.tree.map(lambda ended, on: jnp.where(last, ended, on), over, goes_on), None
+
+    return jax.lax.scan(one, totals, (features, mean_reward, ended))[0]
+
+
+def forget_running(totals: Totals) -> Totals:
+    """Without the episode that is under way."""
+    return totals._replace(running=jnp.zeros_like(totals.running), steps=jnp.zeros_like(totals.steps))
+
+
+def spread(totals: Totals) -> Float[Array, " features"]:
+    """S: the deviations of the episodes' mean factors; 1 for one that never varied."""
+    of_each = jnp.sqrt(jnp.diagonal(totals.products)[:-1] / jnp.maximum(totals.episodes, 1))
+    return jnp.where(of_each > 1e-6 * jnp.abs(totals.mean[:-1]), of_each, 1)
+
+
+def design_matrix(totals: Totals, ridge: float) -> Float[Array, "features features"]:
+    """A."""
+    unit = spread(totals)
+    return totals.products[:-1, :-1] / jnp.outer(unit, unit) + ridge * jnp.eye(len(unit))
+
+
+def ridge_regression(totals: Totals, ridge: float) -> Linear:
+    """The regularised least-squares estimate of the rewards."""
+    unit, mean = spread(totals), totals.mean
+    weight = jnp.linalg.solve(design_matrix(totals, ridge), totals.products[:-1, -1] / unit) / unit
+    return Linear(weight, mean[-1] - weight @ mean[:-1])
+
+
+def best_signs(totals: Totals) -> Linear:
+    """The signs for which the sum of the factors comes nearest to the returns; the first of them where some are equal."""
+    count, mean = totals.episodes, totals.mean
+    signs = jnp.asarray(np.array(list(itertools.product((1.0, -1.0), repeat=len(mean) - 1)), np.float32))
+    # Of v = (z, R/T) times (w, -1): the sum of the squares is that about the mean and k times that of the mean.
+    v = jnp.concatenate([signs, -jnp.ones((len(signs), 1))], axis=1)
+    error = jnp.sum((v @ totals.products) * v, axis=1) + count * (v @ mean) ** 2
+    return Linear(signs[jnp.argmin(error)], jnp.zeros(()))
+
+
+def uncertainty(
+    totals: Totals,
+    features: Float[Array, "rows features"],
+    length: int,
+    ridge: float,
+    delta: float,
+) -> Float[Array, " rows"]:
+    """l_k |x|_{A^-1}: how far, at most, r_hat is from the true reward of each row, in the rewards' units."""
+    unit = spread(totals)
+    x = (features - totals.mean[:-1]) / unit
+    inverse = jnp.linalg.inv(design_matrix(totals, ridge))
+    return radius(totals, length, ridge, delta) * jnp.sqrt(jnp.sum((x @ inverse) * x, axis=1))
+
+
+def radius(totals: Totals, length: int, ridge: float, delta: float) -> Float[Array, ""]:
+    """l_k of Proposition 1, in the rewards' units."""
+    size = len(totals.mean) - 1
+    largest = jnp.trace(design_matrix(totals, 0.0))
+    grown = jnp.log((1 + largest / ridge) / (delta / 10))
+    return totals.farthest * (jnp.sqrt(size * grown / (4 * length)) + jnp.sqrt(ridge * size))

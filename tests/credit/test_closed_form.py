@@ -1,0 +1,124 @@
+"""Closed forms against plain NumPy, and the confidence radius against what it promises."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lare.credit.closed_form import (
+    best_signs,
+    forget_running,
+    no_totals,
+    radius,
+    ridge_regression,
+    take_in,
+    uncertainty,
+)
+
+LENGTHS = (3, 7, 5, 9, 4, 6, 8)
+WEIGHT = np.array([1.5, -2.0, 0.5])
+
+
+def episodes(seed=0, noise=0.0, offset=0.0, count=1):
+    """Steps one behind the other: features, R/T where an episode ended, and where that is."""
+    rng, lengths = np.random.default_rng(seed), LENGTHS * count
+    rows = rng.normal(size=(sum(lengths), 3)) + offset
+    reward = rows @ WEIGHT + 0.7 + noise * rng.normal(size=len(rows))
+    ended = np.zeros(len(rows), bool)
+    ended[np.cumsum(lengths) - 1] = True
+    pieces = np.split(np.arange(len(rows)), np.cumsum(lengths)[:-1])
+    z = np.array([rows[piece].mean(axis=0) for piece in pieces])
+    y = np.array([reward[piece].mean() for piece in pieces])
+    at_its_end = np.full(len(rows), 99.0)
+    at_its_end[ended] = y
+    return rows, at_its_end, ended, z, y
+
+
+def taken(rows, at_its_end, ended, parts=1):
+    totals = no_totals(rows.shape[1])
+    for piece in np.array_split(np.arange(len(rows)), parts):
+        given = (jnp.asarray(part[piece], jnp.float32) for part in (rows, at_its_end))
+        totals = jax.jit(take_in)(totals, *given, jnp.asarray(ended[piece]))
+    return totals
+
+
+@pytest.mark.parametrize("parts", [1, 6])
+@pytest.mark.parametrize("offset", [0.0, 1000.0])
+def test_totals_against_numpy(parts, offset):
+    """In whatever pieces the steps come, and without cancellation where the mean is far from 0."""
+    rows, at_its_end, ended, z, y = episodes(offset=offset)
+    totals = taken(rows, at_its_end, ended, parts)
+    v = np.column_stack([z, y])
+    assert float(totals.episodes) == len(LENGTHS)
+    np.testing.assert_allclose(totals.mean, v.mean(axis=0), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(totals.products, (v - v.mean(axis=0)).T @ (v - v.mean(axis=0)), rtol=1e-2, atol=1e-2)
+    assert float(totals.farthest) == pytest.approx(np.abs(y).max(), rel=1e-5)
+
+
+def test_ridge_against_numpy():
+    rows, at_its_end, ended, z, y = episodes(noise=0.5)
+    found = ridge_regression(taken(rows, at_its_end, ended), ridge=2.0)
+    unit = z.std(axis=0)
+    x = (z - z.mean(axis=0)) / unit
+    w = np.linalg.solve(x.T @ x + 2.0 * np.eye(3), x.T @ (y - y.mean())) / unit
+    np.testing.assert_allclose(found.weight, w, rtol=1e-3)
+    assert float(found.bias) == pytest.approx(y.mean() - w @ z.mean(axis=0), rel=1e-3)
+
+
+def test_without_noise_ridge_finds_the_rewards():
+    rows, at_its_end, ended, *_ = episodes(count=4)
+    found = ridge_regression(taken(rows, at_its_end, ended), ridge=1e-4)
+    np.testing.assert_allclose(found.weight, WEIGHT, rtol=1e-2)
+    assert float(found.bias) == pytest.approx(0.7, rel=1e-2)
+
+
+def test_a_feature_that_never_varies_takes_no_weight():
+    rows, at_its_end, ended, *_ = episodes(count=2)
+    rows[:, 1] = 5.0
+    found = ridge_regression(taken(rows, at_its_end, ended), ridge=1.0)
+    assert float(found.weight[1]) == 0
+    assert np.isfinite(found.weight).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_signs_against_trying_all(seed):
+    rows, at_its_end, ended, z, y = episodes(seed, noise=2.0)
+    found = best_signs(taken(rows, at_its_end, ended))
+    errors = {signs: ((z @ signs - y) ** 2).sum() for signs in itertools.product((1.0, -1.0), repeat=3)}
+    assert tuple(np.asarray(found.weight)) == min(errors, key=errors.get)
+    assert float(found.bias) == 0
+
+
+def test_an_episode_that_is_forgotten_leaves_nothing():
+    rows, at_its_end, ended, *_ = episodes()
+    whole = taken(rows, at_its_end, ended)
+    begun = take_in(whole, jnp.ones((2, 3)), jnp.zeros(2), jnp.zeros(2, bool))
+    assert float(begun.steps) == 2
+    for a, b in zip(jax.tree.leaves(forget_running(begun)), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_radius_by_hand():
+    rows, at_its_end, ended, _, y = episodes()
+    totals = taken(rows, at_its_end, ended)
+    # d = 3, and the squares of x_k, in units of their deviation, add up to d times the episodes.
+    grown = np.log((1 + 3 * len(LENGTHS) / 2.0) / (0.1 / 10))
+    want = np.abs(y).max() * (np.sqrt(3 * grown / (4 * 10)) + np.sqrt(2.0 * 3))
+    assert float(radius(totals, 10, 2.0, 0.1)) == pytest.approx(want, rel=1e-3)
+
+
+def test_uncertainty_holds_and_shrinks():
+    """Rewards that are linear in the factors lie within it, and more episodes make it smaller."""
+    widths = []
+    for count in (1, 16):
+        rows, at_its_end, ended, *_ = episodes(noise=0.3, count=count)
+        totals = taken(rows, at_its_end, ended)
+        found = ridge_regression(totals, 1.0)
+        x = jnp.asarray(rows[:50], jnp.float32)
+        width = uncertainty(totals, x, length=6, ridge=1.0, delta=0.1)
+        r_hat = found(x, None).r_hat
+        assert (np.abs(r_hat - (rows[:50] @ WEIGHT + 0.7)) <= np.asarray(width)).all()
+        widths.append(float(width.mean()))
+    assert widths[1] < widths[0] / 2
