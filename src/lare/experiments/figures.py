@@ -57,7 +57,29 @@ def curves(by_name: Mapping[str, Curve], label: str, *, from_zero: bool = False)
     if from_zero:
         axes.set_ylim(bottom=0)
     axes.set(xlabel="environment steps", ylabel=label)
-    axes.xaxis.set_major_formatter(lambda x, _: f"{x / 1e6:g}M" if x >= 1e6 else f"{x / 1e3:g}k" if x else "0")
+    axes.xaxis.set_major_formatter(in_thousands)
+    legend_above(axes)
+    return svg(figure)
+
+
+def in_thousands(x: float, _: Any) -> str:
+    return f"{x / 1e6:g}M" if x >= 1e6 else f"{x / 1e3:g}k" if x else "0"
+
+
+Points = Float[np.ndarray, " points"]
+
+
+def bands(
+    by_name: Mapping[str, tuple[Points, Points, Points, Points]], across: str, up: str, steps: bool = False
+) -> str:
+    """Curves (x, y), each with an interval (low, high) at every point; `steps` where x counts them."""
+    figure, (axes,) = new_figure()
+    for colour, (name, (x, y, low, high)) in zip(COLOURS * len(by_name), by_name.items(), strict=False):
+        axes.plot(x, y, color=colour, label=name)
+        axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0)
+    axes.set(xlabel=across, ylabel=up)
+    if steps:
+        axes.xaxis.set_major_formatter(in_thousands)
     legend_above(axes)
     return svg(figure)
 
@@ -72,6 +94,9 @@ def credit(
     if uncertainty is not None:
         band = (proxy - uncertainty, proxy + uncertainty)
         axes.fill_between(np.arange(len(proxy)), *band, color=COLOURS[0], alpha=0.2, linewidth=0)
+        # A band that leaves the picture must not flatten the curves in it.
+        low, high = (pick(np.append(reward, proxy)) for pick in (np.min, np.max))
+        axes.set_ylim(low - (high - low), high + (high - low))
     axes.plot(reward, color="#999999", linewidth=1.6, label="true reward")
     axes.plot(proxy, color=COLOURS[0], linewidth=0.9, label="proxy reward")
     axes.set(xlabel="step of the episode", ylabel="reward")

@@ -1,7 +1,36 @@
-"""Pieces of a page."""
+"""Pieces of a page, and the page."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
+from importlib.resources import files
+from pathlib import Path
+
+from lare.errors import LareError
+
+PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+{style}</style>
+</head>
+<body>
+{body}
+</body>
+</html>
+"""
+
+
+def write_page(path: Path, title: str, body: str) -> Path:
+    """One HTML file that needs nothing else. Raises `LareError` where it cannot be written."""
+    style = (files("lare.experiments") / "report.css").read_text(encoding="utf-8")
+    try:
+        path.write_text(PAGE.format(title=escape(title), style=style, body=body), encoding="utf-8")
+    except OSError as error:
+        raise LareError(f"the report {path} cannot be written: {error.strerror}") from error
+    return path
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:

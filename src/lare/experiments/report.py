@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterable, Sequence
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +14,9 @@ from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
 from lare.experiments.credit import DELTA, credit_of, factor_labels
-from lare.experiments.html import function_text, note, table
+from lare.experiments.html import function_text, note, table, write_page
 from lare.training.run import Run, open_run
 from lare.training.settings import Settings, decide
-
-PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-{style}</style>
-</head>
-<body>
-{body}
-</body>
-</html>
-"""
 
 
 def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> Path:
@@ -61,12 +45,7 @@ def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> P
         parts.extend(learning(task, chosen))
     for name, run in zip(names, opened, strict=True):
         parts.extend(details(name, run))
-    style = (files("lare.experiments") / "report.css").read_text(encoding="utf-8")
-    try:
-        path.write_text(PAGE.format(title=escape(title), style=style, body="\n".join(parts)), encoding="utf-8")
-    except OSError as error:
-        raise LareError(f"the report {path} cannot be written: {error.strerror}") from error
-    return path
+    return write_page(path, title, "\n".join(parts))
 
 
 def labels(runs: Sequence[Run]) -> list[str]:

@@ -124,9 +124,7 @@ class Run:
 
     def metrics(self) -> list[dict[str, Any]]:
         """Every complete line of metrics.jsonl, in order."""
-        path = self.directory / METRICS
-        lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
-        return [json.loads(line) for line in lines if line.endswith("\n")]
+        return read_metrics(self.directory)
 
     def append(self, lines: Sequence[dict[str, Any]]) -> int:
         """Add lines to metrics.jsonl; returns how long the file is then."""
@@ -201,6 +199,24 @@ def default_directory(task: TaskSpec, plan: Plan) -> Path:
     return directory
 
 
+def read_config(directory: Path) -> Config:
+    """What a run depends on. Raises `LareError` where there is no run, or no sense in it."""
+    path = directory / CONFIG
+    if not path.is_file():
+        raise LareError(f"{directory} is not a run: there is no {CONFIG} in it")
+    try:
+        return Config(**json.loads(path.read_text(encoding="utf-8")))
+    except (LareError, OSError, ValueError, TypeError) as error:
+        raise LareError(f"{path}: {error}") from error
+
+
+def read_metrics(directory: Path) -> list[dict[str, Any]]:
+    """Every complete line of a run's metrics.jsonl, in order."""
+    path = directory / METRICS
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
+    return [json.loads(line) for line in lines if line.endswith("\n")]
+
+
 def open_run(directory: str | Path) -> Run:
     """Read a run directory; its latent function is verified again before anything executes it.
 
@@ -208,14 +224,7 @@ def open_run(directory: str | Path) -> Run:
         LareError: it is not a run, or its files are not what they should be.
     """
     directory = Path(directory)
-    path = directory / CONFIG
-    if not path.is_file():
-        raise LareError(f"{directory} is not a run: there is no {CONFIG} in it")
-    try:
-        config = Config(**json.loads(path.read_text(encoding="utf-8")))
-    except (LareError, OSError, ValueError, TypeError) as error:
-        raise LareError(f"{path}: {error}") from error
-    functions = []
+    config, functions = read_config(directory), []
     for role, digest in zip(config.task.roles, config.function_sha256, strict=bool(config.function_sha256)):
         place = directory / function_file(config.task, role)
         function = load(place, role)

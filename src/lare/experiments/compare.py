@@ -1,0 +1,86 @@
+"""A comparison of methods as a page: the table, and the figures that rliable's authors ask for."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+
+from lare.errors import LareError
+from lare.experiments import figures
+from lare.experiments.html import note, table, write_page
+from lare.experiments.statistics import REFERENCES, REPETITIONS, Band, Comparison, compare, rounded
+from lare.training.run import CONFIG, Run, read_config
+
+HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "better than first [95%]")
+
+
+def find_runs(places: Sequence[Path]) -> list[Run]:
+    """The runs that are given, and those in directories that are given, as that of a sweep.
+
+    Raises:
+        LareError: there is none in one of them.
+    """
+    runs = []
+    for place in places:
+        found = [place] if (place / CONFIG).is_file() else sorted(path.parent for path in place.glob(f"*/*/{CONFIG}"))
+        if not found:
+            raise LareError(f"{place} is no run, and there is none in it")
+        # What they measured is all that is needed of them: their functions are left alone.
+        runs += [Run(directory, read_config(directory), ()) for directory in found]
+    return runs
+
+
+def cells(comparison: Comparison) -> list[tuple[str, ...]]:
+    """The table, as text."""
+    return [
+        (
+            row.label,
+            str(row.seeds),
+            str(row.draws),
+            str(row.iqm),
+            f"{rounded(row.mean, row.deviation)} ± {rounded(row.deviation, row.deviation)}",
+            "-" if row.over_draws is None else str(row.over_draws),
+            "-" if row.better is None else str(row.better),
+        )
+        for row in comparison.rows
+    ]
+
+
+def what_scores_are(comparison: Comparison) -> str:
+    """In a sentence or two."""
+    if not comparison.normalised:
+        return f"Scores are true returns on {comparison.tasks[0]} at the last evaluation that all runs share."
+    ends = (f"{task}: 0 is {REFERENCES[task][0]:g}, 1 is {REFERENCES[task][1]:g}" for task in comparison.tasks)
+    return f"Scores are true returns at the last evaluation that all runs share, between fixed ends. {'; '.join(ends)}."
+
+
+def write_comparison(runs: Sequence[Run], out: Path) -> Comparison:
+    """Compare runs, and write the page.
+
+    Raises:
+        LareError: they cannot be compared, or the file not be written.
+    """
+    comparison = compare(runs)
+    title = f"{', '.join(comparison.tasks)}: {', '.join(row.label for row in comparison.rows)}"
+    write_page(out, title, "\n".join(body(title, comparison)))
+    return comparison
+
+
+def body(title: str, comparison: Comparison) -> Iterable[str]:
+    yield f"<h1>{escape(title)}</h1>"
+    yield table(HEAD, cells(comparison), range(1, len(HEAD)))
+    yield note(
+        what_scores_are(comparison)
+        + f" IQM: interquartile mean. Intervals: stratified bootstrap over the seeds, {REPETITIONS} "
+        "repetitions; over the draws of the language model where it says draws. sd: standard deviation over the seeds. Better than "
+        "first: the probability that a run scores more than one of the first method."
+    )
+    score = "score" if comparison.normalised else "true return"
+    yield from figure("Learning", comparison.curves, "environment steps", f"IQM of the {score}", steps=True)
+    yield from figure("Performance profiles", comparison.profiles, f"x ({score})", "share of runs that score more")
+
+
+def figure(title: str, bands: Mapping[str, Band], across: str, up: str, *, steps: bool = False) -> Iterable[str]:
+    yield f"<h2>{title}</h2>"
+    yield figures.bands(
+        {label: (one.x, one.value, one.low, one.high) for label, one in bands.items()}, across, up, steps
+    )

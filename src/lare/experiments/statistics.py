@@ -1,0 +1,235 @@
+"""Honest statistics of few runs (Agarwal et al., "Deep RL at the edge of the statistical precipice", NeurIPS 2021), by rliable.
+
+A *score* is a run's return at its last evaluation: as it is where there is one task, else between 0, what a random policy
+earns, and 1, a fixed reference (`REFERENCES`). Intervals are of 95%, by stratified bootstrap over the seeds; and apart from
+that over the draws of the language model, where a method was trained on several, each of them a mean over its seeds.
+"""
+
+import contextlib
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lare.errors import LareError
+from lare.training.run import Run
+
+REFERENCES = {
+    "Reacher-v4": (-44.0, -2.7),
+    "Walker2d-v4": (3.4, 4600.0),
+    "HalfCheetah-v4": (-271.0, 10_200.0),
+}
+"""Returns that count as 0 and as 1. 0: mean over 20 episodes of uniformly random actions. 1: TD3 on true rewards after a
+million steps, the upper end of what public benchmarks report."""
+
+REPETITIONS = 2000
+"""Of the bootstrap."""
+
+Scores = Float[np.ndarray, "runs tasks *steps"]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and its 95% interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        shown = (rounded(number, self.high - self.low) for number in (self.value, self.low, self.high))
+        return "{} [{}, {}]".format(*shown)
+
+
+def rounded(number: float, spread: float) -> str:
+    """A number to three digits of its spread, or to three places where it has none."""
+    places = 3 if spread <= 0 else min(max(2 - math.floor(math.log10(spread)), 0), 3)
+    return f"{number:.{places}f}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method, over all tasks."""
+
+    label: str
+    seeds: int
+    draws: int
+    iqm: Estimate
+    """Interquartile mean, its interval over the seeds."""
+    mean: float
+    deviation: float
+    """Standard deviation over the seeds of their means over the tasks."""
+    over_draws: Estimate | None
+    """The mean, its interval over the draws; None where there is one draw."""
+    better: Estimate | None
+    """Probability that a run of it scores more than one of the first method; None for the first."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """A curve with an interval at each of its points."""
+
+    x: Float[np.ndarray, " points"]
+    value: Float[np.ndarray, " points"]
+    low: Float[np.ndarray, " points"]
+    high: Float[np.ndarray, " points"]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What can be said of some runs."""
+
+    tasks: tuple[str, ...]
+    rows: tuple[Row, ...]
+    curves: Mapping[str, Band]
+    """Interquartile mean by steps."""
+    profiles: Mapping[str, Band]
+    """Share of runs that score more than x."""
+    normalised: bool
+
+
+@dataclass(frozen=True)
+class Group:
+    """The runs of one method."""
+
+    label: str
+    seeds: tuple[int, ...]
+    draws: tuple[int, ...]
+    steps: tuple[int, ...]
+    scores: Float[np.ndarray, "draws seeds tasks steps"]
+
+
+def compare(runs: Sequence[Run]) -> Comparison:
+    """Compare methods by their runs, on the tasks that all of them were trained on.
+
+    Raises:
+        LareError: the runs do not make up a whole table, or rliable is not there.
+    """
+    groups, tasks = grouped(runs)
+    by_seed = {group.label: group.scores.mean(axis=0) for group in groups}
+    last = {label: scores[..., -1] for label, scores in by_seed.items()}
+    names = tuple(last)
+    taus = np.linspace(min(map(np.min, last.values())), max(map(np.max, last.values())), 101)
+    steps = np.array(groups[0].steps, float)
+    return Comparison(
+        tasks,
+        tuple(row(group, last, names[0]) for group in groups),
+        {label: band(steps, scores, curve_of_iqm) for label, scores in by_seed.items()},
+        {label: band(taus, scores, lambda scores: share_above(scores, taus)) for label, scores in last.items()},
+        len(tasks) > 1,
+    )
+
+
+def grouped(runs: Sequence[Run]) -> tuple[list[Group], tuple[str, ...]]:
+    """The runs by method, and the tasks. Raises `LareError` where a table of them would have holes."""
+    tasks = tuple(sorted({run.config.task.name for run in runs}))
+    if len(tasks) > 1 and (unknown := [task for task in tasks if task not in REFERENCES]):
+        raise LareError(
+            f"there is no reference for {', '.join(unknown)}, so its returns cannot be laid beside those of other tasks: "
+            "compare the runs of each task by themselves"
+        )
+    labels = list(dict.fromkeys(label for _, label in labelled(runs)))
+    curves: dict[tuple[str, str, int, int], tuple[Run, dict[int, float]]] = {}
+    for run, label in labelled(runs):
+        for seed in run.seeds:
+            key = (label, run.config.task.name, run.config.settings.draw, seed)
+            if key in curves:
+                other = curves[key][0].directory
+                raise LareError(
+                    f"{run.directory} and {other} are both {label} on {key[1]} with seed {seed}: leave one out"
+                )
+            curves[key] = run, curve(run, seed)
+    steps = sorted(set.intersection(*(set(values) for _, values in curves.values())))
+    if not steps:
+        raise LareError("the runs have no step in common at which all of them were evaluated")
+    return [group_of(label, tasks, curves, steps) for label in labels], tasks
+
+
+def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[int]) -> Group:
+    draws, seeds = (sorted({key[place] for key in curves if key[0] == label}) for place in (2, 3))
+
+    def values(draw: int, seed: int, task: str) -> list[float]:
+        if (label, task, draw, seed) not in curves:
+            raise LareError(f"{label} on {task} lacks a run with seed {seed} and draw {draw}, which it has elsewhere")
+        found = curves[label, task, draw, seed][1]
+        low, high = REFERENCES[task] if len(tasks) > 1 else (0.0, 1.0)
+        return [(found[step] - low) / (high - low) for step in steps]
+
+    scores = [[[values(draw, seed, task) for task in tasks] for seed in seeds] for draw in draws]
+    return Group(label, tuple(seeds), tuple(draws), tuple(steps), np.array(scores))
+
+
+def labelled(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
+    """Each run and its method; with the algorithm where several are compared."""
+    plans = [run.config.settings for run in runs]
+    several = len({plan.algorithm for plan in plans}) > 1
+    for run, plan in zip(runs, plans, strict=True):
+        yield run, f"{plan.method}, {plan.algorithm}" if several else plan.method
+
+
+def curve(run: Run, seed: int) -> dict[int, float]:
+    """True return by step."""
+    return {line["step"]: line["evaluation/return"] for line in run.metrics() if line["seed"] == seed}
+
+
+def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:
+    metrics, mine = rliable()[1], last[group.label]
+    (iqm,) = estimates(mine, lambda scores: np.array([metrics.aggregate_iqm(scores)]))
+    over_draws = better = None
+    if len(group.draws) > 1:
+        (over_draws,) = estimates(group.scores[..., -1].mean(axis=1), lambda scores: np.array([np.mean(scores)]))
+    if group.label != first:
+        (better,) = estimates((mine, last[first]), lambda *both: np.array([metrics.probability_of_improvement(*both)]))
+    of_seeds = mine.mean(axis=1)
+    mean, deviation = float(of_seeds.mean()), float(np.std(of_seeds, ddof=min(1, len(mine) - 1)))
+    return Row(group.label, len(group.seeds), len(group.draws), iqm, mean, deviation, over_draws, better)
+
+
+def curve_of_iqm(scores: Scores) -> np.ndarray:
+    metrics = rliable()[1]
+    return np.array([metrics.aggregate_iqm(scores[..., step]) for step in range(scores.shape[-1])])
+
+
+def share_above(scores: Scores, taus: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points"]:
+    """The run-score distribution."""
+    return np.mean(scores[..., None] > taus, axis=(0, 1))
+
+
+def band(x: Float[np.ndarray, " points"], scores: Scores, function: Callable[..., np.ndarray]) -> Band:
+    found = estimates(scores, function)
+    return Band(x, *(np.array([getattr(one, part) for one in found]) for part in ("value", "low", "high")))
+
+
+def estimates(scores: Scores | tuple[Scores, Scores], function: Callable[..., np.ndarray]) -> list[Estimate]:
+    """What `function` gives, with intervals by stratified bootstrap, always from the same random numbers."""
+    library, _ = rliable()
+    with warnings.catch_warnings(), random_numbers(0):
+        warnings.simplefilter("ignore")  # of the libraries beneath it about each other
+        points, intervals = library.get_interval_estimates({"": scores}, function, reps=REPETITIONS)
+    values = np.atleast_1d(points[""])
+    return [Estimate(*map(float, one)) for one in zip(values, *np.reshape(intervals[""], (2, -1)), strict=True)]
+
+
+@contextlib.contextmanager
+def random_numbers(seed: int) -> Iterator[None]:
+    """NumPy's own random numbers from a seed: rliable draws them there, whatever state it is given."""
+    state = np.random.get_state()
+    np.random.seed(seed)
+    try:
+        yield
+    finally:
+        np.random.set_state(state)
+
+
+def rliable():
+    """Rliable's library and its metrics."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            from rliable import library, metrics
+    except ImportError:
+        raise LareError("lare compare needs an extra: pip install 'lare-rl[statistics]'") from None
+    return library, metrics

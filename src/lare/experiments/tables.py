@@ -1,0 +1,51 @@
+"""The metrics of many runs as one table on the disk, that anybody can load."""
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from lare.training.checkpoint import write_atomically
+from lare.training.run import CONFIG, read_config, read_metrics
+
+KEYS = ("task", "method", "algorithm", "judges", "draw", "seed", "step")
+
+
+def rows_of(directories: Iterable[Path]) -> list[dict[str, Any]]:
+    """A row for each run, seed and evaluation."""
+    rows = []
+    for directory in directories:
+        if not (directory / CONFIG).is_file():
+            continue
+        config = read_config(directory)
+        plan = config.settings
+        run = {
+            "task": config.task.name,
+            "method": plan.method,
+            "algorithm": plan.algorithm,
+            "judges": plan.judges or config.task.judges,
+            "draw": plan.draw,
+        }
+        rows += [run | line for line in read_metrics(directory)]
+    return rows
+
+
+def write_table(rows: Sequence[dict[str, Any]], path: Path) -> list[Path]:
+    """Write PATH.csv, and PATH.parquet where the extra `statistics` is there; returns what was written."""
+    names = [*KEYS, *sorted({name for row in rows for name in row} - {*KEYS})]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names)
+    writer.writeheader()
+    writer.writerows(rows)
+    written = [path.with_suffix(".csv")]
+    write_atomically(written[0], lambda file: file.write(text.getvalue().encode()))
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        return written
+    table = pyarrow.Table.from_pylist([{name: row.get(name) for name in names} for row in rows])
+    written.append(path.with_suffix(".parquet"))
+    write_atomically(written[1], lambda file: parquet.write_table(table, file))
+    return written

@@ -1,0 +1,131 @@
+"""Statistics of made-up runs, whose answers are known."""
+
+import json
+
+import numpy as np
+import pytest
+
+from lare.errors import LareError
+from lare.experiments import statistics
+from lare.experiments.compare import find_runs, write_comparison
+from lare.training.run import Run, describe
+from lare.training.settings import Settings, decide
+from toys import toy_spec
+
+
+@pytest.fixture(autouse=True)
+def few_repetitions(monkeypatch):
+    monkeypatch.setattr(statistics, "REPETITIONS", 300)
+
+
+@pytest.fixture
+def made(tmp_path):
+    """Makes a run directory: configuration and metrics, nothing trained."""
+
+    def make(name, returns, task="Chase", steps=(50, 100), method="dense", **settings):
+        spec = toy_spec(name=task)
+        plan = decide(Settings(method=method, steps=100, seeds=len(returns), **settings), spec)
+        directory = tmp_path / "runs" / task / name
+        directory.mkdir(parents=True)
+        config = describe(spec, plan, ())
+        (directory / "config.json").write_text(config.model_dump_json())
+        lines = [
+            {"step": step, "seed": seed, "evaluation/return": value * share}
+            for step, share in zip(steps, (0.5, 1.0), strict=True)
+            for seed, value in zip(plan.all_seeds, returns, strict=True)
+        ]
+        (directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        return Run(directory, config, ())
+
+    return make
+
+
+def test_figures_by_hand(made):
+    """The interquartile mean of 8 numbers leaves out the two at either end."""
+    values = [-100.0, 1, 2, 3, 4, 5, 6, 1000]
+    found = statistics.compare([made("a", values), made("b", [v + 0.5 for v in values], method="rrdu")])
+    first, second = found.rows
+    assert first.iqm.value == pytest.approx(np.mean([2, 3, 4, 5]))
+    assert first.mean == pytest.approx(np.mean(values))
+    assert first.deviation == pytest.approx(np.std(values, ddof=1))
+    assert first.iqm.low <= first.iqm.value <= first.iqm.high
+    assert first.better is None
+    pairs = [(x + 0.5 > y) + 0.5 * (x + 0.5 == y) for x in values for y in values]
+    assert second.better.value == pytest.approx(np.mean(pairs))
+    np.testing.assert_allclose(found.curves["dense"].x, [50, 100])
+    np.testing.assert_allclose(found.curves["dense"].value, [3.5 / 2, 3.5])
+    profile = found.profiles["dense"]
+    np.testing.assert_allclose(profile.value, [np.mean(np.array(values) > x) for x in profile.x])
+
+
+def test_intervals_hold_what_they_promise():
+    """Of the mean of 10 normal numbers, in most of 60 tries; a bootstrap of few is a little too sure of itself."""
+    rng = np.random.default_rng(0)
+    inside = 0
+    for _ in range(60):
+        (one,) = statistics.estimates(rng.normal(size=(10, 1)), lambda scores: np.array([scores.mean()]))
+        inside += one.low <= 0 <= one.high
+    assert 46 <= inside <= 60
+
+
+def test_the_same_runs_give_the_same_intervals(made):
+    runs = [made("a", [1.0, 2, 5])]
+    assert statistics.compare(runs).rows == statistics.compare(runs).rows
+
+
+def test_draws_are_told_apart_from_seeds(made):
+    """Seeds differ by 100, draws by 1: the interval over draws is the narrow one."""
+    runs = [made(f"draw{draw}", [draw, draw + 100.0], method="lare-rrdu", draw=draw) for draw in range(3)]
+    (row,) = statistics.compare(runs).rows
+    assert (row.seeds, row.draws) == (2, 3)
+    assert row.over_draws.value == pytest.approx(51)
+    assert (row.over_draws.low, row.over_draws.high) == (pytest.approx(50, abs=0.5), pytest.approx(52, abs=0.5))
+    assert row.iqm.high - row.iqm.low == pytest.approx(100)
+
+
+def test_several_tasks_are_laid_between_fixed_ends(made, tmp_path):
+    runs = [made("a", [-44.0, -2.7], "Reacher-v4"), made("b", [4600.0, 4600.0], "Walker2d-v4")]
+    found = write_comparison(runs, tmp_path / "page.html")
+    assert found.normalised
+    assert found.rows[0].mean == pytest.approx(np.mean([0, 1, 1, 1]))
+    page = (tmp_path / "page.html").read_text()
+    assert "Reacher-v4: 0 is -44, 1 is -2.7; Walker2d-v4: 0 is 3.4, 1 is 4600." in page
+    assert page.count("<svg") == 2
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        (
+            [("a", "Chase", {}), ("b", "Reacher-v4", {})],
+            "there is no reference for Chase, so its returns cannot be laid beside those of other tasks: compare the runs of "
+            "each task by themselves",
+        ),
+        (
+            [("a", "Chase", {}), ("b", "Chase", {"td3": {"gamma": 0.9}})],
+            "{runs}/Chase/b and {runs}/Chase/a are both dense on Chase with seed 0: leave one out",
+        ),
+        (
+            [("a", "Walker2d-v4", {}), ("a", "Reacher-v4", {}), ("b", "Reacher-v4", {"seed": 2})],
+            "dense on Walker2d-v4 lacks a run with seed 2 and draw 0, which it has elsewhere",
+        ),
+        (
+            [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": (60, 70)})],
+            "the runs have no step in common at which all of them were evaluated",
+        ),
+    ],
+)
+def test_what_cannot_be_compared(runs, message, made, tmp_path):
+    opened = [made(name, [1.0, 2.0], task, **settings) for name, task, settings in runs]
+    with pytest.raises(LareError) as error:
+        statistics.compare(opened)
+    assert str(error.value) == message.format(runs=tmp_path / "runs")
+
+
+def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):
+    made("a", [1.0]), made("b", [2.0], method="rd")
+    found = find_runs([tmp_path / "runs"])
+    assert [run.config.settings.method for run in found] == ["dense", "rd"]
+    assert find_runs([tmp_path / "runs" / "Chase" / "a"])[0].directory == found[0].directory
+    with pytest.raises(LareError, match=r"nothing is no run, and there is none in it$"):
+        find_runs([tmp_path / "nothing"])

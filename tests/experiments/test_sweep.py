@@ -1,0 +1,199 @@
+"""Sweeps: what is asked for, what is missing, what is said of mistakes; and one that really trains."""
+
+import csv
+import signal
+
+import pytest
+
+import lare
+from lare.errors import LareError
+from lare.experiments import sweep
+from lare.experiments.sweep import read_sweep, run_sweep, shares, train_one
+from lare.experiments.tables import rows_of, write_table
+from lare.training.train import Interrupted
+from toys import At
+
+FILE = """
+tasks = ["Reacher-v4"]
+methods = ["dense", "lare-linear"]
+draws = [0, 3]
+
+[settings]
+steps = 200
+seeds = 2
+chunk = 50
+evaluate_every = 100
+evaluation_episodes = 1
+td3 = { hidden = [8], warmup = 100, batch_size = 8 }
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "small.toml"
+    path.write_text(FILE)
+    return path
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """No process for each run; the jobs that were trained."""
+    trained = []
+
+    def train(job, cores, running):
+        trained.append(job.name)
+        train_one(sweep.as_json(job))
+
+    monkeypatch.setattr(sweep, "in_a_process", train)
+    monkeypatch.setattr(lare.training.train, "Terminal", lambda: At(-1, None))
+    return trained
+
+
+def test_every_run_that_is_asked_for(file, tmp_path):
+    _, jobs = read_sweep(file)
+    assert [job.name for job in jobs] == [
+        "Reacher-v4/dense-td3",
+        "Reacher-v4/lare-linear-td3-draw0",
+        "Reacher-v4/lare-linear-td3-draw3",
+    ]
+    assert jobs[0].directory == tmp_path / "runs" / "small" / "Reacher-v4" / "dense-td3"
+    assert [job.plan.draw for job in jobs] == [0, 0, 3]
+    assert {job.plan.steps for job in jobs} == {200}
+    assert not any(job.done or job.begun for job in jobs)
+
+
+def test_what_is_done_is_left_alone_and_what_was_begun_goes_on(file, in_this_process):
+    wanted, (dense, first, second) = read_sweep(file)
+    train_one(sweep.as_json(dense))
+    stop = At(100, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(Interrupted):
+        lare.train(first.task, lare.Settings(**first.plan.model_dump()), out=first.directory, listeners=[stop])
+    killed_early = second.directory
+    killed_early.mkdir(parents=True)
+    (killed_early / "latent_function.py").write_text("half of i")
+    wanted, jobs = read_sweep(file)
+    said = []
+    assert run_sweep(wanted, jobs, said.append) == []
+    assert in_this_process == [first.name, second.name]
+    assert sorted(said) == sorted(
+        [
+            "3 runs, 1 of them done",
+            f"{first.name} begins again at step 100",
+            f"2 of 3: {first.name} is done",
+            f"{second.name} begins",
+            f"3 of 3: {second.name} is done",
+        ]
+    )
+    assert all(job.done for job in jobs)
+    in_this_process.clear()
+    assert run_sweep(wanted, jobs, said.append) == []
+    assert in_this_process == []
+
+
+def test_one_table_of_everything(file, in_this_process, tmp_path):
+    wanted, jobs = read_sweep(file)
+    run_sweep(wanted, jobs[:1], lambda _: None)
+    rows = rows_of([*(job.directory for job in jobs), tmp_path / "nothing"])
+    assert len(rows) == 2 * 2
+    rows[-1]["credit/error"] = 0.5
+    written = write_table(rows, tmp_path / "results")
+    assert [path.name for path in written] == ["results.csv", "results.parquet"]
+    with written[0].open() as opened:
+        table = list(csv.DictReader(opened))
+    assert [(row["method"], row["draw"], row["seed"], row["step"]) for row in table[:4]] == [
+        ("dense", "0", "0", "100"),
+        ("dense", "0", "1", "100"),
+        ("dense", "0", "0", "200"),
+        ("dense", "0", "1", "200"),
+    ]
+    assert [row["credit/error"] for row in table] == ["", "", "", "0.5"]
+    from pyarrow import parquet
+
+    columns = parquet.read_table(written[1]).to_pydict()
+    assert columns["credit/error"] == [None, None, None, 0.5]
+    assert columns["evaluation/return"] == [float(row["evaluation/return"]) for row in table]
+
+
+def test_a_run_that_fails_is_named_and_the_others_go_on(file, monkeypatch):
+    wanted, jobs = read_sweep(file)
+    monkeypatch.setattr(sweep, "in_a_process", lambda job, cores, running: "no luck" if "draw3" in job.name else None)
+    said = []
+    assert run_sweep(wanted, jobs, said.append) == [jobs[2]]
+    assert any(line.endswith("Reacher-v4/lare-linear-td3-draw3 failed: no luck") for line in said)
+
+
+def test_a_whole_sweep_from_the_command_line(command, file, tmp_path):
+    """Processes of their own, a log for each, a table, and a page of statistics."""
+    file.write_text(FILE.replace("draws = [0, 3]", ""))
+    status, out, err = command("sweep", file)
+    assert status == 0, err
+    root = tmp_path / "runs" / "small"
+    assert out == f"wrote {root}/results.csv\nwrote {root}/results.parquet\n"
+    assert err.splitlines()[-1].startswith("2 of 2: Reacher-v4/")
+    assert "step 200 of 200" in (root / "Reacher-v4" / "dense-td3.log").read_text()
+    status, out, _ = command("compare", root)
+    assert status == 0
+    assert out.splitlines()[-1] == "wrote compare.html"
+    assert [line.split()[0] for line in out.splitlines()[1:] if line.startswith(("dense", "lare"))] == [
+        "dense",
+        "lare-linear",
+    ]
+
+
+def test_on_a_local_ray(command, file, tmp_path):
+    file.write_text(FILE.replace('"dense", ', "").replace("[0, 3]", "[0]"))
+    status, out, err = command("sweep", file, "--ray", "local")
+    assert status == 0, err
+    assert err.splitlines()[-1] == "1 of 1: Reacher-v4/lare-linear-td3-draw0 is done"
+    assert read_sweep(file)[1][0].done
+
+
+def test_a_process_that_fails_says_why(file, tmp_path):
+    _, jobs = read_sweep(file)
+    jobs[0].directory.mkdir(parents=True)  # as if another sweep had just begun it
+    error = sweep.in_a_process(jobs[0], [], set())
+    log = jobs[0].directory.with_name("dense-td3.log")
+    assert error == (
+        f"{jobs[0].directory} exists, and a run never overwrites another: choose another --out, or go on with --resume ({log})"
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("tasks", "task"), "the key 'tasks' is missing (and 1 more)"),
+        (('"dense"', '"dence"'), "no method 'dence' (did you mean 'dense'?); the methods are "),
+        (('["Reacher-v4"]', "[]"), "tasks = []: tuple should have at least 1 item after validation, not 0"),
+        (("seeds = 2", "seed = -1"), "seed = -1: input should be greater than or equal to 0"),
+        (("steps = 200", "steps = 201"), "steps = 201 is not a multiple of chunk = 50: take 200"),
+        (('["Reacher-v4"]', '["Reacher-v5"]'), "no task 'Reacher-v5'"),
+        (("[settings]", "[settings"), "Expected"),
+    ],
+)
+def test_a_file_that_lies(change, message, file):
+    file.write_text(FILE.replace(*change))
+    with pytest.raises(LareError) as error:
+        read_sweep(file)
+    assert str(error.value).startswith(f"{file}: {message}")
+
+
+def test_a_directory_with_something_else_in_it(file, in_this_process):
+    wanted, jobs = read_sweep(file)
+    run_sweep(wanted, jobs[:1], lambda _: None)
+    file.write_text(FILE.replace("steps = 200", "steps = 400"))
+    with pytest.raises(LareError) as error:
+        read_sweep(file)
+    assert str(error.value) == (
+        f"{jobs[0].directory} holds a run of other settings or of another task: choose another out"
+    )
+    jobs[1].directory.mkdir(parents=True)
+    (jobs[1].directory / "thesis.tex").write_text("")
+    file.write_text(FILE)
+    with pytest.raises(LareError) as error:
+        read_sweep(file)
+    assert str(error.value) == f"{jobs[1].directory} exists, and is not a run: choose another out"
+
+
+def test_more_cores_than_there_are():
+    with pytest.raises(LareError, match=r"^processes = 1000 of cores = 3 are 3000 cores, and this machine lends \d+$"):
+        shares(1000, 3)
