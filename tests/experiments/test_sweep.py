@@ -142,7 +142,7 @@ def test_a_whole_sweep_from_the_command_line(command, file, tmp_path):
 
 def test_on_a_local_ray(command, file, tmp_path):
     file.write_text(FILE.replace('"dense", ', "").replace("[0, 3]", "[0]"))
-    status, out, err = command("sweep", file, "--ray", "local")
+    status, _, err = command("sweep", file, "--ray", "local")
     assert status == 0, err
     assert err.splitlines()[-1] == "1 of 1: Reacher-v4/lare-linear-td3-draw0 is done"
     assert read_sweep(file)[1][0].done
