@@ -179,8 +179,7 @@ def test_the_ablation_without_pre_verification_keeps_what_runs(command):
         ("train Reacher-v4 --seed -1", "seed = -1: input should be greater than or equal to 0"),
         (
             "train Reacher-v4 --method magic",
-            "no method 'magic'; the methods are dense, episodic, rd, rrd, rrdu, vib-rd, vib-rrdu, arel, stas, lare-rd, "
-            "lare-rrdu, lare-rd-shared",
+            f"no method 'magic'; the methods are {', '.join(METHODS)}",
         ),
         ("train CN-6 --algorithm ppo", "ppo is for a single agent, and CN-6 is a task of many"),
         (

@@ -1,0 +1,52 @@
+"""The command line. Each command is one function; its arguments are its options, and tyro writes the help.
+
+What is slow to import is imported by the command that needs it.
+"""
+
+import os
+import sys
+import traceback
+
+import tyro
+
+from lare.cli.functions import design, new_task, prompt, verify
+from lare.cli.lists import algorithms, methods, tasks
+from lare.cli.runs import cross_play, evaluate, report, train
+from lare.cli.studies import compare, sweep
+from lare.errors import LareError
+
+DESCRIPTION = "Train reinforcement learning on episodic rewards, through latent rewards that a language model wrote."
+COMMANDS = {
+    "tasks": tasks,
+    "methods": methods,
+    "algorithms": algorithms,
+    "new-task": new_task,
+    "prompt": prompt,
+    "design": design,
+    "verify": verify,
+    "train": train,
+    "evaluate": evaluate,
+    "sweep": sweep,
+    "report": report,
+    "compare": compare,
+    "cross-play": cross_play,
+}
+
+
+def main() -> None:
+    """`lare`: a mistake of the user's is one line on stderr and exit status 2 (--debug shows where it came from)."""
+    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    debug = len(arguments) < len(sys.argv) - 1
+    try:
+        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="lare", description=DESCRIPTION, args=arguments)
+    except LareError as error:
+        if debug:
+            traceback.print_exc()
+        sys.stderr.write(f"lare: {' '.join(str(error).split())}\n")
+        sys.exit(130 if type(error).__name__ == "Interrupted" else 2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:
+        # Whoever read the output has read enough. Python would complain again when it flushes at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)

@@ -1,0 +1,43 @@
+"""What there is: tasks, methods, algorithms."""
+
+from lare.cli.terminal import show
+
+
+def tasks() -> None:
+    """List the tasks that come with the package."""
+    from lare.tasks.spec import read_task, shipped_tasks
+
+    specs = [read_task(name) for name in shipped_tasks()]
+    show(
+        ("task", "observation", "action", "judges", "agents"),
+        (
+            (
+                spec.name,
+                str(spec.observation_size),
+                str(spec.action_size),
+                spec.judges,
+                "many" if spec.particles else "of one team" if spec.whole else "one",
+            )
+            for spec in specs
+        ),
+    )
+
+
+def methods() -> None:
+    """List the ways to assign credit, and where each comes from."""
+    from lare.credit.methods import TABLE
+
+    show(
+        ("method", "what the algorithm is trained on", "source"),
+        ((row.name, row.summary + (" (many agents)" if row.for_many_only else ""), row.source) for row in TABLE),
+    )
+
+
+def algorithms() -> None:
+    """List the reinforcement learning algorithms, and where each comes from."""
+    from lare.algorithms.table import TABLE
+
+    show(
+        ("algorithm", "learns", "what it is", "source"),
+        ((row.name, row.kind, row.summary, row.source) for row in TABLE),
+    )

@@ -1,0 +1,115 @@
+"""Runs: train, evaluate, report, and let two of them meet."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from lare.cli.terminal import RunDirectories, RunDirectory, say, show
+from lare.errors import LareError
+from lare.training.settings import Settings
+
+DEFAULTS = Settings()
+
+
+def train(
+    task: Annotated[Positional[str | None], tyro.conf.arg(metavar="[TASK]")] = None,
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = DEFAULTS,
+    function: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = (),
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    tensorboard: bool = False,
+) -> None:
+    """Train on a task's episodic rewards. Ctrl-C saves and leaves; --resume goes on.
+
+    Args:
+        task: a shipped name (see `lare tasks`), or the path of a task file. Not given with --resume.
+        function: a latent function (.py) to use instead of a recorded one, verified before it is run. Where several teams learn,
+            one --function for each, in the order of the task.
+        out: the run directory, which must not exist; runs/TASK-METHOD-ALGORITHM-sSEED unless given.
+        resume: a run directory to go on with, from its last checkpoint and with its own settings.
+        tensorboard: write TensorBoard events into the run directory too (needs the extra lare-rl[tensorboard]).
+    """
+    import lare
+    from lare.latent.function import load, per_role
+
+    if resume is not None:
+        if (task, function, out, settings) != (None, (), None, DEFAULTS):
+            raise LareError("--resume goes on with the run's own settings: give it no task and no other settings")
+        run = lare.resume(resume, tensorboard=tensorboard)
+    elif task is None:
+        raise LareError("say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR")
+    else:
+        spec = lare.load_task(task)
+        functions = [load(file, role) for file, role in per_role(function, spec)] if function else None
+        run = lare.train(spec, settings, function=functions, out=out, tensorboard=tensorboard)
+    say(f"finished {run.directory}; to see it: lare report {run.directory}")
+
+
+def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -> None:
+    """Evaluate the policy of a run by its true return.
+
+    Args:
+        run: a run directory.
+        episodes: episodes for each seed. A single agent acts without noise, agents of particle tasks as in training.
+        video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
+    """
+    from lare.experiments.evaluation import evaluate_run, record_video
+    from lare.training.run import open_run
+
+    returns = evaluate_run(run, episodes)
+    for team, of_team in returns.items():
+        for seed, of_seed in zip(open_run(run).seeds, of_team, strict=True):
+            named = f"{team}, " if len(returns) > 1 else ""
+            say(f"{named}seed {seed}: return {of_seed.mean():.1f} ± {of_seed.std():.1f} over {episodes} episodes")
+    if video is not None:
+        record_video(run, video)
+        say(f"wrote {video}")
+
+
+def report(runs: RunDirectories, out: Path | None = None) -> None:
+    """Draw a report of one or more runs: one HTML file that needs nothing else.
+
+    Args:
+        runs: run directories; their learning curves are laid over each other, named by method.
+        out: the file to write; report.html in the (first) run's directory unless given.
+    """
+    from lare.experiments.report import write_report
+
+    say(f"wrote {write_report(list(runs), out)}")
+
+
+def cross_play(
+    first: RunDirectory,
+    second: RunDirectory,
+    episodes: int = 200,
+) -> None:
+    """Let the first team of each of two runs meet the other team of each, every seed against every seed.
+
+    Prints the first team's return, mean and standard deviation over the pairs of seeds.
+
+    Args:
+        first: a run of a task in which two teams learn, as CompetitivePP-6.
+        second: another run of the same task.
+        episodes: episodes of each pair.
+    """
+    from lare.experiments.agents import Match
+    from lare.experiments.agents import cross_play as play
+    from lare.training.run import open_run
+
+    runs = open_run(first), open_run(second)
+    matches = play(runs, episodes)
+    task = runs[0].config.task
+    ours, theirs = (task.team(role) for role in task.teams)
+
+    def cell(match: Match) -> str:
+        return f"{match.returns.mean():.1f} ± {match.returns.std(ddof=match.returns.size > 1):.1f}"
+
+    rows = zip((first, second), (matches[:2], matches[2:]), strict=True)
+    head = (f"{ours} of, against {theirs} of", str(first), str(second))
+    show(head, ((str(name), *map(cell, row)) for name, row in rows))
+    say(
+        f"Returns of the {ours} team: mean ± standard deviation over all pairs of a seed of one run and a seed of the other, "
+        f"{episodes} episodes each."
+    )

@@ -1,0 +1,57 @@
+"""What the commands share: types of their arguments, and ways to say something."""
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional
+
+from lare.errors import LareError
+
+Task = Annotated[Positional[str], tyro.conf.arg(metavar="TASK")]
+RunDirectory = Annotated[Positional[Path], tyro.conf.arg(metavar="RUN")]
+RunDirectories = Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN")]
+Kind = Literal["factors", "reward"]
+
+
+def say(text: str) -> None:
+    print(text)  # noqa: T201 - the one place that writes to standard output
+
+
+def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table; its first column is never broken."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(*head, box=None, pad_edge=False)
+    table.columns[0].no_wrap = True
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def progress(text: str) -> None:
+    """What is worth knowing on the way, apart from the result."""
+    sys.stderr.write(text + "\n")
+
+
+def free_name(path: Path) -> Path:
+    """The path itself, or one with a number behind it as long as that is taken."""
+    number = 1
+    while path.exists():
+        number += 1
+        path = path.with_name(f"{path.name.split('.attempts')[0]}.attempts-{number}.json")
+    return path
+
+
+def write_new(path: Path, text: str, option: str) -> None:
+    """Write a file that must not be there."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise LareError(f"{path} exists, and is not overwritten; choose another {option}") from None
+    except OSError as error:
+        raise LareError(f"{path} cannot be written: {error.strerror}") from error
