@@ -92,9 +92,9 @@ def half(handler: Handler) -> None:
     handler.connection.shutdown(socket.SHUT_RDWR)
 
 
-def dribbles(handler: Handler) -> None:
+def dribbles(handler: Handler, status: int = 200) -> None:
     """A byte now and then, and no end."""
-    handler.send_response(200)
+    handler.send_response(status)
     handler.send_header("Content-Type", "application/json")
     handler.end_headers()
     try:
@@ -106,9 +106,21 @@ def dribbles(handler: Handler) -> None:
         return
 
 
-def floods(handler: Handler) -> None:
+def spells_headers(handler: Handler) -> None:
+    """A letter of a header now and then, and no end."""
+    try:
+        handler.wfile.write(b"HTTP/1.1 200 OK\r\nX-Patience: ")
+        while True:
+            handler.wfile.write(b"a")
+            handler.wfile.flush()
+            threading.Event().wait(0.05)
+    except OSError:
+        return
+
+
+def floods(handler: Handler, status: int = 200) -> None:
     """A megabyte after the other, and no end."""
-    handler.send_response(200)
+    handler.send_response(status)
     handler.send_header("Content-Type", "application/json")
     handler.end_headers()
     try:
@@ -116,3 +128,11 @@ def floods(handler: Handler) -> None:
             handler.wfile.write(b" " * (1 << 20))
     except OSError:
         return
+
+
+def refuses_without_end(handler: Handler) -> None:
+    floods(handler, 500)
+
+
+def refuses_slowly(handler: Handler) -> None:
+    dribbles(handler, 500)

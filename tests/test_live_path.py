@@ -110,6 +110,46 @@ def test_a_budget_ends_a_design(serve, command, arguments, said):
     assert len(server.requests) <= 2
 
 
+def test_what_was_said_is_kept_when_the_budget_ends(serve, command, tmp_path):
+    server = serve(says("Not today."))
+    asked = ("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1, "--requests", 2)
+    status, out, err = command(*asked)
+    assert (status, out) == (2, "")
+    assert "lare: the budget of 2 requests is spent\nevery attempt is kept in Reacher-v4.attempts.json" in err
+    kept = read_recording((tmp_path / "Reacher-v4.attempts.json").read_text(), "kept")
+    assert [exchange.stage for exchange in kept.exchanges] == ["candidate", "correct"]
+
+
+def test_what_a_model_says_does_not_steer_the_terminal(serve, command):
+    server = serve(says('{"Functions": 1, "\x1b]0;gone\x07": 2}'), says("\x1b[31mno"))
+    asked = ("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1, "--requests", 2)
+    assert "\x1b" not in command(*asked)[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--base-url", "http://h/v1"], "--base-url is for a live model: say which one with --model NAME"),
+        (
+            ["--model", "m", "--draw", 2],
+            "--draw chooses among recordings, and a live model says something new each time: leave it out",
+        ),
+        (["--budget", -5], "budget = -5: at least one is needed"),
+        (["--requests", 0], "requests = 0: at least one is needed"),
+        (["--temperature", "nan"], "temperature = nan: a number from 0 on"),
+        (["--reflect", -1], "reflect = -1: there can be no fewer rounds than none"),
+        (["--out", "."], ". is not the name of a file; choose another --out"),
+        (["--out", "no/phi.py"], "no/phi.py cannot be written: there is no directory no; choose another --out"),
+        (["--record", "no/r.json"], "no/r.json cannot be written: there is no directory no; choose another --record"),
+        (["--record", "r.json", "--out", "r.py"], "--out writes r.json too: choose another --record"),
+        (["--policy", "nowhere"], "nowhere is not a run: there is no config.json in it"),
+    ],
+)
+def test_options_of_a_design_that_make_no_sense(command, arguments, message):
+    """Before anybody is asked, or paid."""
+    assert command("design", "Reacher-v4", *arguments) == (2, "", f"lare: {message}\n")
+
+
 def test_a_reply_for_another_task_is_corrected(serve):
     # The chase has observations of size 2; the recorded function of Reacher reads entry 10.
     reacher = shipped_recordings("factors", 0)

@@ -7,7 +7,7 @@ import pytest
 from lare.errors import LareError
 from lare.latent import design as module
 from lare.latent.checks import Check
-from lare.latent.design import ATTEMPTS, LONGEST_QUOTE, DesignFailed, design
+from lare.latent.design import ATTEMPTS, LONGEST_QUOTE, DesignBroken, DesignFailed, design
 from lare.latent.verify import Verdict, random_steps
 from lare.llm.prompts import candidate, combine, correct
 from lare.llm.recording import read_recording
@@ -254,7 +254,44 @@ def test_a_task_without_recordings_is_refused():
         design(toy_spec())
 
 
-@pytest.mark.parametrize("n", [0, -1])
-def test_too_few_candidates(chase, n):
-    with pytest.raises(LareError, match=f"candidates = {n}"):
+def test_without_verification_nobody_looks_at_candidates(chase, trusting):
+    model = Scripted(failing("a"), GOOD, GOOD)
+    design(chase, model=model, candidates=2, pre_verification=False)
+    assert model.asked[-1][0] == combine(chase, [failing("a"), GOOD], "factors")
+
+
+class Leaves(Scripted):
+    """A model that is gone after its last line."""
+
+    def reply(self, messages, sample):
+        if not self.lines:
+            raise LareError("nobody there")
+        return super().reply(messages, sample)
+
+
+def test_what_was_said_is_kept_when_the_model_leaves(chase):
+    with pytest.raises(DesignBroken, match=r"^nobody there$") as error:
+        design(chase, model=Leaves(failing("a"), failing("b")), candidates=1)
+    assert [exchange.stage for exchange in error.value.recorder.exchanges] == ["candidate", "correct"]
+    with pytest.raises(LareError) as error:
+        design(chase, model=Leaves(), candidates=1)
+    assert not isinstance(error.value, DesignFailed)
+
+
+def test_half_a_character_goes_back_as_an_error(chase, tmp_path):
+    broken = GOOD.replace('"u"', '"\\ud800"')
+    model = Scripted(broken, "\ud800", GOOD)
+    function = design(chase, model=model, candidates=1, said=[].append)
+    assert "which is half a character (a surrogate)" in model.asked[1][0][-1]["content"]
+    function.save(tmp_path / "phi.py")
+
+
+@pytest.mark.parametrize("n", [0, -1, 101])
+def test_too_few_candidates_or_too_many(chase, n):
+    with pytest.raises(LareError, match=f"candidates = {n}: from 1 to 100"):
         design(chase, candidates=n)
+
+
+def test_fewer_rounds_than_none(chase):
+    with pytest.raises(LareError, match="reflect = -1"):
+        design(chase, reflect=-1)

@@ -188,11 +188,33 @@ def test_a_function_of_ones_own_needs_no_record(chase, sound, tmp_path, trusting
 
 def test_a_source_is_read_without_a_look_into_it(function, tmp_path):
     function.save(tmp_path / "phi.py")
-    assert read_source(tmp_path / "phi.py") == read_source(tmp_path / "phi.json") == SOURCE
-    (tmp_path / "mine.py").write_text("\n\nno Python\n")
-    assert read_source(tmp_path / "mine.py") == "no Python"
-    with pytest.raises(LareError, match="there is no function file"):
+    assert read_source(tmp_path / "phi.py") == read_source(tmp_path / "phi.json") == (SOURCE, False)
+    (tmp_path / "mine.py").write_text("\ufeff\n\nno Python\n", encoding="utf-8")
+    assert read_source(tmp_path / "mine.py") == ("no Python", False)
+    with pytest.raises(LareError, match=r"the function file .* is not there"):
         read_source(tmp_path / "none.py")
+    (tmp_path / "book.py").write_bytes(b"#" * (2 << 20))
+    with pytest.raises(LareError, match="is larger than 1 MB: that is no function"):
+        read_source(tmp_path / "book.py")
+
+
+def test_the_hash_says_whether_a_source_was_changed(function, chase, tmp_path):
+    """With the record beside it, and without."""
+    path = tmp_path / "phi.py"
+    function.save(path)
+    assert not load(path, chase).changed
+    path.write_text(path.read_text().replace("effort", "exertion"))
+    assert read_source(path)[1]
+    assert load(path, chase).model == function.model + "; changed by hand since"
+    path.with_suffix(".json").unlink()
+    assert load(path, chase).changed
+
+
+def test_no_name_becomes_a_line_of_code(function, chase, tmp_path):
+    replace(function, model="x\nimport os\r\x85import sys\u2028#").save(tmp_path / "phi.py")
+    assert load(tmp_path / "phi.py", chase).source == function.source
+    top = [line for line in (tmp_path / "phi.py").read_text().splitlines() if line.startswith(HEADER)]
+    assert top[2] == f"{HEADER}model: x import os import sys #"
 
 
 def test_loading_verifies_again(function, chase, tmp_path):
@@ -221,7 +243,8 @@ def test_a_missing_file_is_refused(chase, tmp_path, name):
     path = tmp_path / name
     with pytest.raises(LareError) as error:
         load(path, chase)
-    assert str(error.value) == f"there is no function file {path.with_suffix('.py') if name else path}"
+    found = f"{path.with_suffix('.py')} is not there" if name else f"{path} is not a file"
+    assert str(error.value) == f"the function file {found}"
 
 
 def test_a_file_that_is_no_text_is_refused(chase, tmp_path):
@@ -268,7 +291,7 @@ def test_a_reward_stays_a_reward(chase, tmp_path):
 
 
 def test_null(chase):
-    with pytest.raises(LareError, match=r"E-SYNTAX line 1: [^\n]*null bytes"):
+    with pytest.raises(LareError, match=r"E-SYNTAX line 2: there is '\\x00', a character that nobody sees"):
         verified(phi("return [action]") + "\0", chase)
 
 

@@ -812,3 +812,16 @@ def test_benign_lines_in_any_order_do_no_harm(lines):
 def test_benign_programs_crossed_do_no_harm(first, second, upper, lower):
     lines = [*BENIGN[first].splitlines()[:upper], *BENIGN[second].splitlines()[lower:]]
     assert does_no_harm("\n".join(lines))
+
+
+@pytest.mark.parametrize("letter", ["\x1b", "\x07", "\x00", "\x7f", "\x9b", "\u202e", "\u2066", "\u200b", "\ufeff"])
+def test_no_letter_that_nobody_sees(letter):
+    """Not even in a comment: a person is to read this, in a terminal."""
+    source = f"def evaluation_func(o, a):\n    # upright {letter} and calm\n    return [o]\n"
+    (problem,) = inspect(source)
+    assert str(problem) == f"E-SYNTAX line 2: there is {letter!a}, a character that nobody sees: only text, please"
+
+
+@pytest.mark.parametrize("letter", ["\t", "\r\n", "ü", "→", "─", "π", "🙂"])
+def test_letters_that_are_welcome_in_comments(letter):
+    assert inspect(f"def evaluation_func(o, a):\n    # upright {letter}# and calm\n    return [o]\n") == []

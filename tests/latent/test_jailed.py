@@ -386,3 +386,17 @@ def test_threads_take_turns(worker):
         found = list(pool.map(lambda rows: program.call(*batch(rows)).factors, sizes))
     for rows, factors in zip(sizes, found, strict=True):
         np.testing.assert_array_equal(factors, expected(PHI, *batch(rows)))
+
+
+def test_where_there_is_no_worker_it_is_said_in_a_line(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "win32")
+    with pytest.raises(NoWorker, match=r"^a latent function needs a process of its own, [^\n]*: use WSL$"):
+        JailedProgram(PHI, 2, 1)
+
+
+def test_the_package_is_there_where_limits_are_not():
+    script = (
+        "import sys; sys.modules['resource'] = None; import lare; from lare.latent import jail; print(*jail.limits())"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == "\n"

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from lare.errors import LareError
 from lare.latent.design import design
 from lare.latent.function import verified
 from lare.latent.reflect import episodes_of, gather, held_out_fit
@@ -108,3 +109,27 @@ def test_a_round_that_fails_changes_nothing():
     model = Says(RIGHT, *["def f(): ..."] * 5)
     assert design(toy_spec(), model=model, candidates=1, reflect=1).source == RIGHT
     assert model.lines == []
+
+
+def test_what_was_verified_is_kept_when_the_model_leaves():
+    class Leaves(Says):
+        def reply(self, messages, sample):
+            if not self.lines:
+                raise LareError("nobody there")
+            return super().reply(messages, sample)
+
+    said = []
+    function = design(toy_spec(), model=Leaves(RIGHT), candidates=1, reflect=1, said=said.append)
+    assert function.source == RIGHT
+    assert said[-1] == "reflection 1: nobody there"
+
+
+def test_episodes_of_a_given_policy():
+    """The best there is returns 0, and its factor with it."""
+    task = toy_spec()
+    best = episodes_of(task, lambda observation: observation[:1], count=2)
+    assert [episode.total for episode in best] == pytest.approx([0, 0], abs=1e-9)
+    model = Says(RIGHT, WRONG)
+    design(task, model=model, candidates=1, reflect=1, policy=lambda observation: observation[:1] + 0.5)
+    shown = gather(verified(RIGHT, task), task, episodes_of(task, lambda observation: observation[:1] + 0.5)).text
+    assert shown in model.asked[1][-1]["content"]

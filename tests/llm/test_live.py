@@ -6,7 +6,21 @@ import pytest
 
 from lare.llm import live
 from lare.llm.live import LADDER, Budget, BudgetSpent, LiveModel, ModelFailed, most_tokens
-from servers import Server, completion, dribbles, floods, half, hangs_up, raw, refuses, resets, says
+from servers import (
+    Server,
+    completion,
+    dribbles,
+    floods,
+    half,
+    hangs_up,
+    raw,
+    refuses,
+    refuses_slowly,
+    refuses_without_end,
+    resets,
+    says,
+    spells_headers,
+)
 
 KEY = "sk-secret-key-0123456789"
 ASKED = [{"role": "user", "content": "Write some."}]
@@ -124,12 +138,14 @@ def test_nobody_there(served):
     server, model, waited = served(says("hello"))
     server.shutdown()
     server.server_close()
-    with pytest.raises(ModelFailed, match="m did not answer: APIConnectionError"):
+    with pytest.raises(
+        ModelFailed, match=r"m did not answer: http://127\.0\.0\.1:\d+/v1/ cannot be reached: .*refused"
+    ):
         model.reply(ASKED, 0)
     assert len(waited) == live.TRIES - 1
 
 
-@pytest.mark.parametrize("answer", [dribbles, floods])
+@pytest.mark.parametrize("answer", [dribbles, floods, refuses_slowly, refuses_without_end, spells_headers])
 def test_an_answer_without_end_is_cut_off(served, monkeypatch, answer):
     monkeypatch.setattr(live, "TIMEOUT", 0.3)
     monkeypatch.setattr(live, "TRIES", 1)
@@ -174,7 +190,17 @@ def test_the_text_is_given_on_as_it_came(served, answer, text):
     assert model.reply(ASKED, 0) == text
 
 
-@pytest.mark.parametrize("usage", [{}, {"prompt_tokens": None}, {"prompt_tokens": "many", "completion_tokens": 1}])
+@pytest.mark.parametrize(
+    "usage",
+    [
+        {},
+        {"prompt_tokens": None},
+        {"prompt_tokens": "many", "completion_tokens": 1},
+        {"prompt_tokens": float("inf"), "completion_tokens": 1},
+        {"prompt_tokens": 10**400, "completion_tokens": 1},
+        {"prompt_tokens": 1, "completion_tokens": -1},
+    ],
+)
 def test_a_server_that_counts_nothing_is_counted_by_bytes(served, usage):
     _, model, _ = served(says("grüße", usage=usage))
     model.reply(ASKED, 0)
@@ -182,9 +208,30 @@ def test_a_server_that_counts_nothing_is_counted_by_bytes(served, usage):
     assert "counted as bytes" in model.budget.summary()
 
 
+def test_half_a_character_is_none(served):
+    """JSON can say it, and no file could keep it."""
+    body = json.dumps(completion("a \ud800 b")).encode()
+    _, model, _ = served(raw(body))
+    assert model.reply(ASKED, 0) == "a ? b"
+
+
+@pytest.mark.parametrize("key", ["schlüssel", "two words", "line\nbreak"])
+def test_a_key_that_is_none(monkeypatch, key):
+    monkeypatch.setenv("OPENAI_API_KEY", key)
+    with pytest.raises(
+        ModelFailed, match="the environment variable OPENAI_API_KEY holds characters that are in no key"
+    ):
+        LiveModel("m", "http://127.0.0.1:1/v1")
+
+
+def test_a_model_without_a_name():
+    with pytest.raises(ModelFailed, match="the name of the model is empty"):
+        LiveModel(" ", "http://127.0.0.1:1/v1")
+
+
 def test_the_budget_of_requests_is_never_passed(served):
     server, model, _ = served(refuses(500), budget=Budget(requests=3))
-    with pytest.raises(BudgetSpent, match="the budget of 3 requests is spent"):
+    with pytest.raises(BudgetSpent, match="the budget of 3 requests is spent; the last try failed: HTTP 500: "):
         model.reply(ASKED, 0)
     assert len(server.requests) == 3
 

@@ -8,7 +8,7 @@ from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from lare.errors import LareError
 from lare.latent.function import verified
 from lare.llm.prompts import candidate
-from lare.tasks.new import draft
+from lare.tasks.new import draft, without_clause
 from lare.tasks.spec import FILL_IN, load_task
 from toys import Chase
 
@@ -98,10 +98,10 @@ def test_whatever_speaks_of_rewards_is_left_out(tmp_path):
     assert task.description == (
         "Tells of a chase.\nThe goal is to catch the *target*.\nSee the docs.\n1. Truncation: after 20 steps."
     )
-    assert task.observation == "2 entries.\nA target."
+    assert task.observation == "2 entries.\nA target.\nIt returns nothing."
     assert task.action == "1 entries, each between -2 and 2.\n1: The second row; -"
-    assert drafted.left_out == 4
-    assert "4 sentences or rows" in drafted.toml
+    assert drafted.left_out == 3
+    assert "3 sentences or rows" in drafted.toml
 
 
 def test_what_is_not_documented_must_be_filled_in(tmp_path):
@@ -160,3 +160,34 @@ def test_parts_of_an_observation_stand_behind_each_other():
     parts = Dict({"place": Box(-1, 1, (2,), np.float32), "gear": Discrete(3)})
     gymnasium.register("toys/Parts-v0", entry_point=lambda: Odd(observation_space=parts), disable_env_checker=True)
     assert "5 entries, Dict('gear': Discrete(3), 'place': Box(" in draft("toys/Parts-v0").toml
+
+
+@pytest.mark.parametrize(
+    ("said", "kept"),
+    [
+        ("The agent gets a reward of 1 for each step.", ""),
+        ("You earn 5 points.", ""),
+        ("It is worth +10 points.", ""),
+        ("The goal is to maximise the expected return.", ""),
+        ("A fixed point in the plane.", "A fixed point in the plane."),
+        ("Face cards have a point value of 10.", "Face cards have a point value of 10."),
+        ("It returns to the start.", "It returns to the start."),
+        (
+            "The goal is to run forward as fast as possible, with a positive reward for the distance.",
+            "The goal is to run forward as fast as possible.",
+        ),
+        ("Be quick, since a penalty is due.", ""),
+    ],
+)
+def test_what_speaks_of_rewards_and_what_does_not(said, kept):
+    assert without_clause(said) == kept
+
+
+def test_a_draft_keeps_the_goal():
+    assert "swing it into an upright position" in draft("Pendulum-v1").toml
+    assert "run forward" in draft("HalfCheetah-v5").toml
+
+
+def test_an_id_without_a_version_is_written_with_it():
+    drafted = draft("CartPole")
+    assert 'environment = "CartPole-v1"' in drafted.toml

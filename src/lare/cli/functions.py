@@ -1,14 +1,17 @@
 """Latent functions: the request, a task of one's own, design, verification."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 from tyro.conf import Positional
 
 from lare.cli.terminal import Kind, Task, free_name, progress, say, write_new
 from lare.errors import LareError
+from lare.tasks.spec import TaskSpec
 
 
 def prompt(task: Task, kind: Kind = "factors") -> None:
@@ -56,6 +59,7 @@ def design(
     draw: int = 0,
     candidates: int = 5,
     reflect: int = 0,
+    policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
     pre_verification: bool = True,
     budget: int = 400_000,
     requests: int = 60,
@@ -79,23 +83,24 @@ def design(
         candidates: first attempts that are combined; with 1, the attempt itself is the function (the paper's ablation
             without self-prompting).
         reflect: further rounds, in which the model sees how its factors go with the return, and may improve them.
+        policy: a run whose policy plays the episodes for --reflect; random actions do, unless given.
         pre_verification: without it (the paper's ablation), the first reply is tried once, in its jail, and kept as it is.
-        budget: tokens, in and out together, that are never passed.
+        budget: tokens, in and out together: no request is begun that might pass them.
         requests: requests that are never passed.
         price: of a million tokens in and out, to have the cost reckoned.
         temperature: of the model; the server's own unless given.
         record: a file that takes every exchange, for --model FILE; it must not exist.
         out: a .py file to write, with the replies and checks in a .json beside it; it must not exist.
     """
-    from lare.latent.design import DesignFailed
+    from lare.latent.design import DesignBroken, DesignFailed
     from lare.latent.design import design as design_function
     from lare.llm.live import Budget, LiveModel
     from lare.llm.model import RECORDED, recorded_model
     from lare.tasks.spec import load_task
 
-    for path in (out.with_suffix(".py"), out.with_suffix(".json")) if out is not None and out.name else ():
-        if path.exists():
-            raise LareError(f"{path} exists, and is not overwritten; choose another --out")
+    live = model not in (None, RECORDED) and not str(model).endswith(".json")
+    check_design(live, base_url, draw, budget, requests, temperature)
+    check_files(out, record)
     spec, cost = load_task(task), Budget(requests, budget)
     if model is None or model == RECORDED:
         asked = recorded_model(spec.name, kind, draw)
@@ -111,6 +116,7 @@ def design(
             candidates=candidates,
             reflect=reflect,
             pre_verification=pre_verification,
+            policy=acting(policy, spec),
             record=record,
             said=progress,
         )
@@ -119,7 +125,7 @@ def design(
         if record is None:
             error.recorder.write(path, error.model)
         progress(f"lare: {error}\nevery attempt is kept in {path}")
-        sys.exit(1)
+        sys.exit(2 if isinstance(error, DesignBroken) else 1)
     finally:
         if cost.requests_made:
             progress(f"{asked.name}: {cost.summary(price)}")
@@ -128,6 +134,46 @@ def design(
     else:
         function.save(out)
         say(f"wrote {out.with_suffix('.py')}: {function.size} factors ({', '.join(function.names)})")
+
+
+def acting(run: Path | None, spec: TaskSpec) -> Callable[[np.ndarray], np.ndarray] | None:
+    """The policy of a run, if there is one."""
+    if run is None:
+        return None
+    from lare.experiments.evaluation import policy_of
+
+    return policy_of(run, spec)
+
+
+def check_design(
+    live: bool, base_url: str | None, draw: int, budget: int, requests: int, temperature: float | None
+) -> None:
+    """Raise `LareError` where options do not go together, or make no sense."""
+    if base_url is not None and not live:
+        raise LareError("--base-url is for a live model: say which one with --model NAME")
+    if draw and live:
+        raise LareError("--draw chooses among recordings, and a live model says something new each time: leave it out")
+    for name, value in (("budget", budget), ("requests", requests)):
+        if value < 1:
+            raise LareError(f"{name} = {value}: at least one is needed")
+    if temperature is not None and not 0 <= temperature < float("inf"):
+        raise LareError(f"temperature = {temperature}: a number from 0 on")
+
+
+def check_files(out: Path | None, record: Path | None) -> None:
+    """Raise `LareError` where what is to be written could not be, before a model is asked and paid."""
+    written = {path: "--record" for path in (record,) if path is not None}
+    if out is not None:
+        if not out.name or out.is_dir():
+            raise LareError(f"{out} is not the name of a file; choose another --out")
+        written |= {out.with_suffix(".py"): "--out", out.with_suffix(".json"): "--out"}
+        if record in (out.with_suffix(".py"), out.with_suffix(".json")):
+            raise LareError(f"--out writes {record} too: choose another --record")
+    for path, option in written.items():
+        if path.exists():
+            raise LareError(f"{path} exists, and is not overwritten; choose another {option}")
+        if not path.parent.is_dir():
+            raise LareError(f"{path} cannot be written: there is no directory {path.parent}; choose another {option}")
 
 
 def verify(
@@ -148,7 +194,10 @@ def verify(
     from lare.latent.verify import verify as verify_source
     from lare.tasks.spec import load_task
 
-    verdict = verify_source(read_source(file), load_task(task), kind)
+    source, changed = read_source(file)
+    if changed:
+        say("note    the source is not the one that was saved: its hash is another")
+    verdict = verify_source(source, load_task(task), kind)
     for check in verdict.checks:
         say(f"{'passed' if check.passed else 'FAILED'}  {check.name}")
         for line in check.message.splitlines():

@@ -6,7 +6,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare.cli.terminal import RunDirectories, RunDirectory, say, show
+from lare.cli.terminal import RunDirectories, RunDirectory, progress, say, show
 from lare.errors import LareError
 from lare.training.settings import Settings
 
@@ -32,7 +32,7 @@ def train(
         tensorboard: write TensorBoard events into the run directory too (needs the extra lare-rl[tensorboard]).
     """
     import lare
-    from lare.latent.function import load, per_role
+    from lare.latent.function import CHANGED, load, per_role
 
     if resume is not None:
         if (task, function, out, settings) != (None, (), None, DEFAULTS):
@@ -43,6 +43,11 @@ def train(
     else:
         spec = lare.load_task(task)
         functions = [load(file, role) for file, role in per_role(function, spec)] if function else None
+        for one in functions or ():
+            if one.changed:
+                progress(
+                    f"the function by {one.model.removesuffix(CHANGED)} is not the one that was saved: its hash is another"
+                )
         run = lare.train(spec, settings, function=functions, out=out, tensorboard=tensorboard)
     say(f"finished {run.directory}; to see it: lare report {run.directory}")
 

@@ -33,8 +33,8 @@ def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 
 
 def progress(text: str) -> None:
-    """What is worth knowing on the way, apart from the result."""
-    sys.stderr.write(text + "\n")
+    """What is worth knowing on the way, apart from the result. Some of it a stranger has said: it must not steer the terminal."""
+    sys.stderr.write("".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text) + "\n")
 
 
 def free_name(path: Path) -> Path:

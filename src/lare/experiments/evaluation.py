@@ -1,5 +1,6 @@
 """The policy of a finished (or stopped) run, evaluated and filmed, for one agent and for many."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from jaxtyping import Float
 from lare.errors import LareError
 from lare.experiments import agents
 from lare.tasks.particles.drawing import FRAMES_PER_SECOND
-from lare.tasks.spec import check_against_environment
+from lare.tasks.spec import TaskSpec, check_against_environment
 from lare.training.environments import Policy, Stream, episode_seed, evaluate, make_episodic, to_bounds
 from lare.training.run import Run, open_run
 from lare.training.single_agent import compiled, load_learner
@@ -21,6 +22,24 @@ def load_policy(run: Run) -> Policy:
     functions = compiled(recipe)
     actor = functions.actor(learner)
     return lambda observation: np.asarray(functions.act(actor, observation))
+
+
+def policy_of(directory: str | Path, task: TaskSpec) -> Callable[[np.ndarray], np.ndarray]:
+    """The deterministic policy of a run's first seed, from one observation to one action of the environment.
+
+    Raises:
+        LareError: the directory is no run, or one of another environment.
+    """
+    run = open_run(directory)
+    if run.config.task.environment != task.environment or task.particles:
+        raise LareError(f"{directory} is a run of {run.config.task.name}: its policy cannot play {task.name}")
+    policy, space = load_policy(run), make_episodic(task).action_space
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        everyone = np.broadcast_to(np.asarray(observation, np.float32), (len(run.seeds), len(observation)))
+        return to_bounds(policy(everyone)[0], space)
+
+    return act
 
 
 def evaluate_run(directory: str | Path, episodes: int = 10) -> dict[str, Float[np.ndarray, "seeds episodes"]]:

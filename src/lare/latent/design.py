@@ -10,10 +10,9 @@ import numpy as np
 
 from lare.errors import LareError
 from lare.latent.checks import Check, Failed, factors_of
-from lare.latent.evaluator import LatentRewardError
 from lare.latent.function import LatentFunction, normal
 from lare.latent.jailed import JailedProgram, WorkerFailed
-from lare.latent.reflect import episodes_of, gather
+from lare.latent.reflect import Policy, episodes_of, gather
 from lare.latent.verify import Verdict, random_steps, verify
 from lare.llm import prompts
 from lare.llm.model import Model, recorded_model
@@ -25,6 +24,8 @@ from lare.tasks.spec import TaskSpec, the_role
 CANDIDATES = 5
 """n of the paper."""
 
+MOST_CANDIDATES = 100
+
 ATTEMPTS = 5
 """How often a function is verified, the first time included, before the loop gives up."""
 
@@ -33,11 +34,15 @@ LONGEST_QUOTE = 20_000
 
 
 class DesignFailed(LareError):
-    """No attempt passed. `recorder` holds all of them."""
+    """No attempt passed. `recorder` holds all of them, and whatever else was said."""
 
     def __init__(self, message: str, recorder: Recorder, model: str):
         super().__init__(message)
         self.recorder, self.model = recorder, model
+
+
+class DesignBroken(DesignFailed):
+    """The model could not be asked any more before an attempt passed."""
 
 
 @dataclass(frozen=True)
@@ -83,23 +88,28 @@ class Conversation:
         self.recorder.take(stage, messages, reply, self.model.name)
         return reply
 
-    def begin(self, candidates: int) -> tuple[list[Message], str]:
+    def begin(self, candidates: int, pre_verification: bool) -> tuple[list[Message], str]:
         """Candidates, and their combination: the last request, and the reply to it.
 
-        A candidate that cannot be read or does not pass is left out of the combination, as long as another one passes.
+        A candidate that cannot be read or does not pass is left out of the combination, as long as another one passes;
+        without pre-verification nobody looks.
         """
         request = prompts.candidate(self.task, self.kind)
         replies = [self.ask("candidate", request, sample) for sample in range(candidates)]
         if candidates == 1:
             return request, replies[0]
+        sound = self.sound(replies) if pre_verification else []
+        request = prompts.combine(self.task, sound or [quoted(reply) for reply in replies], self.kind)
+        return request, self.ask("combine", request)
+
+    def sound(self, replies: Sequence[str]) -> list[str]:
+        """Those that can be read and pass."""
         random_steps(self.task)  # once, before several want them at the same time
         with ThreadPoolExecutor() as pool:
             tried = list(pool.map(lambda reply: examine(reply, self.task, self.kind), replies))
         for number, attempt in enumerate(tried, start=1):
             self.said(f"candidate {number}: {first_line(attempt)}")
-        sound = [attempt.reply for attempt in tried if not attempt.errors]
-        request = prompts.combine(self.task, sound or [quoted(reply) for reply in replies], self.kind)
-        return request, self.ask("combine", request)
+        return [attempt.reply for attempt in tried if not attempt.errors]
 
     def correct(self, request: list[Message], reply: str) -> Attempt:
         """Verify a reply, and ask for a better one as long as it does not pass. Raises `DesignFailed`."""
@@ -124,17 +134,20 @@ class Conversation:
             raise self.failed(f"the reply does not run: {error}") from error
         return Attempt(reply, source, Verdict((Check("executed", True, ""),), factors.shape[1]), "")
 
-    def reflect(self, best: Attempt, rounds: int) -> Attempt:
-        """Show the model what its factors did on whole episodes; keep the function that predicts returns best."""
-        episodes = episodes_of(self.task)
+    def reflect(self, best: Attempt, rounds: int, policy: Policy | None) -> Attempt:
+        """Show the model what its factors did on whole episodes; keep the function that predicts returns best.
+
+        Whatever goes wrong on the way, there is a verified function to go back to.
+        """
+        episodes = episodes_of(self.task, policy)
         evidence = gather(self.made(best), self.task, episodes)
         self.said(f"reflection: before it, a linear decoder explains {evidence.fit:.3f} of unseen returns")
         for number in range(1, rounds + 1):
-            request = prompts.reflect(self.task, best.reply, evidence.text, self.kind)
             try:
+                request = prompts.reflect(self.task, best.reply, evidence.text, self.kind)
                 attempt = self.correct(request, self.ask("reflect", request))
                 found = gather(self.made(attempt), self.task, episodes)
-            except (DesignFailed, LatentRewardError) as error:
+            except LareError as error:
                 self.said(f"reflection {number}: {error}")
                 continue
             better = found.fit > evidence.fit
@@ -175,6 +188,7 @@ def design(
     candidates: int = CANDIDATES,
     reflect: int = 0,
     pre_verification: bool = True,
+    policy: Policy | None = None,
     record: Path | None = None,
     said: Callable[[str], None] = lambda _: None,
 ) -> LatentFunction:
@@ -192,19 +206,30 @@ def design(
             nothing is combined.
         reflect: rounds of reflection on whole episodes, after a function has passed. Not in the paper.
         pre_verification: without it (the paper's ablation), the first function is kept if it runs at all, in its jail.
+        policy: from one observation to one action of the environment: plays the episodes for reflection, instead of random
+            actions.
         record: a file that takes every exchange, from the first reply on.
         said: is told how it goes.
 
     Raises:
-        DesignFailed: no attempt passed.
+        DesignFailed: no attempt passed. `DesignBroken` where the model could not be asked any more.
         LareError: the model cannot answer, or each team of the task has a function of its own.
     """
     the_role(task)
-    if candidates < 1:
-        raise LareError(f"candidates = {candidates}: at least one is needed")
+    if not 1 <= candidates <= MOST_CANDIDATES:
+        raise LareError(f"candidates = {candidates}: from 1 to {MOST_CANDIDATES}")
+    if reflect < 0:
+        raise LareError(f"reflect = {reflect}: there can be no fewer rounds than none")
     model = model or recorded_model(task.name, kind, draw)
     recorder = Recorder(task.name, kind, getattr(model, "temperature", None), record)
     conversation = Conversation(task, kind, model, recorder, said)
-    request, reply = conversation.begin(candidates)
-    attempt = conversation.correct(request, reply) if pre_verification else conversation.once(reply)
-    return conversation.made(conversation.reflect(attempt, reflect) if reflect else attempt)
+    try:
+        request, reply = conversation.begin(candidates, pre_verification)
+        attempt = conversation.correct(request, reply) if pre_verification else conversation.once(reply)
+    except DesignFailed:
+        raise
+    except LareError as error:
+        if not recorder.exchanges:
+            raise
+        raise DesignBroken(str(error), recorder, model.name) from error
+    return conversation.made(conversation.reflect(attempt, reflect, policy) if reflect else attempt)

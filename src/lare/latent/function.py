@@ -20,6 +20,12 @@ from lare.latent.verify import verify
 from lare.llm.prompts import Kind
 from lare.tasks.spec import Judges, TaskSpec, read_text
 
+LARGEST_FILE = 1 << 20
+"""Bytes of a function file."""
+
+CHANGED = "; changed by hand since"
+"""Stands behind the model's name where a source is not the one that was saved."""
+
 HEADER = "# lare: "
 """Marks the lines that `save` puts on top of the source."""
 
@@ -45,6 +51,11 @@ class LatentFunction:
     def digest(self) -> str:
         """SHA-256 of the source."""
         return hashlib.sha256(self.source.encode()).hexdigest()
+
+    @property
+    def changed(self) -> bool:
+        """Whether somebody has changed the source since it was saved."""
+        return self.model.endswith(CHANGED)
 
     @property
     def names(self) -> list[str]:
@@ -125,6 +136,7 @@ class LatentFunction:
             f"sha256: {self.digest}",
             f"passed: {', '.join(check.name for check in self.checks)}",
         )
+        top = (" ".join(line.split()) for line in top)  # a name may be anybody's: nothing of it becomes a line of code
         try:
             path.write_text("".join(f"{HEADER}{line}\n" for line in top) + self.source + "\n", encoding="utf-8")
             path.with_suffix(".json").write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
@@ -151,7 +163,10 @@ def source_file(path: str | Path) -> Path:
     path = Path(path)
     source_path = path.with_suffix(".py") if path.suffix == ".json" else path
     if not source_path.is_file():
-        raise LareError(f"there is no function file {source_path}")
+        what = "is not a file" if source_path.exists() else "is not there"
+        raise LareError(f"the function file {source_path} {what}")
+    if source_path.stat().st_size > LARGEST_FILE:
+        raise LareError(f"the function file {source_path} is larger than {LARGEST_FILE >> 20} MB: that is no function")
     return source_path
 
 
@@ -162,9 +177,14 @@ def split_header(text: str) -> tuple[list[str], str]:
     return header, "\n".join(lines[len(header) :])
 
 
-def read_source(path: str | Path) -> str:
-    """The source of a function file, not yet looked into. Raises `LareError` where it cannot be read."""
-    return normal(split_header(read_text(source_file(path)))[1])
+def read_source(path: str | Path) -> tuple[str, bool]:
+    """The source of a function file, not yet looked into, and whether it was changed since it was saved.
+
+    Raises:
+        LareError: it cannot be read.
+    """
+    header, source = split_header(read_text(source_file(path)))
+    return normal(source), was_changed(header, source)
 
 
 Given = TypeVar("Given")
@@ -191,7 +211,16 @@ def load(path: str | Path, task: TaskSpec) -> LatentFunction:
         function = verified(source, task, kind)
     except LareError as error:
         raise LareError(f"{source_path}: {error}") from error
-    return with_provenance(function, source_path.with_suffix(".json"))
+    function = with_provenance(function, source_path.with_suffix(".json"))
+    if was_changed(header, source) and not function.changed:
+        function = replace(function, model=function.model + CHANGED)
+    return function
+
+
+def was_changed(header: Sequence[str], source: str) -> bool:
+    """Whether the header that `save` has written speaks of another source."""
+    said = [line.removeprefix(f"{HEADER}sha256: ").strip() for line in header if line.startswith(f"{HEADER}sha256: ")]
+    return bool(said) and said[0] != hashlib.sha256(normal(source).encode()).hexdigest()
 
 
 def with_provenance(function: LatentFunction, record: Path) -> LatentFunction:
@@ -204,4 +233,4 @@ def with_provenance(function: LatentFunction, record: Path) -> LatentFunction:
         model, exchanges = saved["model"], tuple(saved["exchanges"])
     except (ValueError, KeyError, TypeError) as error:
         raise LareError(f"{record} is not the record of a latent function: {error!r}") from error
-    return replace(function, model=model if same else f"{model}; changed by hand since", exchanges=exchanges)
+    return replace(function, model=model if same else model + CHANGED, exchanges=exchanges)

@@ -23,6 +23,10 @@ DEEPEST = 100
 CHAIN = re.compile(r"(?:[-+~]\s*){12}|(?:\bnot\s+){12}|(?:\blambda\s*:\s*){12}")
 """Operators that nest without brackets, and would go deep into the parser's own stack."""
 
+HIDDEN = re.compile(
+    r"[\x00-\x08\x0b\x0e-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb]"
+)
+"""What steers a terminal, or the direction of writing: who reads a function must see what there is."""
 
 UNREAD = re.compile(r'"""[^\\]*?"""|#[^\n]*', re.DOTALL)
 """Comments and docstrings, where rulers and smileys are welcome. Who hides code from this meets the parser's own limits."""
@@ -51,6 +55,11 @@ def guard(source: str) -> Iterator[Problem]:
     size = len(source.encode(errors="replace"))
     if any("\ud800" <= letter <= "\udfff" for letter in source):
         yield Problem("E-SYNTAX", 1, "there are characters that are no text (surrogates)")
+        return
+    hidden = HIDDEN.search(source)
+    if hidden:
+        line = source.count("\n", 0, hidden.start()) + 1
+        yield Problem("E-SYNTAX", line, f"there is {hidden[0]!a}, a character that nobody sees: only text, please")
         return
     if size > LONGEST:
         yield Problem("E-SIZE", 1, f"the program has {size} bytes; at most {LONGEST} are accepted")

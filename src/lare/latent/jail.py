@@ -13,10 +13,14 @@ import ctypes
 import errno
 import os
 import platform
-import resource
 import struct
 import sys
 from collections.abc import Iterator
+
+try:
+    import resource
+except ImportError:  # Windows, where there is no worker to be jailed
+    resource = None
 
 MEMORY = 2 << 30
 """Bytes of address space beyond what the process has when it enters."""
@@ -55,6 +59,8 @@ def limits() -> Iterator[str]:
         "RLIMIT_NOFILE": 0,
         "RLIMIT_NPROC": 0,
     }
+    if resource is None:
+        return
     for name, value in wanted.items():
         number = getattr(resource, name, None)
         if number is None:
@@ -72,7 +78,7 @@ def address_space() -> int:
     """Bytes that this process has mapped."""
     try:
         with open("/proc/self/statm", encoding="ascii") as file:
-            return int(file.read().split()[0]) * resource.getpagesize()
+            return int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
         return 0
 

@@ -108,6 +108,8 @@ class JailedProgram:
         """What happened to a program that could not even be loaded."""
         if self.problems:
             return
+        if sys.platform == "win32":
+            raise NoWorker("a latent function needs a process of its own, which Windows does not give: use WSL")
         given = ROWS * 8 * (observation_size + action_size)
         text = source.encode(errors="replace")  # what cannot be encoded, the gate has refused
         with shared(max(given, len(text))) as self.inputs, shared(ROWS * 8 * MOST_FACTORS) as self.outputs:

@@ -1,6 +1,6 @@
 """A live language model behind any OpenAI-compatible endpoint: OpenAI, vLLM, Ollama, llama.cpp, gateways.
 
-    time-outs    120 s for a reply, all of it
+    time-outs    120 s for a reply, all of it, headers too; 8 MB, whatever its status
     retries      408, 409, 429, 5xx and broken connections, with back-off or as long as the server says
     structure    asked for as a JSON schema; of servers that know none, as a JSON object; else only in words
     budget       requests and tokens, counted before each request so that they are never passed
@@ -9,10 +9,14 @@
 What a reply says is read by `reply`, whatever way it was asked for.
 """
 
+import importlib
 import json
 import os
+import queue
+import re
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -35,6 +39,9 @@ REPLY_TOKENS, SHORTEST_REPLY = 16_384, 1024
 """The most that a reply may have; halved as long as the model allows less, down to the second."""
 
 RETRIED = {408, 409, 429}
+
+MOST_TOKENS = 1 << 40
+"""A server that counts more does not know what it says."""
 
 SCHEMA = {
     "type": "object",
@@ -92,11 +99,13 @@ class Budget:
         """Add what a reply cost, by the server's own count where it gives one."""
         try:
             tokens_in, tokens_out = int(usage["prompt_tokens"]), int(usage["completion_tokens"])
-        except (TypeError, KeyError, ValueError):
+            if not 0 <= min(tokens_in, tokens_out) <= max(tokens_in, tokens_out) <= MOST_TOKENS:
+                raise ValueError("no number of tokens")
+        except (TypeError, KeyError, ValueError, OverflowError):
             tokens_in, tokens_out = most_tokens(messages), len(reply.encode(errors="replace"))
             self.estimated = True
-        self.tokens_in += max(0, tokens_in)
-        self.tokens_out += max(0, tokens_out)
+        self.tokens_in += tokens_in
+        self.tokens_out += tokens_out
 
     def summary(self, prices: tuple[float, float] | None = None) -> str:
         """What was used, in a line; `prices` are those of a million tokens in and out."""
@@ -132,21 +141,31 @@ class LiveModel:
     longest: int = REPLY_TOKENS
 
     def __post_init__(self) -> None:
-        try:
-            import openai
-        except ImportError:
-            raise ModelFailed("a live model needs an extra: pip install 'lare-rl[llm]'") from None
+        if not self.name.strip():
+            raise ModelFailed("the name of the model is empty")
         self.key = os.environ.get("OPENAI_API_KEY", "").strip()
+        if not re.fullmatch(r"[!-~]*", self.key):
+            raise ModelFailed("the environment variable OPENAI_API_KEY holds characters that are in no key")
         base_url = self.base_url or os.environ.get("OPENAI_BASE_URL")
         if not self.key and base_url is None:
             raise ModelFailed(
                 f"to ask {self.name!r}, put a key into the environment variable OPENAI_API_KEY, or name a server of "
                 "your own with --base-url (as http://localhost:11434/v1 for Ollama)"
             )
+        self.endpoint = base_url
         try:
-            self.client = openai.OpenAI(api_key=self.key or "none", base_url=base_url, max_retries=0, timeout=TIMEOUT)
+            self.client = self.connect()
+        except ImportError:
+            raise ModelFailed("a live model needs an extra: pip install 'lare-rl[llm]'") from None
         except Exception as error:
             raise ModelFailed(f"the endpoint {base_url!r} cannot be used: {self.scrubbed(error)}") from None
+
+    def connect(self) -> Any:
+        """A client that reads no answer without end."""
+        import openai
+
+        http = openai.DefaultHttpxClient(event_hooks={"response": [bound]}, timeout=TIMEOUT)
+        return openai.OpenAI(api_key=self.key or "none", base_url=self.endpoint, max_retries=0, http_client=http)
 
     def scrubbed(self, text: object) -> str:
         """A message in one line, without the key."""
@@ -168,7 +187,11 @@ class LiveModel:
             if failure.wait:
                 self.said(f"{self.name}: {failure.said}; trying again in {failure.wait:.1f} s")
                 self.sleep(failure.wait)
-            outcome = self.ask(messages)
+            try:
+                outcome = self.ask(messages)
+            except BudgetSpent as error:
+                why = f"; the last try failed: {failure.said}" if tries else ""
+                raise BudgetSpent(f"{error}{why}") from None
             if isinstance(outcome, str):
                 return self.without_key(outcome)
             tries += outcome.wait is not None
@@ -189,12 +212,22 @@ class LiveModel:
             options["temperature"] = self.temperature
         self.budget.requests_made += 1
         create = self.client.chat.completions.with_streaming_response.create
-        try:
+
+        def fetch() -> bytes:
             with create(model=self.name, messages=list(messages), **options) as response:  # type: ignore[arg-type]
-                body = bounded(response.iter_bytes())
+                return response.read()
+
+        try:
+            body = in_time(fetch)
         except openai.APIStatusError as error:
             return self.refused(error)
+        except openai.APIConnectionError as error:
+            where = re.sub(r"//[^/@]*@", "//", str(self.client.base_url))
+            return Failure(self.scrubbed(f"{where} cannot be reached: {error.__cause__ or error}"), again=True)
         except (openai.OpenAIError, OSError) as error:
+            if isinstance(error, TimeoutError):  # whoever goes on reading is left behind
+                self.client.close()
+                self.client = self.connect()
             return Failure(self.scrubbed(f"{type(error).__name__}: {error}"), again=True)
         except TooMuch as error:
             self.budget.count(None, messages, "x" * LARGEST_BODY)
@@ -211,6 +244,7 @@ class LiveModel:
             text = choice.get("content") or choice.get("refusal") or ""
             if not isinstance(text, str):
                 raise TypeError("the content is not a text")
+            text = text.encode(errors="replace").decode()  # half a character is none
         except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
             self.budget.count(None, messages, body.decode(errors="replace"))
             return Failure(
@@ -262,15 +296,50 @@ class TooMuch(Exception):
     """An answer has no end."""
 
 
-def bounded(chunks: Any) -> bytes:
-    """A whole body, if it comes in time and is not too long."""
-    body, deadline = b"", time.monotonic() + TIMEOUT
-    for chunk in chunks:
-        body += chunk
-        if len(body) > LARGEST_BODY:
-            raise TooMuch(f"the answer has more than {LARGEST_BODY >> 20} MB")
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"the answer was not complete after {TIMEOUT:.0f} s")
+def bound(response: Any) -> None:
+    """Let the body of an answer, of whatever status, be read in time and no further than it may go."""
+    # Which HTTP library is beneath depends on the client's version; a stream must be one of its own kind.
+    library = importlib.import_module(type(response).__module__.partition(".")[0])
+
+    class Bounded(library.SyncByteStream):
+        def __init__(self, stream: Any):
+            self.stream = stream
+
+        def __iter__(self) -> Iterator[bytes]:
+            size, deadline = 0, time.monotonic() + TIMEOUT
+            for chunk in self.stream:
+                size += len(chunk)
+                if size > LARGEST_BODY:
+                    raise TooMuch(f"the answer has more than {LARGEST_BODY >> 20} MB")
+                if time.monotonic() > deadline:
+                    raise TimeoutError(f"the answer was not complete after {TIMEOUT:.0f} s")
+                yield chunk
+
+        def close(self) -> None:
+            self.stream.close()
+
+    response.stream = Bounded(response.stream)
+
+
+def in_time(fetch: Callable[[], bytes]) -> bytes:
+    """What `fetch` returns or raises. Raises `TimeoutError` where it does neither in time: a server may say its headers letter by
+    letter, and each one starts a socket's clock anew.
+    """
+    outcome: queue.SimpleQueue[tuple[bytes, BaseException | None]] = queue.SimpleQueue()
+
+    def run() -> None:
+        try:
+            outcome.put((fetch(), None))
+        except BaseException as error:
+            outcome.put((b"", error))
+
+    threading.Thread(target=run, daemon=True).start()
+    try:
+        body, error = outcome.get(timeout=1.1 * TIMEOUT)  # the sockets' own clocks come first, and say more
+    except queue.Empty:
+        raise TimeoutError(f"the answer was not complete after {TIMEOUT:.0f} s") from None
+    if error is not None:
+        raise error
     return body
 
 

@@ -52,11 +52,18 @@ def shipped_recordings(kind: Kind, draw: int) -> list[Recording]:
 def read_recording(text: str, name: str) -> Recording:
     """Raises `LareError` where `text` is not a recording; `name` says in the message which one."""
     try:
-        return Recording(**json.loads(text))
+        values = json.loads(text)
+        json.dumps(values, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        raise LareError(f"recording {name} holds half a character (a surrogate), which no file can keep") from error
+    except (ValueError, RecursionError) as error:
+        raise LareError(f"recording {name} is not JSON: {error}") from error
+    if not isinstance(values, dict):
+        raise LareError(f"recording {name} is JSON, but not an object")
+    try:
+        return Recording(**values)
     except LareError as error:
         raise LareError(f"recording {name}: {error}") from error
-    except (ValueError, TypeError, RecursionError) as error:
-        raise LareError(f"recording {name} is not JSON: {error}") from error
 
 
 class RecordedModel:

@@ -44,6 +44,7 @@ def parse(text: str) -> Reply:
         raise MalformedReply("the reply is empty")
     if len(text) > LONGEST:
         raise MalformedReply(f"the reply has {len(text)} characters; at most {LONGEST} are read")
+    check_characters(text)
     try:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -56,8 +57,20 @@ def parse(text: str) -> Reply:
         reply = Reply(**values)
     except LareError as error:
         raise MalformedReply(f"the reply's JSON object is not as asked for: {error}") from error
+    for part in (reply.understand, reply.analyze, reply.functions):
+        check_characters(part)
     inner = FENCE.search(reply.functions)
     return reply.model_copy(update={"functions": inner[2]}) if inner else reply
+
+
+def check_characters(text: str) -> None:
+    """Raise `MalformedReply` where a text has half a character in it: JSON can say one, and no file can keep it."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise MalformedReply(
+            f"the reply holds {text[error.start]!a}, which is half a character (a surrogate)"
+        ) from None
 
 
 def embedded(text: str) -> dict[str, Any] | None:

@@ -21,9 +21,13 @@ def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) 
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
+        warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
         try:
             return as_rows(gymnasium.make(environment, max_episode_steps=max_episode_steps, **kwargs))
-        except Exception as error:  # an environment is foreign code: anything may come out of its constructor
+        except (
+            Exception,
+            SystemExit,
+        ) as error:  # an environment is foreign code: anything may come out of its constructor
             logging.getLogger(__name__).debug("making %s failed", environment, exc_info=True)
             reason = str(error).strip().splitlines() or [type(error).__name__]
             raise LareError(f"environment {environment!r} cannot be made: {reason[0]}") from error

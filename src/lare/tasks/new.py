@@ -14,9 +14,15 @@ from lare.tasks.spec import FILL_IN
 HEADING = re.compile(r"^[ \t]*#+\s*(.+?)\s*$", re.MULTILINE)
 
 LEAKS = re.compile(
-    r"reward|penal|\bcosts?\b|\bscor(e|es|ed|ing)\b|\bpoints?\b(?! (of|in|mass))|\breturns?\b", re.IGNORECASE
+    r"reward|penal|\bcosts?\b|\bscor(e|es|ed|ing)\b"
+    r"|(\d|\b(earn|gain|get|give|lose|receive|win|award)\w*)( \w+)? points?\b"
+    r"|\b(average|cumulative|discounted|episodic?|expected|mean|the|total) returns?\b(?! to\b)",
+    re.IGNORECASE,
 )
 """What a language model must not read: it is to find out what matters, not to copy it."""
+
+SHORTEST_SENTENCE = 8
+"""Words that are worth keeping on their own."""
 
 SENTENCE = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
@@ -81,6 +87,9 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
         key: "\n".join(part for part in (heads.get(key), text or f"{FILL_IN}: {wanted[key]}") if part)
         for key, text in texts.items()
     }
+    # An id without a version means the latest one, which may be another one tomorrow.
+    module, colon, _ = environment_id.rpartition(":")
+    full_id = f"{module}{colon}{environment.spec.id}" if environment.spec else environment_id
     name = re.sub(r"[^\w.\-]+", "-", environment_id.rpartition(":")[2])
     limit = environment.spec.max_episode_steps if environment.spec else None
     lines = [
@@ -88,7 +97,7 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
         "# know nothing but these texts. Whatever spoke of rewards was left out on purpose, so that the reward does not",
         f"# leak into the request ({left_out} sentences or rows); say what the goal is, not how it is paid.",
         f'name = "{name}"',
-        f'environment = "{environment_id}"',
+        f'environment = "{full_id}"',
         f"observation_size = {observation_size}",
         f"action_size = {action_size}",
         'judges = "after"',
@@ -141,9 +150,18 @@ def row(line: str) -> str:
 
 
 def without_rewards(lines: list[str]) -> tuple[str, int]:
-    """The lines that say nothing of rewards, and how many do."""
-    kept = [line for line in lines if not LEAKS.search(line)]
-    return "\n".join(kept), len(lines) - len(kept)
+    """What is left of the lines when nothing in them speaks of rewards, and how many did."""
+    kept = [without_clause(line) for line in lines]
+    return "\n".join(line for line in kept if line), sum(line != was for line, was in zip(kept, lines, strict=True))
+
+
+def without_clause(line: str) -> str:
+    """A line up to the clause that speaks of rewards, if what is before it makes a sentence; else nothing."""
+    found = LEAKS.search(line)
+    if found is None:
+        return line
+    before, _, _ = line[: found.start()].rpartition(", ")
+    return before + "." if len(before.split()) >= SHORTEST_SENTENCE else ""
 
 
 def ending(sections: dict[str, str]) -> str:

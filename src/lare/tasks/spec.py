@@ -159,7 +159,7 @@ def is_file(name: str) -> bool:
 
 def read_text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise LareError(f"{path} cannot be read: {error}") from error
 
