@@ -20,6 +20,7 @@ import numpy as np
 import lare
 from lare.credit.decomposition import CreditSettings
 from lare.experiments import figures
+from lare.training.settings import AgentSettings
 
 PUBLISHED = {"credit": CreditSettings(normalise=False)}
 
@@ -35,13 +36,20 @@ HALF_CHEETAH = {
     "lare-rd": {"method": "lare-rd"},
     "rd": {"method": "rd"},
     "episodic": {"method": "episodic"},
+    "lare-rrdu-chunk-1": {"method": "lare-rrdu", "chunk": 1},
+    "lare-rrdu-chunk-1000": {"method": "lare-rrdu", "chunk": 1000},
 }
 OTHERS = {name: HALF_CHEETAH[name] for name in ("lare-rrdu", "rrdu", "dense")}
 MUJOCO = {"steps": 100_000, "seeds": 3}
 
-SMALL = {
+SMALL: dict[str, dict[str, Any]] = {
     name: {"method": name} for name in ("lare-rd", "rd", "dense", "lare-rd-shared", "rrd", "episodic", "stas", "arel")
 }
+USUAL = AgentSettings()
+FEW = USUAL.model_copy(update={"credit": USUAL.credit.model_copy(update={"steps": 800})})
+for slow in ("stas", "arel"):
+    # 32 episodes in an update of the decoder, not 256: it is 13 to 27 times as expensive as that of the others.
+    SMALL[slow]["agents"] = FEW
 LARGE = {name: SMALL[name] for name in ("lare-rd", "rd", "dense")}
 COMPETITIVE = {name: SMALL[name] for name in ("lare-rd", "rd")}
 
