@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from lare.algorithms import sac
-from lare.algorithms.critics import Transitions
 from lare.algorithms.sac import SACSettings
 from lare.networks import MLP
+from twins import forward, transitions
 
 SETTINGS = SACSettings(hidden=(8, 8), temperature=0.5)
 
@@ -21,16 +21,7 @@ def state():
 
 @pytest.fixture(scope="module")
 def batch():
-    rng = np.random.default_rng(0)
-    s, a, r, n = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in [(16, 3), (16, 2), (16,), (16, 3)])
-    return Transitions(s, jnp.tanh(a), r, n, jnp.asarray(np.arange(16) % 4 > 0, jnp.float32))
-
-
-def forward(network, x):
-    """An MLP in plain NumPy."""
-    for layer in network.layers[:-1]:
-        x = np.maximum(x @ np.asarray(layer.weight) + np.asarray(layer.bias), 0)
-    return x @ np.asarray(network.layers[-1].weight) + np.asarray(network.layers[-1].bias)
+    return transitions()
 
 
 def drawn(state, observation, key):

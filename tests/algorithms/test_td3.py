@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from lare.algorithms import td3
-from lare.algorithms.critics import Transitions
 from lare.algorithms.table import DDPG
 from lare.algorithms.td3 import TD3Settings
+from twins import forward, transitions
 
 SETTINGS = TD3Settings(hidden=(8, 8), batch_size=16)
 
@@ -20,16 +20,7 @@ def state():
 
 @pytest.fixture(scope="module")
 def batch():
-    rng = np.random.default_rng(0)
-    s, a, r, n = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in [(16, 3), (16, 2), (16,), (16, 3)])
-    return Transitions(s, jnp.tanh(a), r, n, jnp.asarray(np.arange(16) % 4 > 0, jnp.float32))
-
-
-def forward(network, x):
-    """An MLP in plain NumPy."""
-    for layer in network.layers[:-1]:
-        x = np.maximum(x @ np.asarray(layer.weight) + np.asarray(layer.bias), 0)
-    return x @ np.asarray(network.layers[-1].weight) + np.asarray(network.layers[-1].bias)
+    return transitions()
 
 
 def one_of(critics, place):

@@ -18,35 +18,20 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 from pydantic import Field
 
-from lare.algorithms.critics import Transitions, critics, squared_errors, values
-from lare.errors import Checked
+from lare.algorithms.critics import OffPolicySettings, Transitions, critics, squared_errors, values
 from lare.networks import MLP, descend, move_towards, start_adam
 
 SMALLEST_LOG, LARGEST_LOG = -20.0, 2.0
 """Bounds of log sigma."""
 
 
-class SACSettings(Checked):
-    """The published figures; none of them depends on the task."""
+class SACSettings(OffPolicySettings):
+    """The published figures."""
 
-    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
-    """Widths of the hidden layers of actor and critics."""
-    critics: Annotated[int, Field(ge=1)] = 2
-    """How many there are; the smallest of their values counts."""
-    learning_rate: Annotated[float, Field(gt=0)] = 3e-4
-    """Adam's step size, for actor, critics and temperature."""
-    batch_size: Annotated[int, Field(ge=1)] = 256
-    """Transitions in one update."""
-    gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
-    """Discount of a step."""
-    tau: Annotated[float, Field(gt=0, le=1)] = 0.005
-    """How far the target critics move towards the critics at a time."""
     target_every: Annotated[int, Field(ge=1)] = 2
     """Updates from one move of the target critics to the next."""
     temperature: Annotated[float, Field(gt=0)] = 1.0
     """alpha at the start."""
-    warmup: Annotated[int, Field(ge=0)] = 10_000
-    """Environment steps with uniformly random actions before the first update."""
 
 
 class Networks(NamedTuple):

@@ -12,8 +12,7 @@ from lare.algorithms.ppo import PPOSettings
 from lare.algorithms.sac import SACSettings
 from lare.algorithms.td3 import TD3Settings
 
-OffPolicySettings = TD3Settings | SACSettings
-AlgorithmSettings = OffPolicySettings | PPOSettings
+AlgorithmSettings = TD3Settings | SACSettings | PPOSettings
 
 
 class Kind(StrEnum):

@@ -19,26 +19,13 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 from pydantic import Field
 
-from lare.algorithms.critics import Transitions, critics, squared_errors, value, values
-from lare.errors import Checked
+from lare.algorithms.critics import OffPolicySettings, Transitions, critics, squared_errors, value, values
 from lare.networks import MLP, descend, move_towards, start_adam
 
 
-class TD3Settings(Checked):
-    """The figures of the TD3 paper; none of them depends on the task."""
+class TD3Settings(OffPolicySettings):
+    """The figures of the TD3 paper. The targets move at each policy update."""
 
-    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
-    """Widths of the hidden layers of actor and critics."""
-    critics: Annotated[int, Field(ge=1)] = 2
-    """How many there are; the smallest of their values counts."""
-    learning_rate: Annotated[float, Field(gt=0)] = 3e-4
-    """Adam's step size, for actor and critics."""
-    batch_size: Annotated[int, Field(ge=1)] = 256
-    """Transitions in one update."""
-    gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
-    """Discount of a step."""
-    tau: Annotated[float, Field(gt=0, le=1)] = 0.005
-    """How far the targets move towards the networks at a policy update."""
     policy_noise: Annotated[float, Field(ge=0)] = 0.2
     """Standard deviation of the noise on the target action, in units of the action bound."""
     noise_clip: Annotated[float, Field(ge=0)] = 0.5
@@ -47,8 +34,6 @@ class TD3Settings(Checked):
     """Critic updates for each update of actor and targets."""
     exploration_noise: Annotated[float, Field(ge=0)] = 0.1
     """Standard deviation of the noise on the actions that are taken, in units of the action bound."""
-    warmup: Annotated[int, Field(ge=0)] = 10_000
-    """Environment steps with uniformly random actions before the first update."""
 
 
 class Networks(NamedTuple):

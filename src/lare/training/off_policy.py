@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
 from lare.algorithms import sac, td3
-from lare.algorithms.critics import Transitions
-from lare.algorithms.table import OffPolicySettings
+from lare.algorithms.critics import OffPolicySettings, Transitions
 from lare.credit.decomposition import Decomposition
 from lare.networks import MLP
 from lare.training import learner as common
