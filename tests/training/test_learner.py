@@ -111,6 +111,27 @@ def test_closed_forms_are_fitted_to_the_episodes_that_have_ended(pieces):
     np.testing.assert_allclose(learner.credit.decoder.weight, want, rtol=1e-3)
 
 
+def test_padded_episodes_are_whole_and_repeat_their_end():
+    chosen = recipe("diaster")
+    held = stored(chosen).replay
+    drawn = common.draw_padded_episodes(held, jax.random.key(0), 5, chosen)
+    steps = np.asarray(drawn.steps).reshape(5, chosen.credit.episodes, chosen.longest_episode)
+    for of_update, first, length in zip(
+        steps, np.asarray(drawn.episodes.first), np.asarray(drawn.episodes.length), strict=True
+    ):
+        for row, begin, count in zip(of_update, first, length, strict=True):
+            np.testing.assert_array_equal(row[:count], begin + np.arange(count))
+            assert set(row[count:]) <= {begin + count - 1}
+
+
+def test_state_and_action_alone():
+    chosen = recipe("diaster")
+    drawn = replay.read(stored(chosen).replay, jnp.array([7]))
+    want = np.concatenate([drawn.observation, np.clip(drawn.action, -1, 1)], axis=1)
+    np.testing.assert_array_equal(common.features(drawn, chosen.method), want)
+    assert want.shape[1] == chosen.features == 5
+
+
 def test_forgetting_the_episode_under_way_leaves_the_fit():
     chosen = recipe("lare-linear")
     learner = stored(chosen)

@@ -36,6 +36,7 @@ def test_what_is_given_stands():
         ("CN-6", {"algorithm": "td3"}, "td3 is for a single agent, and CN-6 is a task of many"),
         ("Reacher-v4", {"algorithm": "ippo"}, "ippo is for many agents, and Reacher-v4 is a task of one"),
         ("Reacher-v4", {"method": "arel"}, "arel assigns credit among agents, and Reacher-v4 is a task of one"),
+        ("CN-6", {"method": "diaster"}, "diaster assigns credit to a single agent, and CN-6 is a task of many"),
         (
             "Reacher-v4",
             {"method": "llm-reward", "judges": "both"},

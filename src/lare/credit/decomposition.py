@@ -22,13 +22,14 @@ from lare.credit import losses
 from lare.credit.arel import AREL
 from lare.credit.closed_form import Linear, Totals, best_signs, forget_running, no_totals, ridge_regression, take_in
 from lare.credit.decoders import Bottleneck, Decoded, StepDecoder
+from lare.credit.diaster import Diaster
 from lare.credit.methods import Decoder, Fit, Method
 from lare.credit.stas import STAS
 from lare.errors import Checked
 from lare.networks import descend, start_adam
 from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe, observe_scale, standardise
 
-Network = StepDecoder | Bottleneck | AREL | STAS | Linear
+Network = StepDecoder | Bottleneck | AREL | STAS | Diaster | Linear
 """A decoder of any kind."""
 
 
@@ -49,6 +50,10 @@ class CreditSettings(Checked):
     """K: steps drawn from an episode by RRD and its kin."""
     steps: Annotated[int, Field(ge=2)] = 256
     """Steps in one update of the decoder: K steps of so many episodes, or whole episodes that make up about as many."""
+    episodes: Annotated[int, Field(ge=1)] = 8
+    """diaster: whole episodes in one update of its decoder."""
+    fits: Annotated[int, Field(ge=1)] = 1
+    """diaster: updates of its decoder before each chunk of those of an off-policy algorithm."""
     ridge: Annotated[float, Field(gt=0)] = 1.0
     """lambda of the ridge regression: so many episodes' worth of belief in no difference between steps."""
     bottleneck: Annotated[int, Field(ge=1)] = 4
@@ -58,7 +63,10 @@ class CreditSettings(Checked):
 
 
 class Episodes(NamedTuple):
-    """Steps of some episodes, and what those episodes returned. For K drawn steps, rows = episodes * K, in order."""
+    """Steps of some episodes, and what those episodes returned.
+
+    For K drawn steps, rows = episodes * K, in order; for Diaster, episodes * the longest that there can be.
+    """
 
     features: Float[Array, "rows *agents features"]
     episode: Int[Array, " rows"]
@@ -95,6 +103,8 @@ def init(
             decoder = AREL(features, steps, key=key)
         case Decoder.STAS:
             decoder = STAS(features, steps, agents, key=key)
+        case Decoder.DIASTER:
+            decoder = Diaster(features, settings.hidden, key=key)
         case Decoder.LINEAR:
             decoder = Linear(jnp.zeros(features), jnp.zeros(()))
             return Decomposition(decoder, (), no_moments(features), no_scale(), no_totals(features))
@@ -166,6 +176,10 @@ def loss_and_gradient(
     weight = losses.episode_weight(episodes.length, episodes.counts, settings.sum_form)
 
     def loss_of(decoder: Network) -> Float[Array, ""]:
+        if isinstance(decoder, Diaster):
+            whole = episodes.features.reshape(len(target), -1, episodes.features.shape[-1])
+            seen = standardise(state.moments, whole) if settings.normalise else whole
+            return decoder.loss(seen, episodes.length, target, weight, key)
         decoded = decode(decoder, state, episodes.features, settings, key)
         r_hat = jnp.mean(decoded.r_hat.reshape(len(episodes.features), -1), axis=1)
         return losses_of(r_hat) + decoded.penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)

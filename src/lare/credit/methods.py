@@ -33,6 +33,8 @@ class Fit(StrEnum):
     """RRD: K steps drawn from each episode."""
     DRAWN_STEPS_UNBIASED = "drawn steps, unbiased"
     """RRD-unbiased: the same, less the variance that the drawing adds."""
+    SUBTRAJECTORIES = "two pieces of an episode"
+    """Diaster: the two pieces of an episode that was cut somewhere (equations in `diaster.py`)."""
     RIDGE = "ridge regression"
     """In closed form, on all episodes (equations in `closed_form.py`)."""
     SIGNS = "best signs"
@@ -42,6 +44,11 @@ class Fit(StrEnum):
     def closed_form(self) -> bool:
         """Whether nothing descends a gradient."""
         return self in (Fit.RIDGE, Fit.SIGNS)
+
+    @property
+    def apart(self) -> bool:
+        """Whether it is too expensive to go with every update of an off-policy algorithm, and goes between chunks of them."""
+        return self is Fit.SUBTRAJECTORIES
 
 
 class Decoder(StrEnum):
@@ -55,6 +62,8 @@ class Decoder(StrEnum):
     """Attention over time and agents; one reward a step for all agents."""
     STAS = "stas"
     """Attention over time, then over random coalitions of agents."""
+    DIASTER = "diaster"
+    """A recurrent model of pieces of an episode, and an MLP on each step that learns its differences."""
     LINEAR = "linear"
     """A weighted sum."""
 
@@ -101,6 +110,11 @@ class Method:
         """Whether it says nothing where there is a single agent."""
         return self.shared or self.decoder in (Decoder.AREL, Decoder.STAS)
 
+    @property
+    def for_one_only(self) -> bool:
+        """Whether it says nothing where there are many."""
+        return self.decoder is Decoder.DIASTER
+
 
 LARE = "Qu et al., LaRe, AAAI 2025"
 RD = "Efroni et al., AAAI 2021; Arjona-Medina et al., RUDDER, 2019"
@@ -132,6 +146,15 @@ TABLE = (
         "RRD-unbiased behind a bottleneck of its own",
         VIB,
         Decoder.BOTTLENECK,
+    ),
+    Method(
+        "diaster",
+        Reward.PROXY,
+        Encoder.TAKEN,
+        Fit.SUBTRAJECTORIES,
+        "differences of what pieces of an episode pay",
+        "Lin et al., Diaster, AAAI 2024",
+        Decoder.DIASTER,
     ),
     Method(
         "arel",

@@ -61,7 +61,13 @@ class Recipe:
     @property
     def features(self) -> int:
         """Size of what the decoder sees."""
-        return self.factors if self.method.encoder is Encoder.LATENT else 2 * self.observation_size + self.action_size
+        match self.method.encoder:
+            case Encoder.LATENT:
+                return self.factors
+            case Encoder.TAKEN:
+                return self.observation_size + self.action_size
+            case _:
+                return 2 * self.observation_size + self.action_size
 
 
 class Learner(NamedTuple):
@@ -104,9 +110,11 @@ def features(steps: Step | Draw, method: Method) -> Float[Array, "batch features
     """What the method's decoder sees of some steps."""
     if method.encoder is Encoder.LATENT:
         return jnp.asarray(steps.factors)
-    change = steps.observation - steps.next_observation
     # A Gaussian may choose beyond the bounds; what happened is that the bound was taken.
-    return jnp.concatenate([steps.observation, jnp.clip(steps.action, -1, 1), change], axis=-1)
+    rows = [steps.observation, jnp.clip(steps.action, -1, 1)]
+    if method.encoder is Encoder.RAW:
+        rows.append(steps.observation - steps.next_observation)
+    return jnp.concatenate(rows, axis=-1)
 
 
 def store(learner: Learner, steps: Step, recipe: Recipe) -> Learner:
@@ -151,6 +159,8 @@ def draw_credit(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -
     if recipe.method.fit is Fit.ALL_STEPS:
         whole = partial(draw_whole_episodes, held, recipe=recipe)
         return jax.vmap(whole)(jax.random.split(key, updates))
+    if recipe.method.fit is Fit.SUBTRAJECTORIES:
+        return draw_padded_episodes(held, key, updates, recipe)
     return draw_parts_of_episodes(held, key, updates, recipe)
 
 
@@ -162,6 +172,16 @@ def draw_parts_of_episodes(held: Replay, key: PRNGKeyArray, updates: int, recipe
     steps = episodes.first[..., None] + replay.draw_steps(steps_key, episodes.length, drawn)
     episode = jnp.broadcast_to(jnp.repeat(jnp.arange(count), drawn), (updates, count * drawn))
     return CreditDraws(steps.reshape(updates, -1), episode, episodes)
+
+
+def draw_padded_episodes(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> CreditDraws:
+    """All steps of some episodes, and the last one again until each is as long as the longest can be, for Diaster."""
+    count, longest = recipe.credit.episodes, recipe.longest_episode
+    episodes = replay.draw_episodes(held, key, (updates, count))
+    number = jnp.minimum(jnp.arange(longest), episodes.length[..., None] - 1)
+    steps = (episodes.first[..., None] + number).reshape(updates, -1)
+    episode = jnp.broadcast_to(jnp.repeat(jnp.arange(count), longest), steps.shape)
+    return CreditDraws(steps, episode, episodes)
 
 
 def draw_whole_episodes(held: Replay, key: PRNGKeyArray, recipe: Recipe) -> CreditDraws:
@@ -192,6 +212,22 @@ def fit(
     seen, chosen = features(replay.read(held, draws.steps), recipe.method), draws.episodes
     episodes = Episodes(seen, draws.episode, chosen.length, chosen.mean_reward, chosen.counts)
     return decomposition.update(credit, episodes, key, recipe.method.fit, recipe.credit)
+
+
+def fit_often(
+    learner: Learner, key: PRNGKeyArray, updates: int, recipe: Recipe
+) -> tuple[Learner, dict[str, Float[Array, ""]]]:
+    """Some updates of the decoder, one behind the other; the mean of each metric over them."""
+    draw_key, key = jax.random.split(key)
+    draws = draw_credit(learner.replay, draw_key, updates, recipe)
+    if learner.credit is None or draws is None:
+        return learner, {}
+
+    def one(credit: Decomposition, turn: tuple[CreditDraws, PRNGKeyArray]):
+        return fit(credit, learner.replay, *turn, recipe)
+
+    credit, measured = jax.lax.scan(one, learner.credit, (draws, jax.random.split(key, updates)))
+    return learner._replace(credit=credit), jax.tree.map(jnp.mean, measured)
 
 
 def rewards(batch: Draw, learner: Learner, recipe: Recipe) -> Float[Array, " batch"]:

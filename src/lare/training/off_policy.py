@@ -43,8 +43,9 @@ def module_of(settings: OffPolicySettings) -> Any:
 def draw(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> Draws:
     """Decide for a whole chunk of updates what each of them reads."""
     batch_key, credit_key = jax.random.split(key)
+    with_each = recipe.method.fit is not None and not recipe.method.fit.apart
     batch = replay.draw_transitions(held, batch_key, (updates, settings_of(recipe).batch_size))
-    return Draws(batch, draw_credit(held, credit_key, updates, recipe))
+    return Draws(batch, draw_credit(held, credit_key, updates, recipe) if with_each else None)
 
 
 def improve(
@@ -52,6 +53,9 @@ def improve(
 ) -> tuple[Learner, dict[str, Float[Array, ""]]]:
     """A chunk of updates, one for each of its steps; the mean of each metric over them."""
     draw_key, noise_key = jax.random.split(key)
+    fitted = {}
+    if recipe.method.fit is not None and recipe.method.fit.apart:
+        learner, fitted = common.fit_often(learner, jax.random.fold_in(key, 1), recipe.credit.fits, recipe)
     held, settings, updates = learner.replay, settings_of(recipe), recipe.turn
 
     def one(carry: tuple[Any, Decomposition | None], turn: tuple[Int[Scalar, ""], Draws, PRNGKeyArray]):
@@ -69,7 +73,7 @@ def improve(
     numbers = done - settings.warmup + jnp.arange(updates)
     turns = (numbers, draw(held, draw_key, updates, recipe), jax.random.split(noise_key, updates))
     (algorithm, credit), measured = jax.lax.scan(one, (learner.algorithm, learner.credit), turns)
-    return learner._replace(algorithm=algorithm, credit=credit), jax.tree.map(jnp.mean, measured)
+    return learner._replace(algorithm=algorithm, credit=credit), fitted | jax.tree.map(jnp.mean, measured)
 
 
 def actor_of(learner: Learner) -> MLP:

@@ -16,11 +16,10 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
 from lare.algorithms import ppo
 from lare.algorithms.ppo import Policy
-from lare.credit.decomposition import Decomposition
 from lare.normalise import Moments, observe, standardise
 from lare.training import learner as common
 from lare.training import replay
-from lare.training.learner import Compiled, CreditDraws, Learner, Recipe, draw_credit, rewards
+from lare.training.learner import Compiled, Learner, Recipe, fit_often, rewards
 
 Actor = tuple[Policy, Moments]
 """A policy, and what its observations are normalised by."""
@@ -30,20 +29,6 @@ def actor_of(learner: Learner) -> Actor:
     assert isinstance(learner.algorithm, ppo.PPO)
     assert learner.observations is not None
     return learner.algorithm.online.actor, learner.observations
-
-
-def fit(learner: Learner, key: PRNGKeyArray, recipe: Recipe) -> tuple[Learner, dict[str, Float[Array, ""]]]:
-    """All updates of the decoder before one of the policy; the mean of each metric over them."""
-    draw_key, key = jax.random.split(key)
-    draws = draw_credit(learner.replay, draw_key, recipe.fit_updates, recipe)
-    if learner.credit is None or draws is None:
-        return learner, {}
-
-    def one(credit: Decomposition, turn: tuple[CreditDraws, PRNGKeyArray]):
-        return common.fit(credit, learner.replay, *turn, recipe)
-
-    credit, measured = jax.lax.scan(one, learner.credit, (draws, jax.random.split(key, recipe.fit_updates)))
-    return learner._replace(credit=credit), jax.tree.map(jnp.mean, measured)
 
 
 def seen(observation: Float[Array, "*batch observation"], moments: Moments) -> Float[Array, "*batch observation"]:
@@ -77,7 +62,7 @@ def improve(
     assert isinstance(recipe.algorithm, ppo.PPOSettings)
     assert isinstance(learner.algorithm, ppo.PPO)
     fit_key, key = jax.random.split(key)
-    algorithm, (learner, fitted) = learner.algorithm, fit(learner, fit_key, recipe)
+    algorithm, (learner, fitted) = learner.algorithm, fit_often(learner, fit_key, recipe.fit_updates, recipe)
     left = 1 - done / recipe.steps
     algorithm, improved = ppo.update(algorithm, rollout(learner, recipe), key, left, recipe.algorithm)
     _, moments = actor_of(learner)

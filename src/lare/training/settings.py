@@ -180,6 +180,8 @@ def decide(settings: Settings, task: TaskSpec) -> Plan:
     judges = plan.judges or task.judges
     if method.reward is Reward.DESIGNED and judges == "both":
         raise LareError(f"{method.name} is one reward a step: it judges the observation before or after, not both")
+    if method.for_one_only and many:
+        raise LareError(f"{method.name} assigns credit to a single agent, and {task.name} is a task of many")
     if method.for_many_only and not many:
         raise LareError(f"{method.name} assigns credit among agents, and {task.name} is a task of one")
     return plan
