@@ -1,5 +1,6 @@
 """A language model's server on loopback, that behaves as it is told (`from servers import ...`)."""
 
+import gzip
 import json
 import socket
 import threading
@@ -128,6 +129,18 @@ def floods(handler: Handler, status: int = 200) -> None:
             handler.wfile.write(b" " * (1 << 20))
     except OSError:
         return
+
+
+def packed(encoding: str, times: int) -> Answer:
+    """A little that is a lot when it is unpacked."""
+
+    def answer(handler: Handler) -> None:
+        body = b" " * (64 << 20)
+        for _ in range(times):
+            body = gzip.compress(body)
+        handler.send(200, body, Content_Encoding=encoding)
+
+    return answer
 
 
 def refuses_without_end(handler: Handler) -> None:

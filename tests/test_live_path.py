@@ -1,6 +1,10 @@
 """From a live model to a trained policy, without a network: a server on loopback speaks for the recorded model."""
 
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -9,6 +13,7 @@ from hypothesis import strategies as st
 from lare.errors import LareError
 from lare.latent.design import design
 from lare.latent.function import load
+from lare.llm import prompts
 from lare.llm.live import Budget, LiveModel
 from lare.llm.recording import read_recording, shipped_recordings
 from lare.tasks.spec import read_task
@@ -142,12 +147,53 @@ def test_what_a_model_says_does_not_steer_the_terminal(serve, command):
         (["--out", "no/phi.py"], "no/phi.py cannot be written: there is no directory no; choose another --out"),
         (["--record", "no/r.json"], "no/r.json cannot be written: there is no directory no; choose another --record"),
         (["--record", "r.json", "--out", "r.py"], "--out writes r.json too: choose another --record"),
+        (["--record", "./r.json", "--out", "../{here}/r"], "--out writes r.json too: choose another --record"),
+        (["--out", "n" * 300], f"{'n' * 300} cannot be written: File name too long"),
+        (["--price", -1, 2], "price = -1.0 2.0: two numbers from 0 on"),
         (["--policy", "nowhere"], "nowhere is not a run: there is no config.json in it"),
     ],
 )
-def test_options_of_a_design_that_make_no_sense(command, arguments, message):
+def test_options_of_a_design_that_make_no_sense(command, tmp_path, arguments, message):
     """Before anybody is asked, or paid."""
-    assert command("design", "Reacher-v4", *arguments) == (2, "", f"lare: {message}\n")
+    given = [str(argument).format(here=tmp_path.name) for argument in arguments]
+    assert command("design", "Reacher-v4", *given) == (2, "", f"lare: {message}\n")
+
+
+def run_lare(*arguments, **streams):
+    """`lare` in a process of its own."""
+    command = [sys.executable, "-c", "from lare.cli import main; main()", *map(str, arguments)]
+    return subprocess.run(command, stderr=subprocess.PIPE, **streams)
+
+
+def test_a_terminal_that_cannot_show_a_letter(tmp_path):
+    """No reason to lose a function."""
+    source = "def evaluation_func(o, a):\n    # größe 漢字 😀\n    return [o[:, :1]]"
+    recording = shipped_recordings("factors", 0)[0].model_dump()
+    recording["exchanges"] = [
+        {
+            "stage": "candidate",
+            "messages": prompts.candidate(read_task("Reacher-v4")),
+            "replies": [json.dumps({"Understand": "", "Analyze": "", "Functions": source})],
+        }
+    ]
+    (tmp_path / "r.json").write_text(json.dumps(recording))
+    asked = ("design", "Reacher-v4", "--model", "r.json", "--candidates", 1)
+    plain = os.environ | {"PYTHONIOENCODING": "cp1252"}
+    done = run_lare(*asked, cwd=tmp_path, env=plain, stdout=subprocess.PIPE)
+    assert done.returncode == 0, done.stderr
+    assert b"\\u6f22\\u5b57" in done.stdout
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk that is always full")
+def test_what_was_paid_for_is_kept_where_nothing_can_be_printed(tmp_path):
+    with open("/dev/full", "w") as full:
+        done = run_lare("design", "Reacher-v4", cwd=tmp_path, stdout=full)
+        assert done.returncode == 2
+        said = done.stderr.decode().splitlines()[-1]
+        assert said == "lare: nothing can be printed (No space left on device); the function is kept in Reacher-v4.py"
+        assert load(tmp_path / "Reacher-v4.py", read_task("Reacher-v4")).size > 0
+        done = run_lare("prompt", "Reacher-v4", cwd=tmp_path, stdout=full)
+        assert (done.returncode, done.stderr.decode()) == (2, "lare: [Errno 28] No space left on device\n")
 
 
 def test_a_reply_for_another_task_is_corrected(serve):

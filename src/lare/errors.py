@@ -4,6 +4,9 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+LONGEST_VALUE = 100
+"""Characters of a value that a message quotes."""
+
 
 class LareError(Exception):
     """A mistake that its reader can mend.
@@ -25,6 +28,12 @@ class Checked(BaseModel):
             raise LareError(first_problem(error)) from error
 
 
+def shortened(value: Any) -> str:
+    """How a value is written, as far as it fits into a line."""
+    text = repr(value)
+    return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]}..."
+
+
 def first_problem(error: ValidationError) -> str:
     """The first thing that pydantic found wrong, in one line, and how many more there are."""
     problems = error.errors()
@@ -35,7 +44,7 @@ def first_problem(error: ValidationError) -> str:
     elif first["type"] == "extra_forbidden":
         said = f"there is no key {where!r}"
     elif where:
-        said = f"{where} = {first['input']!r}: {what.lower()}"
+        said = f"{where} = {shortened(first['input'])}: {what.lower()}"
     else:
         said = what
     return said + (f" (and {len(problems) - 1} more)" if len(problems) > 1 else "")

@@ -1,5 +1,6 @@
 """The live client against a real server on loopback that misbehaves."""
 
+import gzip
 import json
 
 import pytest
@@ -13,6 +14,7 @@ from servers import (
     floods,
     half,
     hangs_up,
+    packed,
     raw,
     refuses,
     refuses_slowly,
@@ -208,6 +210,42 @@ def test_a_server_that_counts_nothing_is_counted_by_bytes(served, usage):
     assert "counted as bytes" in model.budget.summary()
 
 
+@pytest.mark.parametrize(
+    ("encoding", "times", "said"),
+    [
+        ("gzip", 1, "the answer has more than 8 MB"),
+        ("gzip, gzip", 2, "is packed as gzip, gzip, which nobody asked for"),
+    ],
+)
+def test_a_little_that_unpacks_to_a_lot(served, monkeypatch, encoding, times, said):
+    monkeypatch.setattr(live, "TRIES", 1)
+    server, model, _ = served(packed(encoding, times))
+    with pytest.raises(ModelFailed, match=said):
+        model.reply(ASKED, 0)
+    assert server.headers[0]["Accept-Encoding"] == "identity"
+
+
+def test_a_server_that_packs_all_the_same(served):
+    body = gzip.compress(json.dumps(completion("hello")).encode())
+    _, model, _ = served(raw(body, Content_Encoding="gzip"))
+    assert model.reply(ASKED, 0) == "hello"
+
+
+def test_what_may_have_been_answered_is_counted(served):
+    _, model, _ = served(half, says("hello"))
+    model.reply(ASKED, 0)
+    assert model.budget.tokens_out == live.REPLY_TOKENS + 10
+
+
+@pytest.mark.parametrize("url", ["nowhere", "ftp://127.0.0.1:1/v1"])
+def test_what_is_hopeless_is_tried_once(url):
+    waited = []
+    model = LiveModel("m", url, sleep=waited.append)
+    with pytest.raises(ModelFailed, match="cannot be reached"):
+        model.reply(ASKED, 0)
+    assert (waited, model.budget.requests_made, model.budget.tokens_out) == ([], 1, 0)
+
+
 def test_half_a_character_is_none(served):
     """JSON can say it, and no file could keep it."""
     body = json.dumps(completion("a \ud800 b")).encode()
@@ -224,9 +262,10 @@ def test_a_key_that_is_none(monkeypatch, key):
         LiveModel("m", "http://127.0.0.1:1/v1")
 
 
-def test_a_model_without_a_name():
-    with pytest.raises(ModelFailed, match="the name of the model is empty"):
-        LiveModel(" ", "http://127.0.0.1:1/v1")
+@pytest.mark.parametrize("name", ["", " ", "\udcff", "two\nlines"])
+def test_a_model_without_a_name(name):
+    with pytest.raises(ModelFailed, match="is not the name of a model"):
+        LiveModel(name, "http://127.0.0.1:1/v1")
 
 
 def test_the_budget_of_requests_is_never_passed(served):

@@ -3,6 +3,8 @@
 What is slow to import is imported by the command that needs it.
 """
 
+import contextlib
+import io
 import os
 import sys
 import traceback
@@ -35,6 +37,9 @@ COMMANDS = {
 
 def main() -> None:
     """`lare`: a mistake of the user's is one line on stderr and exit status 2 (--debug shows where it came from)."""
+    for stream in (sys.stdout, sys.stderr):  # a terminal that cannot show a letter is no reason to lose a text
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     try:
@@ -46,7 +51,14 @@ def main() -> None:
         sys.exit(130 if type(error).__name__ == "Interrupted" else 2)
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:
-        # Whoever read the output has read enough. Python would complain again when it flushes at the end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            # Whoever read the output has read enough. Python would complain again when it flushes at the end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.exit(1)
+        if debug:
+            traceback.print_exc()
+        sys.stderr.write(f"lare: {error}\n")
+        with contextlib.suppress(OSError):  # what is still to be printed can not be
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(2)

@@ -11,6 +11,7 @@ from tyro.conf import Positional
 
 from lare.cli.terminal import Kind, Task, free_name, progress, say, write_new
 from lare.errors import LareError
+from lare.latent.function import LatentFunction
 from lare.tasks.spec import TaskSpec
 
 
@@ -89,7 +90,7 @@ def design(
         requests: requests that are never passed.
         price: of a million tokens in and out, to have the cost reckoned.
         temperature: of the model; the server's own unless given.
-        record: a file that takes every exchange, for --model FILE; it must not exist.
+        record: a file that takes every exchange, for --model FILE; it must not exist, and not be the .json of --out.
         out: a .py file to write, with the replies and checks in a .json beside it; it must not exist.
     """
     from lare.latent.design import DesignBroken, DesignFailed
@@ -99,7 +100,7 @@ def design(
     from lare.tasks.spec import load_task
 
     live = model not in (None, RECORDED) and not str(model).endswith(".json")
-    check_design(live, base_url, draw, budget, requests, temperature)
+    check_design(live, base_url, draw, budget, requests, price, temperature)
     check_files(out, record)
     spec, cost = load_task(task), Budget(requests, budget)
     if model is None or model == RECORDED:
@@ -130,10 +131,21 @@ def design(
         if cost.requests_made:
             progress(f"{asked.name}: {cost.summary(price)}")
     if out is None:
-        say(function.source)
+        print_function(function, free_name(Path(f"{spec.name}.py")))
     else:
         function.save(out)
         say(f"wrote {out.with_suffix('.py')}: {function.size} factors ({', '.join(function.names)})")
+
+
+def print_function(function: LatentFunction, instead: Path) -> None:
+    """Print a function; where nothing can be printed it was paid for all the same, and is saved `instead`."""
+    try:
+        say(function.source)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        function.save(instead)
+        raise LareError(f"nothing can be printed ({error.strerror}); the function is kept in {instead}") from error
 
 
 def acting(run: Path | None, spec: TaskSpec) -> Callable[[np.ndarray], np.ndarray] | None:
@@ -146,7 +158,13 @@ def acting(run: Path | None, spec: TaskSpec) -> Callable[[np.ndarray], np.ndarra
 
 
 def check_design(
-    live: bool, base_url: str | None, draw: int, budget: int, requests: int, temperature: float | None
+    live: bool,
+    base_url: str | None,
+    draw: int,
+    budget: int,
+    requests: int,
+    price: tuple[float, float] | None,
+    temperature: float | None,
 ) -> None:
     """Raise `LareError` where options do not go together, or make no sense."""
     if base_url is not None and not live:
@@ -156,24 +174,33 @@ def check_design(
     for name, value in (("budget", budget), ("requests", requests)):
         if value < 1:
             raise LareError(f"{name} = {value}: at least one is needed")
+    if price is not None and not all(0 <= one < float("inf") for one in price):
+        raise LareError(f"price = {price[0]} {price[1]}: two numbers from 0 on")
     if temperature is not None and not 0 <= temperature < float("inf"):
         raise LareError(f"temperature = {temperature}: a number from 0 on")
 
 
 def check_files(out: Path | None, record: Path | None) -> None:
     """Raise `LareError` where what is to be written could not be, before a model is asked and paid."""
-    written = {path: "--record" for path in (record,) if path is not None}
+    written = [] if record is None else [(record, "--record")]
     if out is not None:
-        if not out.name or out.is_dir():
+        if not out.name:
             raise LareError(f"{out} is not the name of a file; choose another --out")
-        written |= {out.with_suffix(".py"): "--out", out.with_suffix(".json"): "--out"}
-        if record in (out.with_suffix(".py"), out.with_suffix(".json")):
+        written += [(out, "--out"), (out.with_suffix(".py"), "--out"), (out.with_suffix(".json"), "--out")]
+    try:
+        for path, option in written:
+            if path.is_dir():
+                raise LareError(f"{path} is not the name of a file; choose another {option}")
+            if path.exists() and path != out:
+                raise LareError(f"{path} exists, and is not overwritten; choose another {option}")
+            if not path.parent.is_dir():
+                raise LareError(
+                    f"{path} cannot be written: there is no directory {path.parent}; choose another {option}"
+                )
+        if record is not None and record.resolve() in [path.resolve() for path, option in written if option == "--out"]:
             raise LareError(f"--out writes {record} too: choose another --record")
-    for path, option in written.items():
-        if path.exists():
-            raise LareError(f"{path} exists, and is not overwritten; choose another {option}")
-        if not path.parent.is_dir():
-            raise LareError(f"{path} cannot be written: there is no directory {path.parent}; choose another {option}")
+    except OSError as error:
+        raise LareError(f"{error.filename} cannot be written: {error.strerror}") from error
 
 
 def verify(

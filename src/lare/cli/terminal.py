@@ -16,8 +16,13 @@ RunDirectories = Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="
 Kind = Literal["factors", "reward"]
 
 
+def legible(text: str) -> str:
+    """A text that does not steer the terminal: some of what is printed a stranger has said."""
+    return "".join(letter if letter.isprintable() or letter in "\n\t" else "?" for letter in text)
+
+
 def say(text: str) -> None:
-    print(text)  # noqa: T201 - the one place that writes to standard output
+    print(legible(text), flush=True)  # noqa: T201 - the one place that writes to standard output
 
 
 def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
@@ -33,17 +38,17 @@ def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 
 
 def progress(text: str) -> None:
-    """What is worth knowing on the way, apart from the result. Some of it a stranger has said: it must not steer the terminal."""
-    sys.stderr.write("".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text) + "\n")
+    """What is worth knowing on the way, apart from the result."""
+    sys.stderr.write(legible(text) + "\n")
 
 
 def free_name(path: Path) -> Path:
     """The path itself, or one with a number behind it as long as that is taken."""
-    number = 1
-    while path.exists():
+    number, free = 1, path
+    while free.exists():
         number += 1
-        path = path.with_name(f"{path.name.split('.attempts')[0]}.attempts-{number}.json")
-    return path
+        free = path.with_name(f"{path.stem}-{number}{path.suffix}")
+    return free
 
 
 def write_new(path: Path, text: str, option: str) -> None:

@@ -91,7 +91,7 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
         jobs = list(jobs_of(sweep, path))
     except OSError as error:
         raise LareError(f"{path} cannot be read: {error.strerror}") from error
-    except (LareError, ValueError) as error:
+    except (LareError, ValueError, RecursionError) as error:
         raise LareError(f"{path}: {error}") from error
     for job in jobs:
         check(job)

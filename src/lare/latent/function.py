@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from lare.errors import LareError
+from lare.errors import LareError, shortened
 from lare.latent.checks import Check
 from lare.latent.evaluator import Evaluator
 from lare.latent.names import factor_meanings, names_of
@@ -229,8 +229,11 @@ def with_provenance(function: LatentFunction, record: Path) -> LatentFunction:
         return function
     try:
         saved = json.loads(read_text(record))
+        json.dumps(saved, ensure_ascii=False).encode()  # half a character can be read, and not be written again
         same = saved["source"] == function.source
         model, exchanges = saved["model"], tuple(saved["exchanges"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise LareError(f"{record} is not the record of a latent function: {error!r}") from error
+        if not isinstance(model, str) or not all(isinstance(exchange, dict) for exchange in exchanges):
+            raise TypeError("model or exchanges")
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise LareError(f"{record} is not the record of a latent function: {shortened(error)}") from error
     return replace(function, model=model if same else model + CHANGED, exchanges=exchanges)

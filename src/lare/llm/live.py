@@ -16,6 +16,7 @@ import queue
 import re
 import threading
 import time
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -39,6 +40,13 @@ REPLY_TOKENS, SHORTEST_REPLY = 16_384, 1024
 """The most that a reply may have; halved as long as the model allows less, down to the second."""
 
 RETRIED = {408, 409, 429}
+
+HOPELESS = ("UnsupportedProtocol", "InvalidURL", "LocalProtocolError")
+NOT_SENT = ("Connect", *HOPELESS)
+"""How the names of errors begin: of those that come again, and of those before a request was on its way."""
+
+PLAIN = {"Accept-Encoding": "identity"}
+"""What is not packed needs no room to be unpacked."""
 
 MOST_TOKENS = 1 << 40
 """A server that counts more does not know what it says."""
@@ -141,8 +149,8 @@ class LiveModel:
     longest: int = REPLY_TOKENS
 
     def __post_init__(self) -> None:
-        if not self.name.strip():
-            raise ModelFailed("the name of the model is empty")
+        if not self.name.strip() or not self.name.isprintable():
+            raise ModelFailed(f"{self.name!a} is not the name of a model")
         self.key = os.environ.get("OPENAI_API_KEY", "").strip()
         if not re.fullmatch(r"[!-~]*", self.key):
             raise ModelFailed("the environment variable OPENAI_API_KEY holds characters that are in no key")
@@ -165,7 +173,9 @@ class LiveModel:
         import openai
 
         http = openai.DefaultHttpxClient(event_hooks={"response": [bound]}, timeout=TIMEOUT)
-        return openai.OpenAI(api_key=self.key or "none", base_url=self.endpoint, max_retries=0, http_client=http)
+        return openai.OpenAI(
+            api_key=self.key or "none", base_url=self.endpoint, max_retries=0, http_client=http, default_headers=PLAIN
+        )
 
     def scrubbed(self, text: object) -> str:
         """A message in one line, without the key."""
@@ -222,19 +232,28 @@ class LiveModel:
         except openai.APIStatusError as error:
             return self.refused(error)
         except openai.APIConnectionError as error:
-            where = re.sub(r"//[^/@]*@", "//", str(self.client.base_url))
-            return Failure(self.scrubbed(f"{where} cannot be reached: {error.__cause__ or error}"), again=True)
+            where, cause = re.sub(r"//[^/@]*@", "//", str(self.client.base_url)), error.__cause__ or error
+            if not type(cause).__name__.startswith(NOT_SENT):
+                self.count_all(messages, allowed)
+            hopeless = type(cause).__name__.startswith(HOPELESS)
+            return Failure(self.scrubbed(f"{where} cannot be reached: {cause}"), again=not hopeless)
         except (openai.OpenAIError, OSError) as error:
             if isinstance(error, TimeoutError):  # whoever goes on reading is left behind
                 self.client.close()
                 self.client = self.connect()
+            self.count_all(messages, allowed)
             return Failure(self.scrubbed(f"{type(error).__name__}: {error}"), again=True)
         except TooMuch as error:
             self.budget.count(None, messages, "x" * LARGEST_BODY)
             return Failure(str(error), again=False)
         except Exception as error:  # what the transport raises while a body is read depends on the client's version
+            self.count_all(messages, allowed)
             return Failure(self.scrubbed(f"the answer broke off ({type(error).__name__}: {error})"), again=True)
         return self.read(body, messages)
+
+    def count_all(self, messages: Sequence[Message], allowed: int) -> None:
+        """Count a request that was broken off at the most that it may have cost: somebody may have answered it."""
+        self.budget.count(None, messages, "x" * allowed)
 
     def read(self, body: bytes, messages: Sequence[Message]) -> "str | Failure":
         """The text of a chat completion. An answer that is none is tried again: something is wrong on the way."""
@@ -308,16 +327,22 @@ def bound(response: Any) -> None:
         def __iter__(self) -> Iterator[bytes]:
             size, deadline = 0, time.monotonic() + TIMEOUT
             for chunk in self.stream:
-                size += len(chunk)
+                piece = chunk if unpacked is None else unpacked.decompress(chunk, LARGEST_BODY + 1)
+                size += len(piece)
                 if size > LARGEST_BODY:
                     raise TooMuch(f"the answer has more than {LARGEST_BODY >> 20} MB")
                 if time.monotonic() > deadline:
                     raise TimeoutError(f"the answer was not complete after {TIMEOUT:.0f} s")
-                yield chunk
+                yield piece
 
         def close(self) -> None:
             self.stream.close()
 
+    # A few bytes can unpack to gigabytes, so that is done here, no further than the answer may go.
+    packing = response.headers.pop("content-encoding", "identity").strip().lower()
+    if packing not in ("identity", "", "gzip", "deflate"):
+        raise OSError(f"the answer is packed as {packing}, which nobody asked for")
+    unpacked = zlib.decompressobj(47) if packing in ("gzip", "deflate") else None
     response.stream = Bounded(response.stream)
 
 

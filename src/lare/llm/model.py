@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 from lare.errors import LareError
 from lare.llm.prompts import Kind, Message
 from lare.llm.recording import RecordedModel, read_recording, shipped_recordings
+from lare.tasks.spec import read_text
 
 
 @runtime_checkable
@@ -33,7 +34,7 @@ def recorded_model(task: str, kind: Kind, draw: int = 0, path: Path | None = Non
     if path is None:
         return RecordedModel(shipped_recordings(kind, draw), task)
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise LareError(f"the recording {path} cannot be read: {error}") from error
+        text = read_text(path)
+    except LareError as error:
+        raise LareError(f"the recording {error}") from error
     return RecordedModel([read_recording(text, str(path))], task)

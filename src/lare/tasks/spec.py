@@ -131,7 +131,7 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
         )
     try:
         values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError is one; a number without end is another
         raise LareError(f"task {task!r} is not valid TOML: {error}") from error
     for key in ("like", "teams"):
         named = values.get(key, [])
@@ -158,7 +158,10 @@ def is_file(name: str) -> bool:
 
 
 def read_text(path: Path) -> str:
+    """A file's text. Raises `LareError` where it has none."""
     try:
+        if path.exists() and not path.is_file():
+            raise LareError(f"{path} is not a file")
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise LareError(f"{path} cannot be read: {error}") from error
