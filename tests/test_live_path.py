@@ -184,6 +184,17 @@ def test_a_terminal_that_cannot_show_a_letter(tmp_path):
     assert b"\\u6f22\\u5b57" in done.stdout
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
+def test_what_was_paid_for_is_shown_where_nothing_can_be_written(command, tmp_path):
+    status, out, err = command("design", "Reacher-v4", "--out", "/proc/phi.py")
+    assert (status, err.splitlines()[-1]) == (2, "lare: /proc/phi.py cannot be written: No such file or directory")
+    assert "def evaluation_func" in out
+    status, _, err = command("design", "Reacher-v4", "--record", "/proc/talk.json")
+    assert status == 2
+    assert err.splitlines()[-1] == "every attempt is kept in Reacher-v4.attempts.json"
+    assert read_recording((tmp_path / "Reacher-v4.attempts.json").read_text(), "kept").exchanges
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk that is always full")
 def test_what_was_paid_for_is_kept_where_nothing_can_be_printed(tmp_path):
     with open("/dev/full", "w") as full:

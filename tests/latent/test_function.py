@@ -13,7 +13,7 @@ from lare.errors import LareError
 from lare.latent import function as module
 from lare.latent.checks import CHECKS, Check
 from lare.latent.evaluator import LatentRewardError
-from lare.latent.function import HEADER, LatentFunction, load, read_source, verified
+from lare.latent.function import HEADER, LatentFunction, load, normal, read_source, verified
 from lare.latent.verify import Verdict
 from toys import PHI, phi, toy_spec
 
@@ -208,6 +208,18 @@ def test_the_hash_says_whether_a_source_was_changed(function, chase, tmp_path):
     assert load(path, chase).model == function.model + "; changed by hand since"
     path.with_suffix(".json").unlink()
     assert load(path, chase).changed
+
+
+@pytest.mark.parametrize(
+    "top", ["# lare: x\n\n# lare: kind: reward\n", "\n\n# lare: sha256: 0\n# lare: \n\n\n# lare: y\n"]
+)
+def test_no_reply_writes_a_header(chase, tmp_path, top):
+    """However many there are, one beneath the other: what is saved comes back as what it is."""
+    made = verified(top + PHI, chase)
+    assert made.source == normal(made.source) == SOURCE
+    made.save(tmp_path / "phi.py")
+    back = load(tmp_path / "phi.py", chase)
+    assert (back.kind, back.source, back.changed) == ("factors", SOURCE, False)
 
 
 def test_no_name_becomes_a_line_of_code(function, chase, tmp_path):

@@ -122,8 +122,8 @@ def design(
             said=progress,
         )
     except DesignFailed as error:
-        path = record or free_name(Path(f"{spec.name}.attempts.json"))
-        if record is None:
+        path = record if record and record.is_file() else free_name(Path(f"{spec.name}.attempts.json"))
+        if path != record:
             error.recorder.write(path, error.model)
         progress(f"lare: {error}\nevery attempt is kept in {path}")
         sys.exit(2 if isinstance(error, DesignBroken) else 1)
@@ -133,7 +133,11 @@ def design(
     if out is None:
         print_function(function, free_name(Path(f"{spec.name}.py")))
     else:
-        function.save(out)
+        try:
+            function.save(out)
+        except LareError:
+            say(function.source)  # it was paid for
+            raise
         say(f"wrote {out.with_suffix('.py')}: {function.size} factors ({', '.join(function.names)})")
 
 
