@@ -78,7 +78,7 @@ def test_without_an_episode_nothing_is_learned():
 
 
 @pytest.mark.parametrize("sum_form", [False, True], ids=["mean", "sum"])
-@pytest.mark.parametrize("method", ["rd", "rrd", "rrdu", "arel"])
+@pytest.mark.parametrize("method", ["rd", "rrd", "rrdu"])
 def test_a_gradient_in_parts_is_that_of_the_whole(method, sum_form):
     agents, count, row = 3, 8, METHODS[method]
     settings = CreditSettings(hidden=(8,), sum_form=sum_form)
