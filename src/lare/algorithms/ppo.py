@@ -27,7 +27,7 @@ from lare.normalise import Moments, deviation, no_moments, observe
 
 
 class PPOSettings(Checked):
-    """Figures of PPO; what `lare train` uses where nothing is said stands in `training/settings.py`."""
+    """Figures of PPO; what `lare train` uses where nothing is said stands in `table.py`."""
 
     hidden: tuple[Annotated[int, Field(ge=1)], ...] = (64, 64)
     """Widths of the hidden layers of actor and critic."""

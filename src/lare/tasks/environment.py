@@ -24,10 +24,8 @@ def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) 
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
         try:
             return as_rows(gymnasium.make(environment, max_episode_steps=max_episode_steps, **kwargs))
-        except (
-            Exception,
-            SystemExit,
-        ) as error:  # an environment is foreign code: anything may come out of its constructor
+        # An environment is foreign code: anything may come out of its constructor.
+        except (Exception, SystemExit) as error:
             logging.getLogger(__name__).debug("making %s failed", environment, exc_info=True)
             reason = str(error).strip().splitlines() or [type(error).__name__]
             raise LareError(f"environment {environment!r} cannot be made: {reason[0]}") from error

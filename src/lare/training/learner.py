@@ -128,12 +128,13 @@ def store(learner: Learner, steps: Step, recipe: Recipe) -> Learner:
     mean_reward = held.episode_return[episode % len(held.first)] / length
     credit = learner.credit
     if credit is not None:
-        credit = decomposition.observe_steps(credit, features(steps, recipe.method))
+        seen = features(steps, recipe.method)
+        credit = decomposition.observe_steps(credit, seen)
         credit = decomposition.observe_returns(credit, mean_reward, finished)
         if recipe.method.fit is not None and recipe.method.fit.closed_form:
             ended = jnp.asarray(steps.ended)
             at_its_end = mean_reward[jnp.cumsum(ended) - 1]
-            seen, fit, settings = features(steps, recipe.method), recipe.method.fit, recipe.credit
+            fit, settings = recipe.method.fit, recipe.credit
             credit = decomposition.fit_in_closed_form(credit, seen, at_its_end, ended, fit, settings)
     return learner._replace(credit=credit, scale=observe_scale(learner.scale, mean_reward, finished), replay=held)
 
