@@ -137,7 +137,7 @@ def play(
     return jnp.zeros(table.size).at[entries].add(1.0), jnp.sum(paid)
 
 
-@partial(jax.jit, static_argnames=("redundant", "horizon", "episodes"))
+@partial(jax.jit, static_argnames=("redundant", "horizon", "episodes", "delta"))
 def oful(key: PRNGKeyArray, mdp: MDP, redundant: int, horizon: int, episodes: int, delta: float = 0.1) -> History:
     """OFUL for per-trajectory feedback (Efroni et al., 2021; appendix B), with lambda = T.
 

@@ -8,6 +8,7 @@ import pytest
 from lare.errors import LareError
 from lare.experiments import statistics
 from lare.experiments.compare import find_runs, write_comparison
+from lare.experiments.statistics import by_label
 from lare.training.run import Run, describe
 from lare.training.settings import Settings, decide
 from toys import toy_spec
@@ -43,7 +44,7 @@ def made(tmp_path):
 def test_figures_by_hand(made):
     """The interquartile mean of 8 numbers leaves out the two at either end."""
     values = [-100.0, 1, 2, 3, 4, 5, 6, 1000]
-    found = statistics.compare([made("a", values), made("b", [v + 0.5 for v in values], method="rrdu")])
+    found = statistics.compare(by_label([made("a", values), made("b", [v + 0.5 for v in values], method="rrdu")]))
     first, second = found.rows
     assert first.iqm.value == pytest.approx(np.mean([2, 3, 4, 5]))
     assert first.mean == pytest.approx(np.mean(values))
@@ -69,14 +70,14 @@ def test_intervals_hold_what_they_promise():
 
 
 def test_the_same_runs_give_the_same_intervals(made):
-    runs = [made("a", [1.0, 2, 5])]
+    runs = by_label([made("a", [1.0, 2, 5])])
     assert statistics.compare(runs).rows == statistics.compare(runs).rows
 
 
 def test_draws_are_told_apart_from_seeds(made):
     """Seeds differ by 100, draws by 1: the interval over draws is the narrow one."""
     runs = [made(f"draw{draw}", [draw, draw + 100.0], method="lare-rrdu", draw=draw) for draw in range(3)]
-    (row,) = statistics.compare(runs).rows
+    (row,) = statistics.compare(by_label(runs)).rows
     assert (row.seeds, row.draws) == (2, 3)
     assert row.over_draws.value == pytest.approx(51)
     assert (row.over_draws.low, row.over_draws.high) == (pytest.approx(50, abs=0.5), pytest.approx(52, abs=0.5))
@@ -93,6 +94,22 @@ def test_several_tasks_are_laid_between_fixed_ends(made, tmp_path):
     assert page.count("<svg") == 2
 
 
+def test_runs_of_one_method_are_told_apart_by_their_settings(made):
+    slow = {"credit": {"learning_rate": 1e-4}}
+    runs = [made("a", [1.0], method="rd"), made("b", [2.0], method="rd", **slow), made("c", [3.0])]
+    names = list(by_label(runs))
+    assert names == ["rd, credit.learning_rate 0.0003", "rd, credit.learning_rate 0.0001", "dense"]
+    runs.append(made("d", [3.0], algorithm="ddpg"))
+    assert list(by_label(runs))[1:] == ["rd, td3, credit.learning_rate 0.0001", "dense, td3", "dense, ddpg"]
+
+
+def test_something_else_than_the_return_is_compared(made):
+    run = made("a", [1.0, 3.0])
+    lines = [line | {"credit/error": 2 * line["seed"]} for line in run.metrics()]
+    (run.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert statistics.compare(by_label([run]), "credit/error").rows[0].mean == 1.0
+
+
 @pytest.mark.parametrize(
     ("runs", "message"),
     [
@@ -102,7 +119,7 @@ def test_several_tasks_are_laid_between_fixed_ends(made, tmp_path):
             "each task by themselves",
         ),
         (
-            [("a", "Chase", {}), ("b", "Chase", {"td3": {"gamma": 0.9}})],
+            [("a", "Chase", {}), ("b", "Chase", {"chunk": 10})],
             "{runs}/Chase/b and {runs}/Chase/a are both dense on Chase with seed 0: leave one out",
         ),
         (
@@ -118,7 +135,7 @@ def test_several_tasks_are_laid_between_fixed_ends(made, tmp_path):
 def test_what_cannot_be_compared(runs, message, made, tmp_path):
     opened = [made(name, [1.0, 2.0], task, **settings) for name, task, settings in runs]
     with pytest.raises(LareError) as error:
-        statistics.compare(opened)
+        statistics.compare(by_label(opened))
     assert str(error.value) == message.format(runs=tmp_path / "runs")
 
 

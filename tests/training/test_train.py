@@ -263,6 +263,8 @@ def test_a_small_ring_forgets_and_goes_on(small, tmp_path):
 def test_a_replay_too_small_for_an_episode_is_refused(small, tmp_path):
     with pytest.raises(LareError, match="capacity = 20 is too small: an episode of Chase takes up to 21"):
         lare.train(toy_spec(), small(method="dense", capacity=20), out=tmp_path / "run", listeners=[])
+    with pytest.raises(LareError, match="steps = 400 are too few: an episode of HalfCheetah-v4 takes up to 1001"):
+        lare.train("HalfCheetah-v4", small(steps=400, chunk=4), out=tmp_path / "few")
     with pytest.raises(LareError, match="capacity = 100 is too small: a rollout takes up to 140"):
         lare.train(toy_spec(), small(algorithm="ppo", method="dense", capacity=100), out=tmp_path / "run", listeners=[])
     assert not (tmp_path / "run").exists()

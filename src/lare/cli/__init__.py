@@ -14,7 +14,7 @@ import tyro
 from lare.cli.functions import design, new_task, prompt, verify
 from lare.cli.lists import algorithms, methods, tasks
 from lare.cli.runs import cross_play, evaluate, report, train
-from lare.cli.studies import compare, sweep
+from lare.cli.studies import compare, reproduce, sweep
 from lare.errors import LareError
 
 DESCRIPTION = "Train reinforcement learning on episodic rewards, through latent rewards that a language model wrote."
@@ -32,6 +32,7 @@ COMMANDS = {
     "report": report,
     "compare": compare,
     "cross-play": cross_play,
+    "reproduce": reproduce,
 }
 
 

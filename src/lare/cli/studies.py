@@ -2,17 +2,19 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional
 
-from lare.cli.terminal import RunDirectories, progress, say, show
+from lare.cli.terminal import RunDirectories, say, show
+
+Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")]
 
 
 def sweep(
     file: Annotated[Positional[Path], tyro.conf.arg(metavar="FILE")],
-    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
+    ray: Ray = None,
 ) -> None:
     """Train many runs: what a TOML file asks for and is not done yet. All metrics go to results.csv and .parquet.
 
@@ -20,13 +22,15 @@ def sweep(
         file: tasks, methods, algorithms, draws, settings; processes at a time, and cores of each (docs/sweeps.md).
         ray: a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
     """
+    from lare.cli.watch import watching
     from lare.experiments.sweep import read_sweep, run_sweep
     from lare.experiments.tables import rows_of, write_table
 
     wanted, jobs = read_sweep(file)
     root = jobs[0].directory.parent.parent
     try:
-        failed = run_sweep(wanted, jobs, progress, ray)
+        with watching(jobs) as said:
+            failed = run_sweep(wanted, jobs, said, ray)
     finally:
         rows = rows_of(job.directory for job in jobs)
         if rows:
@@ -50,3 +54,36 @@ def compare(runs: RunDirectories, out: Path = Path("compare.html")) -> None:
     show(HEAD, cells(comparison))
     say(what_scores_are(comparison))
     say(f"wrote {out}")
+
+
+def reproduce(
+    exhibit: Annotated[Positional[str | None], tyro.conf.arg(metavar="NAME")] = None,
+    budget: Literal["smoke", "laptop", "paper"] = "laptop",
+    runs: Path = Path("runs/reproduce"),
+    out: Path = Path("results"),
+    processes: int = 1,
+    cores: int = 1,
+    ray: Ray = None,
+) -> None:
+    """Make a figure or a table of the LaRe paper anew: train what is missing, and write a page that lays it beside the paper's.
+
+    Args:
+        exhibit: which one, or all; without it, they are listed.
+        budget: smoke, to see that it runs; laptop, 3 seeds and a tenth of the steps on some of the tasks; paper, all of it.
+        runs: where the runs are; those that are done are not trained again.
+        out: where the page goes, with its pictures and all metrics.
+        processes: runs at a time.
+        cores: of each run.
+        ray: a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
+    """
+    from lare.cli.watch import watching
+    from lare.experiments.paper import reproduce as paper
+    from lare.experiments.paper.budgets import BUDGETS
+    from lare.experiments.sweep import Share
+
+    if exhibit is None:
+        show(("exhibit", "of the paper", "what it shows"), paper.listed())
+        return
+    share = Share(processes=processes, cores=cores)
+    for name in paper.NAMES if exhibit == "all" else (exhibit,):
+        say(f"wrote {paper.reproduce(name, BUDGETS[budget], share, runs, out, ray, watching)}")

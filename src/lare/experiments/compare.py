@@ -7,7 +7,7 @@ from pathlib import Path
 from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.html import note, table, write_page
-from lare.experiments.statistics import REFERENCES, REPETITIONS, Band, Comparison, compare, rounded
+from lare.experiments.statistics import REFERENCES, REPETITIONS, Band, Comparison, by_label, compare, rounded
 from lare.training.run import CONFIG, Run, read_config
 
 HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "better than first [95%]")
@@ -59,7 +59,7 @@ def write_comparison(runs: Sequence[Run], out: Path) -> Comparison:
     Raises:
         LareError: they cannot be compared, or the file not be written.
     """
-    comparison = compare(runs)
+    comparison = compare(by_label(runs))
     title = f"{', '.join(comparison.tasks)}: {', '.join(row.label for row in comparison.rows)}"
     write_page(out, title, "\n".join(body(title, comparison)))
     return comparison

@@ -6,10 +6,12 @@ that over the draws of the language model, where a method was trained on several
 """
 
 import contextlib
+import itertools
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -24,6 +26,9 @@ REFERENCES = {
 }
 """Returns that count as 0 and as 1. 0: mean over 20 episodes of uniformly random actions. 1: TD3 on true rewards after a
 million steps, the upper end of what public benchmarks report."""
+
+RETURN = "evaluation/return"
+"""What is compared, unless something else is asked for."""
 
 REPETITIONS = 2000
 """Of the bootstrap."""
@@ -89,11 +94,13 @@ class Comparison:
     profiles: Mapping[str, Band]
     """Share of runs that score more than x."""
     normalised: bool
+    last: Mapping[str, Scores]
+    """At the last step, for each seed a mean over the draws."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """The runs of one method."""
+    """The runs of one label."""
 
     label: str
     seeds: tuple[int, ...]
@@ -102,13 +109,17 @@ class Group:
     scores: Float[np.ndarray, "draws seeds tasks steps"]
 
 
-def compare(runs: Sequence[Run]) -> Comparison:
-    """Compare methods by their runs, on the tasks that all of them were trained on.
+def compare(runs: Mapping[str, Sequence[Run]], key: str = RETURN) -> Comparison:
+    """Compare runs by their labels, on the tasks that all of them were trained on.
+
+    Args:
+        runs: of each label, one for each task, seed and draw; see `by_label`.
+        key: what is compared, of the keys of metrics.jsonl.
 
     Raises:
         LareError: the runs do not make up a whole table, or rliable is not there.
     """
-    groups, tasks = grouped(runs)
+    groups, tasks = grouped(runs, key)
     by_seed = {group.label: group.scores.mean(axis=0) for group in groups}
     last = {label: scores[..., -1] for label, scores in by_seed.items()}
     names = tuple(last)
@@ -120,32 +131,58 @@ def compare(runs: Sequence[Run]) -> Comparison:
         {label: band(steps, scores, curve_of_iqm) for label, scores in by_seed.items()},
         {label: band(taus, scores, lambda scores: share_above(scores, taus)) for label, scores in last.items()},
         len(tasks) > 1,
+        last,
     )
 
 
-def grouped(runs: Sequence[Run]) -> tuple[list[Group], tuple[str, ...]]:
-    """The runs by method, and the tasks. Raises `LareError` where a table of them would have holes."""
-    tasks = tuple(sorted({run.config.task.name for run in runs}))
+def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """The runs by method; with the algorithm where several are compared, and with whatever else tells runs of a method apart."""
+    plans = [flat(run.config.settings.model_dump(exclude=TOLD_APART)) for run in runs]
+    several = len({plan["algorithm"] for plan in plans}) > 1
+    found: dict[str, list[Run]] = {}
+    for run, plan in zip(runs, plans, strict=True):
+        alike = [other for other in plans if all(other[name] == plan[name] for name in ("method", "algorithm"))]
+        parts = [f"{name} {value}" for name, value in plan.items() if any(other[name] != value for other in alike)]
+        label = ", ".join([plan["method"], *([plan["algorithm"]] if several else []), *parts])
+        found.setdefault(label, []).append(run)
+    return found
+
+
+TOLD_APART = {"seed", "seeds", "draw", "steps", "chunk", "evaluate_every", "evaluation_episodes"}
+"""Settings that make no other method of it."""
+
+
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Settings by their dotted names, as the command line has them."""
+    parts = (
+        flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+        for name, value in settings.items()
+    )
+    return dict(itertools.chain.from_iterable(part.items() for part in parts))
+
+
+def grouped(runs: Mapping[str, Sequence[Run]], key: str) -> tuple[list[Group], tuple[str, ...]]:
+    """The curves by label, and the tasks. Raises `LareError` where a table of them would have holes."""
+    tasks = tuple(sorted({run.config.task.name for of_label in runs.values() for run in of_label}))
     if len(tasks) > 1 and (unknown := [task for task in tasks if task not in REFERENCES]):
         raise LareError(
             f"there is no reference for {', '.join(unknown)}, so its returns cannot be laid beside those of other tasks: "
             "compare the runs of each task by themselves"
         )
-    labels = list(dict.fromkeys(label for _, label in labelled(runs)))
     curves: dict[tuple[str, str, int, int], tuple[Run, dict[int, float]]] = {}
-    for run, label in labelled(runs):
+    for label, run in ((label, run) for label, of_label in runs.items() for run in of_label):
         for seed in run.seeds:
-            key = (label, run.config.task.name, run.config.settings.draw, seed)
-            if key in curves:
-                other = curves[key][0].directory
+            place = (label, run.config.task.name, run.config.settings.draw, seed)
+            if place in curves:
+                other = curves[place][0].directory
                 raise LareError(
-                    f"{run.directory} and {other} are both {label} on {key[1]} with seed {seed}: leave one out"
+                    f"{run.directory} and {other} are both {label} on {place[1]} with seed {seed}: leave one out"
                 )
-            curves[key] = run, curve(run, seed)
+            curves[place] = run, curve(run, seed, key)
     steps = sorted(set.intersection(*(set(values) for _, values in curves.values())))
     if not steps:
         raise LareError("the runs have no step in common at which all of them were evaluated")
-    return [group_of(label, tasks, curves, steps) for label in labels], tasks
+    return [group_of(label, tasks, curves, steps) for label in runs], tasks
 
 
 def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[int]) -> Group:
@@ -162,17 +199,11 @@ def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[
     return Group(label, tuple(seeds), tuple(draws), tuple(steps), np.array(scores))
 
 
-def labelled(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
-    """Each run and its method; with the algorithm where several are compared."""
-    plans = [run.config.settings for run in runs]
-    several = len({plan.algorithm for plan in plans}) > 1
-    for run, plan in zip(runs, plans, strict=True):
-        yield run, f"{plan.method}, {plan.algorithm}" if several else plan.method
-
-
-def curve(run: Run, seed: int) -> dict[int, float]:
-    """True return by step."""
-    return {line["step"]: line["evaluation/return"] for line in run.metrics() if line["seed"] == seed}
+def curve(run: Run, seed: int, key: str = RETURN) -> dict[int, float]:
+    """What was measured, by step."""
+    return {
+        line["step"]: float(line[key]) for line in run.metrics() if line["seed"] == seed and line.get(key) is not None
+    }
 
 
 def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:
@@ -182,10 +213,17 @@ def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:
     if len(group.draws) > 1:
         (over_draws,) = estimates(group.scores[..., -1].mean(axis=1), lambda scores: np.array([np.mean(scores)]))
     if group.label != first:
-        (better,) = estimates((mine, last[first]), lambda *both: np.array([metrics.probability_of_improvement(*both)]))
+        better = improvement(mine, last[first])
     of_seeds = mine.mean(axis=1)
     mean, deviation = float(of_seeds.mean()), float(np.std(of_seeds, ddof=min(1, len(mine) - 1)))
     return Row(group.label, len(group.seeds), len(group.draws), iqm, mean, deviation, over_draws, better)
+
+
+def improvement(scores: Scores, others: Scores) -> Estimate:
+    """The probability that one of the scores is above one of the others."""
+    metrics = rliable()[1]
+    (found,) = estimates((scores, others), lambda *both: np.array([metrics.probability_of_improvement(*both)]))
+    return found
 
 
 def curve_of_iqm(scores: Scores) -> np.ndarray:

@@ -25,6 +25,7 @@ from pydantic import Field
 from lare.algorithms.table import Name
 from lare.credit.methods import Encoder, find_method
 from lare.errors import Checked, LareError
+from lare.latent.design import CANDIDATES
 from lare.tasks.spec import TaskSpec, load_task
 from lare.training.run import CONFIG, read_config, read_metrics
 from lare.training.settings import Plan, Settings, decide
@@ -33,7 +34,16 @@ Texts = Annotated[tuple[str, ...], Field(min_length=1)]
 Draws = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
-class Sweep(Checked):
+class Share(Checked):
+    """Of the machine."""
+
+    processes: Annotated[int, Field(ge=1)] = 1
+    """Runs at a time."""
+    cores: Annotated[int, Field(ge=1)] = 1
+    """Of each run."""
+
+
+class Sweep(Share):
     """What the file says. Paths are relative to it."""
 
     tasks: Texts
@@ -47,10 +57,6 @@ class Sweep(Checked):
     """Whatever else `lare train` takes, as steps and seeds."""
     out: Path | None = None
     """The directory for all runs: `runs/NAME` beside a file NAME.toml, unless given."""
-    processes: Annotated[int, Field(ge=1)] = 1
-    """Runs at a time."""
-    cores: Annotated[int, Field(ge=1)] = 1
-    """Of each run."""
 
 
 @dataclass(frozen=True)
@@ -106,9 +112,15 @@ def jobs_of(sweep: Sweep, path: Path) -> Iterator[Job]:
         draws = sweep.draws if find_method(method).encoder is Encoder.LATENT else sweep.draws[:1]
         for draw in draws:
             settings = Settings(**{**sweep.settings, "method": method, "algorithm": algorithm, "draw": draw})
-            plan = decide(settings, task)
-            ending = f"-draw{draw}" if find_method(method).encoder is Encoder.LATENT else ""
-            yield Job(root / task.name / f"{method}-{plan.algorithm}{ending}", task, plan)
+            yield job_of(root, task, settings)
+
+
+def job_of(root: Path, task: TaskSpec, settings: Settings) -> Job:
+    """A run in its place: ROOT/TASK/METHOD-ALGORITHM, with the draw and an unusual number of candidates where they matter."""
+    plan, ending = decide(settings, task), ""
+    if find_method(plan.method).encoder is Encoder.LATENT:
+        ending = f"-draw{plan.draw}" + (f"-candidates{plan.candidates}" if plan.candidates != CANDIDATES else "")
+    return Job(root / task.name / f"{plan.method}-{plan.algorithm}{ending}", task, plan)
 
 
 def check(job: Job) -> None:
@@ -124,7 +136,7 @@ def check(job: Job) -> None:
         shutil.rmtree(job.directory)
 
 
-def run_sweep(sweep: Sweep, jobs: Sequence[Job], said: Callable[[str], None], ray: str | None = None) -> list[Job]:
+def run_sweep(share: Share, jobs: Sequence[Job], said: Callable[[str], None], ray: str | None = None) -> list[Job]:
     """Train what is not done, on this machine or on a Ray cluster; returns what failed.
 
     Raises:
@@ -134,7 +146,7 @@ def run_sweep(sweep: Sweep, jobs: Sequence[Job], said: Callable[[str], None], ra
     said(f"{len(jobs)} runs, {len(jobs) - len(missing)} of them done")
     train = on_ray if ray is not None else here
     failed = []
-    for number, (job, error) in enumerate(train(sweep, missing, said, ray), start=len(jobs) - len(missing) + 1):
+    for number, (job, error) in enumerate(train(share, missing, said, ray), start=len(jobs) - len(missing) + 1):
         said(f"{number} of {len(jobs)}: {job.name} {'failed: ' + error if error else 'is done'}")
         if error:
             failed.append(job)
@@ -142,11 +154,11 @@ def run_sweep(sweep: Sweep, jobs: Sequence[Job], said: Callable[[str], None], ra
 
 
 def here(
-    sweep: Sweep, jobs: Sequence[Job], said: Callable[[str], None], _: str | None
+    share: Share, jobs: Sequence[Job], said: Callable[[str], None], _: str | None
 ) -> Iterator[tuple[Job, str | None]]:
     """Train on this machine, so many at a time, each on cores of its own."""
     slots: queue.Queue[list[int]] = queue.Queue()
-    for cores in shares(sweep.processes, sweep.cores):
+    for cores in shares(share.processes, share.cores):
         slots.put(cores)
     running: set[subprocess.Popen] = set()
 
@@ -158,7 +170,7 @@ def here(
         finally:
             slots.put(cores)
 
-    with ThreadPoolExecutor(sweep.processes) as pool:
+    with ThreadPoolExecutor(share.processes) as pool:
         futures = {pool.submit(train, job): job for job in jobs}
         try:
             yield from ((futures[future], future.result()) for future in as_completed(futures))
@@ -224,7 +236,7 @@ def train_one(order: dict[str, Any]) -> None:
 
 
 def on_ray(
-    sweep: Sweep, jobs: Sequence[Job], said: Callable[[str], None], address: str | None
+    share: Share, jobs: Sequence[Job], said: Callable[[str], None], address: str | None
 ) -> Iterator[tuple[Job, str | None]]:
     """Train on a Ray cluster, each run with its number of cores; the directory must be one that all machines see."""
     try:
@@ -242,7 +254,7 @@ def on_ray(
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise LareError(f"there is no Ray cluster at {address}: {error}") from error
     try:
-        remote = ray.remote(num_cpus=sweep.cores, max_calls=1)(train_one)
+        remote = ray.remote(num_cpus=share.cores, max_calls=1)(train_one)
         waiting = {remote.remote(as_json(job)): job for job in jobs}
         while waiting:
             (ended,), _ = ray.wait(list(waiting), num_returns=1)

@@ -60,7 +60,12 @@ def describe(task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) ->
     """Everything that the run depends on. Raises `LareError` where the replay could not hold a single episode."""
     longest = time_limit(task)
     if plan.algorithm != "ippo" and plan.rows < longest + 2:
-        raise LareError(f"capacity = {plan.rows} is too small: an episode of {task.name} takes up to {longest + 1}")
+        room = (
+            f"capacity = {plan.rows} is too small"
+            if plan.rows == plan.capacity
+            else f"steps = {plan.steps} are too few"
+        )
+        raise LareError(f"{room}: an episode of {task.name} takes up to {longest + 1}")
     if plan.algorithm == "ppo" and plan.capacity < 2 * plan.turn + longest:
         raise LareError(f"capacity = {plan.capacity} is too small: a rollout takes up to {2 * plan.turn + longest}")
     if plan.algorithm == "ippo" and plan.agents.capacity < plan.agents.episodes:

@@ -1,0 +1,55 @@
+"""A sweep on the terminal: a bar for each run that is under way, and one for all of them; lines where nobody is looking."""
+
+import contextlib
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+
+from lare.cli.terminal import legible, progress
+from lare.experiments.sweep import Job
+
+EVERY = 2.0
+"""Seconds between two looks."""
+
+
+@contextlib.contextmanager
+def watching(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
+    """Gives what a sweep is to tell its lines to."""
+    if not sys.stderr.isatty():
+        yield progress
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TimeRemainingColumn(),
+    )
+    ended = threading.Event()
+    with Progress(*columns, console=console, transient=True) as bars:
+        looking = threading.Thread(target=look, args=(jobs, bars, ended), daemon=True)
+        looking.start()
+        try:
+            yield lambda text: console.print(legible(text), highlight=False, markup=False)
+        finally:
+            ended.set()
+            looking.join()
+
+
+def look(jobs: Sequence[Job], bars, ended: threading.Event) -> None:
+    """Move the bars until the end."""
+    whole = bars.add_task("all runs", total=sum(job.plan.steps for job in jobs))
+    own: dict[str, int] = {}
+    while not ended.is_set():
+        steps = {job.name: job.step() if job.begun else 0 for job in jobs}
+        bars.update(whole, completed=sum(steps.values()))
+        for job in jobs:
+            done = steps[job.name]
+            if 0 < done < job.plan.steps and job.name not in own:
+                own[job.name] = bars.add_task(job.name, total=job.plan.steps)
+            if job.name in own:
+                bars.update(own[job.name], completed=done, visible=done < job.plan.steps)
+        ended.wait(EVERY)

@@ -1,0 +1,140 @@
+"""Table 1 of the paper: how much of the true reward is in states and in factors, and how many replies run as they come."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare.experiments.credit import correlations
+from lare.experiments.paper.budgets import Budget
+from lare.experiments.paper.pages import Page, items, table
+from lare.latent.design import design, examine
+from lare.llm.recording import shipped_recordings
+from lare.tasks.environment import make
+from lare.tasks.particles.table import find_particle_task
+from lare.tasks.particles.task import ACTIONS, STEPS
+from lare.tasks.particles.world import State
+from lare.tasks.spec import TaskSpec, load_task
+
+TITLE = "What states and factors know of the true reward"
+PRINTED = {
+    "CN-6": ("0.02 (26)", "0.50 (5.6)", "0%", "100%"),
+    "PP-6": ("0.01 (28)", "0.12 (5.4)", "20%", "100%"),
+    "HalfCheetah-v4": ("0.22 (17)", "0.53 (4.8)", "40%", "100%"),
+    "HumanoidStandup-v4": ("0.20 (376)", "0.49 (5.6)", "40%", "100%"),
+}
+"""The paper's figures."""
+
+DIFFERENCES = (
+    "The steps are of uniformly random actions, for states and factors alike; the paper does not say whose its are.",
+    "States and factors are those that a step led to, the rewards those that it paid; of many agents, each agent's own.",
+    "The mean is over the absolute correlations of all entries that vary; the paper does not say whether its are absolute. So "
+    "a state with a few telling entries among many has a low mean; what a decoder could find is nearer to the best entry.",
+    "The recorded replies are of a newer language model than the paper's, and the prompt says more.",
+)
+
+
+class Steps(NamedTuple):
+    """Steps of one agent at a time."""
+
+    before: Float[np.ndarray, "steps observation"]
+    action: Float[np.ndarray, "steps action"]
+    after: Float[np.ndarray, "steps observation"]
+    reward: Float[np.ndarray, " steps"]
+    """True."""
+
+
+def page_of(budget: Budget, command: str) -> Page:
+    """Measure, and write it beside the paper's figures."""
+    tasks = [load_task(name) for name in PRINTED]
+    found = {task.name: (of_entries(task, budget), of_replies(task, budget)) for task in tasks}
+    head = (
+        "",
+        "states: correlation (entries), best",
+        "factors: correlation (number), best",
+        "replies that pass as they come",
+        "functions that pass after verification",
+    )
+    parts = [
+        f"# {TITLE}",
+        f"The paper's table 1, by `{command}`: {budget.episodes} episodes of random actions, {budget.functions} of the "
+        "recorded draws of the language model. Absolute correlation (Pearson's) of an entry with the true reward of the same "
+        "step: mean over the entries, and the best one; of factors the mean over the draws.",
+        table(head, ([name, *entries, *replies] for name, (entries, replies) in found.items())),
+        "## What the paper says",
+        table(
+            ("", "states", "factors", "without pre-verification", "with"),
+            ([name, *printed] for name, printed in PRINTED.items()),
+        ),
+        "## What differs from the paper",
+        items(DIFFERENCES),
+    ]
+    return Page("table-1", "\n\n".join(parts))
+
+
+def of_entries(task: TaskSpec, budget: Budget) -> tuple[str, str]:
+    """Correlations of states, and of the factors of each draw."""
+    steps = random_steps(task, budget.episodes)
+    state = np.abs(correlations(steps.after, steps.reward))
+    sizes, means, best = [], [], []
+    for draw in range(budget.functions):
+        function = design(task, draw=draw)
+        factors = function.of_steps(steps.before, steps.action, steps.after, task.judges)
+        found = np.abs(correlations(factors, steps.reward))
+        sizes.append(factors.shape[1]), means.append(np.nanmean(found)), best.append(np.nanmax(found))
+        function.close()
+    return (
+        f"{np.nanmean(state):.2f} ({len(state)}), {np.nanmax(state):.2f}",
+        f"{np.mean(means):.2f} ({np.mean(sizes):.1f}), {np.mean(best):.2f}",
+    )
+
+
+def of_replies(task: TaskSpec, budget: Budget) -> tuple[str, str]:
+    """Shares of single candidates that pass as they come, and of designs that end with a function."""
+    recordings = [one for draw in range(budget.functions) for one in shipped_recordings("factors", draw)]
+    exchanges = [exchange for one in recordings if one.task == task.name for exchange in one.exchanges]
+    replies = [reply for exchange in exchanges if exchange.stage == "candidate" for reply in exchange.replies]
+    passed = [not examine(reply, task, "factors").errors for reply in replies]
+    designed = [bool(design(task, draw=draw).source) for draw in range(budget.functions)]
+    return f"{sum(passed)} of {len(passed)}", f"{sum(designed)} of {len(designed)}"
+
+
+def random_steps(task: TaskSpec, episodes: int) -> Steps:
+    """Whole episodes of uniformly random actions."""
+    return of_agents(task.particles, episodes) if task.particles else of_one(task, episodes)
+
+
+def of_one(task: TaskSpec, episodes: int) -> Steps:
+    environment = make(task.environment, task.max_episode_steps)
+    environment.action_space.seed(0)
+    rows = []
+    for seed in range(episodes):
+        observation, ended = environment.reset(seed=seed)[0], False
+        while not ended:
+            action = environment.action_space.sample()
+            after, reward, terminated, truncated, _ = environment.step(action)
+            rows.append((observation, action, after, reward))
+            observation, ended = after, terminated or truncated
+    environment.close()
+    return Steps(*(np.asarray(part, np.float32) for part in zip(*rows, strict=True)))
+
+
+def of_agents(name: str, episodes: int) -> Steps:
+    """Of all learning agents, one behind the other."""
+    task = find_particle_task(name)
+
+    def step(state: State, key: PRNGKeyArray) -> tuple[State, tuple[Array, ...]]:
+        choice = jax.random.randint(key, (task.agents,), 0, ACTIONS)
+        after = task.step(state, choice, key)
+        row = (task.observe(state), jax.nn.one_hot(choice, ACTIONS), task.observe(after), task.reward(after))
+        return after, row
+
+    @jax.jit
+    @jax.vmap
+    def episode(key: PRNGKeyArray) -> tuple[Array, ...]:
+        start, steps = jax.random.split(key)
+        return jax.lax.scan(step, task.reset(start), jax.random.split(steps, STEPS))[1]
+
+    played = episode(jax.random.split(jax.random.key(0), episodes))
+    return Steps(*(np.asarray(part).reshape(-1, *part.shape[3:]) for part in played))

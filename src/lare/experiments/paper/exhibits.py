@@ -1,0 +1,228 @@
+"""THE table of exhibits: what the LaRe paper shows by training, as contenders on tasks, and what it says came out.
+
+Two more need no training, and have files of their own: `correlations.py` (table 1) and `regret.py` (propositions 1 and 2).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lare.algorithms.table import Name
+from lare.training.settings import AgentSettings
+
+RETURN, ERROR, TRAVELLED = "evaluation/return", "credit/error", "evaluation/x_position"
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method with an algorithm, as it is named in the paper's figure."""
+
+    label: str
+    method: str
+    algorithm: Name | None = None
+    """The task's own, unless given."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Whatever else differs from what is usual."""
+    draws: int = 1
+    """Of the language model, at most: so many have been recorded."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What the paper says: one contender is above the others, on every task that is shown."""
+
+    better: str
+    others: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """A figure or a table."""
+
+    name: str
+    title: str
+    source: str
+    """Where it is in the paper."""
+    tasks: tuple[str, ...]
+    """All of them; the first is for a quick look."""
+    laptop: tuple[str, ...]
+    """Those that a laptop tries."""
+    contenders: tuple[Contender, ...]
+    claims: tuple[Claim, ...]
+    draws: int = 1
+    """Draws of the language model; a laptop tries three at most."""
+    key: str = RETURN
+    """What is shown of a run, of the keys of metrics.jsonl."""
+    printed: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    """The paper's figures, by task and label, where it prints any."""
+    differences: tuple[str, ...] = ()
+    """From the paper, besides those that all exhibits have."""
+
+    def measure(self, task: str) -> str:
+        """What is shown of a task: the fully sparse one pays 0 or 1, and is shown by how far it came."""
+        return TRAVELLED if task == SPARSE and self.key == RETURN else self.key
+
+
+SPARSE = "HalfCheetahSparse-v4"
+MUJOCO = ("Reacher-v4", "HalfCheetah-v4", "Walker2d-v4", "HumanoidStandup-v4")
+
+DENSE = Contender("dense", "dense")
+EPISODIC = Contender("episodic", "episodic")
+RD, RRD, RRDU = Contender("RD", "rd"), Contender("RRD", "rrd"), Contender("RRD-unbiased", "rrdu")
+IRCR, DIASTER = Contender("IRCR", "ircr"), Contender("Diaster", "diaster")
+LARE_RD, LARE_RRDU = Contender("LaRe-RD", "lare-rd"), Contender("LaRe-RRDu", "lare-rrdu")
+SHARED = Contender("LaRe without agent decomposition", "lare-rd-shared")
+
+USUAL = AgentSettings()
+FEW_EPISODES = {"agents": USUAL.model_copy(update={"credit": USUAL.credit.model_copy(update={"steps": 800})})}
+"""32 episodes in an update of the decoder, not 256: with attention it is 13 to 27 times as expensive as without."""
+AREL = Contender("AREL", "arel", settings=FEW_EPISODES)
+STAS = Contender("STAS", "stas", settings=FEW_EPISODES)
+ATTENTION = "AREL and STAS are fitted on 32 episodes at a time instead of 256: all 256 take 77 and 156 minutes a seed."
+AGENTS = (DENSE, EPISODIC, RD, AREL, STAS, LARE_RD, SHARED)
+ABOVE_AGENTS = Claim("LaRe-RD", ("episodic", "RD", "AREL", "STAS", "LaRe without agent decomposition"))
+
+
+def with_algorithms() -> tuple[Contender, ...]:
+    algorithms: tuple[Name, ...] = ("td3", "sac", "ddpg", "ppo")
+    return tuple(
+        Contender(f"{one.label}, {algorithm}", one.method, algorithm)
+        for algorithm in algorithms
+        for one in (DENSE, EPISODIC, RRDU, LARE_RRDU)
+    )
+
+
+TABLE = (
+    Exhibit(
+        "mujoco",
+        "Returns on MuJoCo tasks",
+        "figure 2",
+        MUJOCO,
+        MUJOCO[:3],
+        (DENSE, EPISODIC, IRCR, RD, RRD, RRDU, DIASTER, LARE_RD, LARE_RRDU),
+        (
+            Claim("LaRe-RRDu", ("episodic", "IRCR", "RD", "RRD", "RRD-unbiased", "Diaster")),
+            Claim("LaRe-RD", ("RD",)),
+        ),
+    ),
+    Exhibit(
+        "particles",
+        "Returns on particle tasks",
+        "figure 3",
+        ("CN-6", "PP-6", "CN-15", "PP-15", "CN-30", "PP-30"),
+        ("CN-6", "PP-6"),
+        AGENTS,
+        (ABOVE_AGENTS,),
+        differences=(ATTENTION,),
+    ),
+    Exhibit(
+        "triangle-area",
+        "Returns on a task that no language model can have read about",
+        "appendix D",
+        ("TriangleArea",),
+        ("TriangleArea",),
+        AGENTS,
+        (ABOVE_AGENTS,),
+        differences=(ATTENTION,),
+    ),
+    Exhibit(
+        "ablations",
+        "Without the reward model, and without self-prompting",
+        "figure 5",
+        MUJOCO,
+        MUJOCO[:2],
+        (
+            EPISODIC,
+            LARE_RRDU,
+            Contender("without reward model", "lare-signs"),
+            Contender("without self-prompting", "lare-rrdu", settings={"candidates": 1}),
+        ),
+        (
+            Claim("LaRe-RRDu", ("without reward model", "without self-prompting")),
+            Claim("without reward model", ("episodic",)),
+        ),
+    ),
+    Exhibit(
+        "candidates",
+        "The number of candidates",
+        "appendix F.1",
+        ("Walker2d-v4", "HumanoidStandup-v4", "HalfCheetah-v4"),
+        ("HalfCheetah-v4",),
+        (
+            Contender("n = 5", "lare-rrdu", draws=5),
+            Contender("n = 1", "lare-rrdu", settings={"candidates": 1}, draws=5),
+        ),
+        (Claim("n = 5", ("n = 1",)),),
+        draws=5,
+        differences=(
+            "The recordings hold n = 1 and n = 5; the paper shows more.",
+            "HalfCheetah-v4 is ours.",
+        ),
+    ),
+    Exhibit(
+        "bottleneck",
+        "A variational information bottleneck instead of a language model",
+        "appendix F.2",
+        MUJOCO,
+        MUJOCO[:2],
+        (RRDU, Contender("bottleneck", "vib-rrdu"), LARE_RRDU),
+        (Claim("LaRe-RRDu", ("bottleneck", "RRD-unbiased")),),
+    ),
+    Exhibit(
+        "bottleneck-agents",
+        "A bottleneck instead of a language model, with many agents",
+        "appendix F.2",
+        ("CN-6", "PP-6", "CN-15", "PP-15", "CN-30", "PP-30"),
+        ("CN-6",),
+        (RD, Contender("bottleneck", "vib-rd"), LARE_RD),
+        (Claim("LaRe-RD", ("bottleneck", "RD")),),
+    ),
+    Exhibit(
+        "algorithms",
+        "Other algorithms",
+        "appendix F.3",
+        MUJOCO,
+        MUJOCO[1:2],
+        with_algorithms(),
+        tuple(
+            Claim(f"LaRe-RRDu, {name}", (f"episodic, {name}", f"RRD-unbiased, {name}"))
+            for name in ("td3", "sac", "ddpg", "ppo")
+        ),
+    ),
+    Exhibit(
+        "reward-design",
+        "A reward function that the language model wrote",
+        "appendix F.4",
+        MUJOCO,
+        MUJOCO[:2],
+        (Contender("LLM reward design", "llm-reward"), LARE_RRDU),
+        (Claim("LaRe-RRDu", ("LLM reward design",)),),
+    ),
+    Exhibit(
+        "errors",
+        "Errors of the proxy reward, |r_hat - r|",
+        "table 4, appendix F.5",
+        ("Reacher-v4", "HalfCheetah-v4"),
+        ("Reacher-v4", "HalfCheetah-v4"),
+        (LARE_RRDU, RRDU, RD),
+        # An error is better the smaller it is.
+        (Claim("RRD-unbiased", ("LaRe-RRDu",)), Claim("RD", ("LaRe-RRDu",))),
+        key=ERROR,
+        printed={
+            "Reacher-v4": {"LaRe-RRDu": "0.0002 ± 0.0002", "RRD-unbiased": "0.011 ± 0.002", "RD": "0.004 ± 0.003"},
+            "HalfCheetah-v4": {"LaRe-RRDu": "0.7 ± 0.5", "RRD-unbiased": "10.7 ± 4.1", "RD": "9.6 ± 8.5"},
+        },
+    ),
+    Exhibit(
+        "sparse",
+        "A fully sparse task: has it travelled more than 500 m?",
+        "appendix F.6",
+        (SPARSE,),
+        (SPARSE,),
+        (EPISODIC, RD, RRDU, LARE_RD, LARE_RRDU),
+        (Claim("LaRe-RRDu", ("episodic", "RD", "RRD-unbiased")),),
+        differences=("As the text has it: 1 for more than 500 m. The published code pays 100 for more than 50 m.",),
+    ),
+)
+
+EXHIBITS = {exhibit.name: exhibit for exhibit in TABLE}

@@ -1,0 +1,52 @@
+"""A page of Markdown with its pictures beside it. What a person wrote under its last heading outlives the next writing."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lare.errors import LareError
+from lare.training.checkpoint import write_atomically
+
+REMARKS = "\n## Remarks\n"
+"""The heading of what a person adds."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """What is to be written."""
+
+    name: str
+    text: str
+    pictures: Mapping[str, str] = field(default_factory=dict)
+    """SVG by file name, as the text refers to them."""
+
+
+def write_page(page: Page, directory: Path) -> Path:
+    """Write a page and its pictures, and keep the remarks of the one before.
+
+    Raises:
+        LareError: they cannot be written.
+    """
+    path = directory / f"{page.name}.md"
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        before = path.read_text(encoding="utf-8") if path.exists() else ""
+        remarks = before[before.index(REMARKS) :] if REMARKS in before else ""
+        for name, svg in page.pictures.items():
+            (directory / name).write_text(svg + "\n", encoding="utf-8")
+        text = page.text.rstrip() + "\n" + remarks
+        write_atomically(path, lambda file: file.write(text.encode()))
+    except OSError as error:
+        raise LareError(f"{path} cannot be written: {error.strerror or error}") from error
+    return path
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |" for line in lines)
+
+
+def items(lines: Iterable[str]) -> str:
+    """A Markdown list."""
+    return "\n".join(f"* {line}" for line in lines)

@@ -1,0 +1,172 @@
+"""Exhibits that are made of runs: which runs, and the page of what came out of them."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lare.credit.methods import Encoder, find_method
+from lare.experiments import figures
+from lare.experiments.paper.budgets import Budget
+from lare.experiments.paper.exhibits import ERROR, RETURN, TRAVELLED, Claim, Contender, Exhibit
+from lare.experiments.paper.pages import Page, items, table
+from lare.experiments.statistics import REPETITIONS, Comparison, Estimate, compare, improvement, rounded
+from lare.experiments.sweep import Job, job_of
+from lare.tasks.spec import load_task
+from lare.training.run import Run, read_config
+from lare.training.settings import Settings
+
+CORRELATION = "credit/correlation"
+
+DIFFERENCES = (
+    "Inputs of decoders and returns are normalised by running statistics, for the baselines as for LaRe (the paper: neither).",
+    "Factors judge the observation that a step led to, but for Reacher-v4, whose own reward looks at the one before (the paper: "
+    "the one before).",
+    "The recorded replies are of a newer language model than the paper's.",
+    "The seed of training and the draw of the language model are two things; the paper's change together.",
+)
+"""From the paper's protocol, of all exhibits."""
+
+Jobs = Mapping[str, Mapping[str, Sequence[Job]]]
+"""By task and label, one for each draw."""
+
+
+def tasks_of(exhibit: Exhibit, budget: Budget) -> tuple[str, ...]:
+    return {"smoke": exhibit.tasks[:1], "laptop": exhibit.laptop, "paper": exhibit.tasks}[budget.name]
+
+
+def jobs_of(exhibit: Exhibit, budget: Budget, root: Path) -> Jobs:
+    """Every run that an exhibit needs. Exhibits that need the same one share it."""
+    return {
+        name: {one.label: list(jobs_of_contender(one, exhibit, budget, name, root)) for one in exhibit.contenders}
+        for name in tasks_of(exhibit, budget)
+    }
+
+
+def jobs_of_contender(one: Contender, exhibit: Exhibit, budget: Budget, name: str, root: Path) -> Iterator[Job]:
+    task = load_task(name)
+    steps = budget.steps_of_many if task.particles else budget.steps
+    usual = {"method": one.method, "algorithm": one.algorithm, "steps": steps, "seeds": budget.seeds}
+    latent = find_method(one.method).encoder is Encoder.LATENT
+    for draw in range(min(exhibit.draws, budget.draws, one.draws) if latent else 1):
+        yield job_of(root, task, Settings(**{**one.settings, **budget.settings, **usual, "draw": draw}))
+
+
+def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
+    """What came out of the runs, beside what the paper says.
+
+    Raises:
+        LareError: the runs do not make up a whole table.
+    """
+    runs = {
+        name: {label: [opened(job) for job in some] for label, some in of_task.items()}
+        for name, of_task in jobs.items()
+    }
+    found = {name: compare(of_task, exhibit.measure(name)) for name, of_task in runs.items()}
+    pictures = {f"{exhibit.name}-{name}.svg": picture(one, exhibit.measure(name)) for name, one in found.items()}
+    parts = [
+        f"# {exhibit.title}",
+        f"The paper's {exhibit.source}, by `{command}`.",
+        protocol([run for of_task in runs.values() for some in of_task.values() for run in some]),
+        *(part for name in jobs for part in of_one_task(exhibit, name, runs[name], found[name])),
+        "## What the paper says, and what came out",
+        table(["the paper", *found], (claimed(*pair, exhibit, found) for pair in pairs(exhibit.claims))),
+        "The probability that a run of the one has more than a run of the other, with its 95% interval; open where the interval "
+        "holds 0.5, and where there are fewer than three seeds.",
+        "## What differs from the paper",
+        items([*exhibit.differences, *DIFFERENCES]),
+    ]
+    return Page(exhibit.name, "\n\n".join(parts), pictures)
+
+
+def opened(job: Job) -> Run:
+    return Run(job.directory, read_config(job.directory), ())
+
+
+def protocol(runs: Sequence[Run]) -> str:
+    """What the figures depend on."""
+    plans = [run.config.settings for run in runs]
+    steps = sorted({plan.steps for plan in plans})
+    seeds = sorted({seed for run in runs for seed in run.seeds})
+    versions = sorted({f"{name} {found}" for run in runs for name, found in run.config.versions.items()})
+    return (
+        f"{' and '.join(f'{one:,}' for one in steps)} environment steps, {span('seed', seeds)}, "
+        f"{span('draw', sorted({plan.draw for plan in plans}))} of the language model. "
+        f"LaRe {', '.join(sorted({run.config.lare for run in runs}))}; {', '.join(versions)}; "
+        f"{'; '.join(sorted({run.config.machine for run in runs}))}."
+    )
+
+
+def span(name: str, numbers: Sequence[int]) -> str:
+    """In words."""
+    return f"{name} {numbers[0]}" if len(numbers) == 1 else f"{name}s {numbers[0]} to {numbers[-1]}"
+
+
+def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], found: Comparison) -> Iterator[str]:
+    """A picture and a table."""
+    key, printed = exhibit.measure(name), exhibit.printed.get(name, {})
+    yield f"## {name}"
+    yield f"![{name}]({exhibit.name}-{name}.svg)"
+    beside = ["the paper"] if printed else [] if key == ERROR else ["error of the proxy reward", "its correlation"]
+    several = len(runs) and max(len(some) for some in runs.values()) > 1
+    head = ["", f"{meaning(key)}: IQM [95%]", "mean ± sd", *(["mean [95%] over draws"] if several else []), *beside]
+    rows = []
+    for row in found.rows:
+        cells = [
+            row.label,
+            str(row.iqm),
+            f"{rounded(row.mean, row.deviation)} ± {rounded(row.deviation, row.deviation)}",
+        ]
+        if several:
+            cells.append("-" if row.over_draws is None else str(row.over_draws))
+        if printed:
+            cells.append(printed.get(row.label, "-"))
+        elif key != ERROR:
+            cells += [spread(runs[row.label], ERROR), spread(runs[row.label], CORRELATION)]
+        rows.append(cells)
+    yield table(head, rows)
+    yield (
+        f"At step {int(found.curves[found.rows[0].label].x[-1]):,}. IQM: interquartile mean, its interval by {REPETITIONS:,} "
+        "stratified bootstraps over the seeds; sd: standard deviation over the seeds."
+    )
+
+
+def spread(runs: Iterable[Run], key: str) -> str:
+    """Mean and standard deviation at the last evaluation, over seeds and draws; a dash where there is none."""
+    values = [line[key] for run in runs for line in last_lines(run) if line.get(key) is not None]
+    if not values:
+        return "-"
+    deviation = float(np.std(values, ddof=min(1, len(values) - 1)))
+    return f"{rounded(float(np.mean(values)), deviation)} ± {rounded(deviation, deviation)}"
+
+
+def last_lines(run: Run) -> Iterator[dict]:
+    lines = run.metrics()
+    return (line for line in lines if line["step"] == lines[-1]["step"])
+
+
+def meaning(key: str) -> str:
+    return {RETURN: "true return", ERROR: "error of the proxy reward", TRAVELLED: "metres travelled"}[key]
+
+
+def picture(found: Comparison, key: str) -> str:
+    lines = {label: (one.x, one.value, one.low, one.high) for label, one in found.curves.items()}
+    return figures.bands(lines, "environment steps", f"{meaning(key)}, IQM", steps=True)
+
+
+def pairs(claims: Iterable[Claim]) -> Iterator[tuple[str, str]]:
+    return ((claim.better, other) for claim in claims for other in claim.others)
+
+
+def claimed(better: str, worse: str, exhibit: Exhibit, found: Mapping[str, Comparison]) -> list[str]:
+    """A row: what is claimed, and whether it is so on each task."""
+    than = "errs more than" if exhibit.key == ERROR else "is above"
+    chances = [(improvement(one.last[better], one.last[worse]), len(one.last[better])) for one in found.values()]
+    return [f"{better} {than} {worse}", *(f"{verdict(chance, seeds)}, {chance}" for chance, seeds in chances)]
+
+
+def verdict(chance: Estimate, seeds: int) -> str:
+    """Of a claim, by the probability of improvement. Of fewer than three seeds nothing can be said."""
+    if seeds < 3 or chance.low <= 0.5 <= chance.high:
+        return "open"
+    return "yes" if chance.low > 0.5 else "the other way round"

@@ -1,0 +1,40 @@
+"""Table 1: steps whose correlations are known, and the page."""
+
+import dataclasses
+
+import numpy as np
+
+from lare.experiments.paper import correlations
+from lare.experiments.paper.budgets import BUDGETS
+from lare.tasks.spec import load_task
+from toys import toy_spec
+
+
+def test_steps_of_one_agent_follow_each_other():
+    steps = correlations.random_steps(toy_spec(), 2)
+    assert len(steps.before) == len(steps.action) == len(steps.reward) == 2 * 20
+    np.testing.assert_array_equal(steps.before[1:20], steps.after[:19])
+    # What the toy pays, by what it shows before the step.
+    np.testing.assert_allclose(steps.reward, -((steps.action[:, 0] - steps.before[:, 0]) ** 2), rtol=1e-4, atol=1e-6)
+
+
+def test_steps_of_many_agents_have_the_rewards_of_each():
+    """A navigator is paid less, the further it is from its landmark: what it sees after the step says so."""
+    steps = correlations.random_steps(load_task("CN-6"), 4)
+    assert steps.before.shape == steps.after.shape == (4 * 25 * 6, 26)
+    assert steps.action.shape == (4 * 25 * 6, 5)
+    assert steps.reward.std() > 0
+    first = steps.before.reshape(4, 25, 6, 26)
+    np.testing.assert_array_equal(first[:, 1:], steps.after.reshape(4, 25, 6, 26)[:, :-1])
+
+
+def test_the_page(monkeypatch):
+    monkeypatch.setattr(correlations, "PRINTED", {"Reacher-v4": ("1", "2", "3", "4")})
+    budget = dataclasses.replace(BUDGETS["smoke"], functions=2)
+    page = correlations.page_of(budget, "lare reproduce table-1")
+    row = next(line for line in page.text.splitlines() if line.startswith("| Reacher-v4 |"))
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert cells[1].split()[1] == "(11),"
+    assert cells[3:] == ["10 of 10", "2 of 2"]
+    means = [float(cell.split()[0]) for cell in cells[1:3]]
+    assert 0 < means[0] < means[1] < 1

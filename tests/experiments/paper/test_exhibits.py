@@ -1,0 +1,162 @@
+"""The table of exhibits holds together, and each of them becomes a page: runs that are made up, and some that are trained."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lare.credit.methods import METHODS
+from lare.errors import LareError
+from lare.experiments import statistics, sweep
+from lare.experiments.paper.budgets import BUDGETS
+from lare.experiments.paper.exhibits import ERROR, EXHIBITS, TABLE
+from lare.experiments.paper.reproduce import NAMES, UNTRAINED, listed, reproduce
+from lare.experiments.paper.trained import jobs_of, verdict
+from lare.experiments.statistics import Estimate
+from lare.experiments.sweep import Share, train_one
+from lare.llm.recording import shipped_recordings
+from lare.training import train as training
+from lare.training.run import describe
+from toys import At
+
+SMOKE = BUDGETS["smoke"]
+
+
+@pytest.fixture(autouse=True)
+def few_repetitions(monkeypatch):
+    monkeypatch.setattr(statistics, "REPETITIONS", 50)
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    """Instead of training: metrics in which each method has a return of its own, its place in the table of methods."""
+
+    def train(job, cores, running):
+        job.directory.mkdir(parents=True)
+        (job.directory / "config.json").write_text(describe(job.task, job.plan, ()).model_dump_json())
+        place = list(METHODS).index(job.plan.method)
+        measured = {
+            "evaluation/return": place,
+            "evaluation/x_position": place,
+            ERROR: 0.1 * place,
+            "credit/correlation": 0.5,
+        }
+        lines = [
+            {"step": job.plan.steps // part, "seed": seed} | measured for part in (2, 1) for seed in job.plan.all_seeds
+        ]
+        (job.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+    monkeypatch.setattr(sweep, "in_a_process", train)
+
+
+@pytest.mark.parametrize("exhibit", TABLE, ids=lambda exhibit: exhibit.name)
+def test_what_is_claimed_and_printed_is_of_contenders_that_are_there(exhibit):
+    labels = [contender.label for contender in exhibit.contenders]
+    assert len(set(labels)) == len(labels)
+    assert {name for claim in exhibit.claims for name in (claim.better, *claim.others)} <= set(labels)
+    assert set(exhibit.printed) <= set(exhibit.tasks)
+    assert all(set(figures) <= set(labels) for figures in exhibit.printed.values())
+    assert set(exhibit.laptop) <= set(exhibit.tasks)
+
+
+@pytest.mark.parametrize("budget", BUDGETS.values(), ids=BUDGETS)
+@pytest.mark.parametrize("exhibit", TABLE, ids=lambda exhibit: exhibit.name)
+def test_every_run_of_an_exhibit_could_be_trained(exhibit, budget):
+    """Settings that go together, and recordings that are there."""
+    for of_task in jobs_of(exhibit, budget, Path("runs")).values():
+        for job in (job for some in of_task.values() for job in some):
+            method = METHODS[job.plan.method]
+            if method.encoder == "latent":
+                recorded = {recording.task for recording in shipped_recordings(method.kind, job.plan.draw)}
+                # A task that is like another one has the same prompts.
+                assert {role.name.replace("Sparse", "") for role in job.task.roles} <= recorded
+
+
+def test_no_two_runs_have_one_place():
+    for budget in BUDGETS.values():
+        plans = {}
+        for exhibit in TABLE:
+            for of_task in jobs_of(exhibit, budget, Path("runs")).values():
+                for job in (job for some in of_task.values() for job in some):
+                    assert plans.setdefault(job.directory, job.plan) == job.plan
+
+
+@pytest.mark.parametrize("name", EXHIBITS)
+def test_every_exhibit_becomes_a_page(name, made_up, tmp_path):
+    exhibit = EXHIBITS[name]
+    page = reproduce(name, SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
+    text = page.read_text()
+    assert text.startswith(
+        f"# {exhibit.title}\n\nThe paper's {exhibit.source}, by `lare reproduce {name} --budget smoke`."
+    )
+    assert all(f"| {contender.label} |" in text for contender in exhibit.contenders)
+    assert all(f"* {difference}" in text for difference in exhibit.differences)
+    for task in exhibit.tasks[:1]:
+        assert f"]({name}-{task}.svg)" in text
+        assert (page.parent / f"{name}-{task}.svg").read_text().startswith("<svg")
+    assert (page.parent / f"{name}.csv").read_text().startswith("task,method,algorithm,")
+
+
+def test_figures_claims_and_verdicts(made_up, tmp_path):
+    """With three seeds: errors are the place in the table of methods, a tenth of it."""
+    budget = BUDGETS["laptop"]
+    text = reproduce("errors", budget, Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    places = {label: list(METHODS).index(name) / 10 for label, name in (("RD", "rd"), ("LaRe-RRDu", "lare-rrdu"))}
+    assert "50,000 environment steps, seeds 0 to 2, draw 0 of the language model." in text
+    assert f"| RD | {places['RD']:.3f} [{places['RD']:.3f}, {places['RD']:.3f}] |" in text
+    assert "| 0.7 ± 0.5 |" in text
+    wrong = "the other way round, 0.000 [0.000, 0.000]"
+    assert places["RD"] < places["LaRe-RRDu"]
+    assert f"| RD errs more than LaRe-RRDu | {wrong} | {wrong} |" in text
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "seeds", "said"),
+    [(0.6, 1.0, 3, "yes"), (0.5, 1.0, 3, "open"), (0.0, 0.4, 3, "the other way round"), (1.0, 1.0, 2, "open")],
+)
+def test_a_verdict_needs_seeds_and_an_interval(low, high, seeds, said):
+    assert verdict(Estimate((low + high) / 2, low, high), seeds) == said
+
+
+def test_what_is_shared_or_done_is_not_trained_again(made_up, monkeypatch, tmp_path):
+    reproduce("bottleneck", SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
+    trained = []
+    monkeypatch.setattr(sweep, "in_a_process", lambda job, *_: trained.append(job.name) or "no")
+    reproduce("bottleneck", SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
+    assert trained == []
+    with pytest.raises(LareError, match=r"^1 of 3 runs failed, so there is no page: Reacher-v4/rd-td3$"):
+        reproduce("errors", SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
+    assert trained == ["Reacher-v4/rd-td3"]
+
+
+def test_remarks_outlive_a_page(made_up, tmp_path):
+    page = reproduce("sparse", SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
+    remarked = page.read_text() + "\n## Remarks\n\nNobody got anywhere.\n"
+    page.write_text(remarked)
+    assert reproduce("sparse", SMOKE, Share(), tmp_path / "runs", tmp_path / "out").read_text() == remarked
+
+
+def test_an_exhibit_that_is_trained(command, monkeypatch, tmp_path):
+    """The whole way, from the command line; the runs in this process, whose compiler is told to hurry."""
+    monkeypatch.setattr(sweep, "in_a_process", lambda job, cores, running: train_one(sweep.as_json(job)))
+    monkeypatch.setattr(training, "Terminal", lambda: At(-1, None))
+    status, out, err = command("reproduce", "errors", "--budget", "smoke")
+    assert (status, out) == (0, "wrote results/errors.md\n"), err
+    assert err.splitlines()[-1].startswith("3 of 3: Reacher-v4/")
+    assert (tmp_path / "runs" / "reproduce" / "smoke" / "Reacher-v4" / "rrdu-td3" / "checkpoint").is_dir()
+    row = next(line for line in (tmp_path / "results" / "errors.md").read_text().splitlines() if "| RD |" in line)
+    assert np.isfinite(float(row.split("|")[3].split("±")[0]))
+
+
+def test_the_list(command):
+    status, out, _ = command("reproduce")
+    assert status == 0
+    assert [name for name, _, _ in listed()] == list(NAMES)
+    assert all(name in out for name in (*EXHIBITS, *UNTRAINED))
+
+
+def test_an_exhibit_that_is_not_there(command):
+    status, _, err = command("reproduce", "figure-9")
+    assert status == 2
+    assert err == f"lare: no exhibit 'figure-9'; the exhibits are {', '.join(NAMES)}\n"
