@@ -5,6 +5,9 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
 from lare.cli.terminal import legible, progress
 from lare.experiments.sweep import Job
 
@@ -18,9 +21,6 @@ def watching(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
     if not sys.stderr.isatty():
         yield progress
         return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
@@ -39,7 +39,7 @@ def watching(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
             looking.join()
 
 
-def look(jobs: Sequence[Job], bars, ended: threading.Event) -> None:
+def look(jobs: Sequence[Job], bars: Progress, ended: threading.Event) -> None:
     """Move the bars until the end."""
     whole = bars.add_task("all runs", total=sum(job.plan.steps for job in jobs))
     own: dict[str, int] = {}
