@@ -5,7 +5,7 @@
     python benchmarks/learning.py table                       from there: results/learning.json, docs/pictures, a table
 
 Every experiment is a run directory RUNS/TASK/LABEL; its settings and metrics are kept as they are. The curve of SBX's TD3
-(`sbx_td3.py RUNS/TASK/sbx-dense`) is one of them. Two processes on one core each train 1.1 times as much as one on two.
+(`sbx_learning.py RUNS/TASK/sbx-dense`) is one of them. Two processes on one core each train 1.1 times as much as one on two.
 """
 
 import json

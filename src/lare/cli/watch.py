@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from lare.cli.terminal import legible, progress
 from lare.experiments.sweep import Job
@@ -42,7 +42,7 @@ def watching(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
 def look(jobs: Sequence[Job], bars: Progress, ended: threading.Event) -> None:
     """Move the bars until the end."""
     whole = bars.add_task("all runs", total=sum(job.plan.steps for job in jobs))
-    own: dict[str, int] = {}
+    own: dict[str, TaskID] = {}
     while not ended.is_set():
         steps = {job.name: job.step() if job.begun else 0 for job in jobs}
         bars.update(whole, completed=sum(steps.values()))

@@ -1,0 +1,137 @@
+"""Learning curves of SBX's algorithms on the true rewards, to be laid over ours.
+
+    python benchmarks/sbx_learning.py OUT --algorithm sac      OUT/metrics.jsonl, as `lare train --method dense` writes it
+
+Hyperparameters and protocol are ours. What still differs: SBX's targets follow at every update, not every second one, and its
+TD3's actor ascends the smaller of the two critics, not the first; its PPO has observations and rewards normalised by
+Stable-Baselines3's VecNormalize, where ours normalises observations and what the critic predicts. Seeds are trained one after the
+other; one core does (`taskset -c 0 python ...`).
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import flax.linen as nn
+import gymnasium
+import jax
+import numpy as np
+import sbx
+import tyro
+from measure import TD3, provenance
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+OFF_POLICY = {name: value for name, value in TD3.items() if name != "policy_delay"}
+PPO = {
+    "learning_rate": lambda left: 3e-4 * left,
+    "clip_range": lambda left: 0.2 * left,
+    "n_steps": 2000,
+    "batch_size": 64,
+    "n_epochs": 10,
+    "gamma": 0.99,
+    "gae_lambda": 0.95,
+    "ent_coef": 0.01,
+    "policy_kwargs": {"net_arch": [256, 256], "activation_fn": nn.tanh},
+}
+
+
+def model_of(algorithm: str, environment: gymnasium.Env, warmup: int, seed: int) -> Any:
+    """One of SBX's learners, with the figures that ours has."""
+    assert isinstance(environment.action_space, gymnasium.spaces.Box)
+    actions = environment.action_space.shape
+    noise = NormalActionNoise(np.zeros(actions), 0.1 * np.ones(actions))
+    usual = {"learning_starts": warmup, "seed": seed}
+    match algorithm:
+        case "td3":
+            smooth = {"target_policy_noise": 0.2, "target_noise_clip": 0.5}
+            return sbx.TD3("MlpPolicy", environment, action_noise=noise, **usual, **smooth, **TD3)
+        case "ddpg":
+            return sbx.DDPG("MlpPolicy", environment, action_noise=noise, qf_learning_rate=3e-4, **usual, **OFF_POLICY)
+        case "sac":
+            return sbx.SAC("MlpPolicy", environment, **usual, **OFF_POLICY)
+        case _:
+            return sbx.PPO("MlpPolicy", VecNormalize(DummyVecEnv([lambda: environment])), seed=seed, **PPO)
+
+
+def evaluate(model: Any, environment: gymnasium.Env, seed: int, episodes: int) -> float:
+    """Mean return of the deterministic policy, from the same starts at every evaluation."""
+    normal = model.get_vec_normalize_env()
+    returns = np.zeros(episodes)
+    for episode in range(episodes):
+        observation, _ = environment.reset(seed=1_000_000 + 1000 * seed + episode)
+        ended = False
+        while not ended:
+            seen = observation if normal is None else normal.normalize_obs(observation)
+            action, _ = model.predict(seen, deterministic=True)
+            observation, reward, terminated, truncated, _ = environment.step(action)
+            returns[episode] += float(reward)
+            ended = terminated or truncated
+    return float(returns.mean())
+
+
+class Evaluations(BaseCallback):
+    """Evaluates after the update that follows every so many steps."""
+
+    def __init__(self, every: int, report: Callable[[int], None]):
+        super().__init__()
+        self.every, self.report = every, report
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps and self.num_timesteps % self.every == 0:
+            self.report(self.num_timesteps)
+
+    def _on_training_end(self) -> None:
+        self.report(self.num_timesteps)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def main(
+    out: Annotated[Path, tyro.conf.Positional],
+    algorithm: Literal["td3", "ddpg", "sac", "ppo"] = "td3",
+    task: str = "HalfCheetah-v4",
+    steps: int = 100_000,
+    seeds: int = 3,
+    evaluate_every: int | None = None,
+    episodes: int = 10,
+    warmup: int = 10_000,
+) -> None:
+    """Train.
+
+    Args:
+        out: a new directory for the results.
+        algorithm: whose learning curve.
+        task: Gymnasium id.
+        steps: environment steps of each seed.
+        seeds: how many seeds, from 0.
+        evaluate_every: environment steps between two evaluations; 5000, or 10,000 for ppo, unless given.
+        episodes: episodes in one evaluation.
+        warmup: random steps before the first update; ppo has none.
+    """
+    every = evaluate_every or (10_000 if algorithm == "ppo" else 5000)
+    out.mkdir(parents=True)
+    settings = {"steps": steps, "seeds": seeds}
+    (out / "config.json").write_text(
+        json.dumps({"algorithm": f"SBX {algorithm}", "task": task, "settings": settings, **provenance()}, indent=1)
+        + "\n"
+    )
+    environment = gymnasium.make(task)
+    for seed in range(seeds):
+        model = model_of(algorithm, gymnasium.make(task), warmup, seed)
+
+        def report(step: int, model: Any = model, seed: int = seed) -> None:
+            line = {"step": step, "seed": seed, "evaluation/return": evaluate(model, environment, seed, episodes)}
+            with (out / "metrics.jsonl").open("a") as file:
+                file.write(json.dumps(line) + "\n")
+            print(f"seed {seed}  step {step:>7d}  return {line['evaluation/return']:10.1f}", flush=True)
+
+        model.learn(steps, log_interval=1_000_000, callback=Evaluations(every, report))
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_platforms", "cpu")
+    tyro.cli(main, description=__doc__)

@@ -1,0 +1,79 @@
+"""What a step costs with every algorithm and every method that fits it: one environment step of HalfCheetah-v4, and its share of
+the updates.
+
+    python benchmarks/step_costs.py
+
+The methods of an algorithm take turns; a turn is so many steps of one session, by the same `Session.advance` that `lare train`
+calls. Off-policy algorithms update at every step, after random ones that fill the replay with whole episodes; of ppo a turn is one
+rollout of 2000 steps with its updates. Many agents: `agents_speed.py`.
+"""
+
+import tempfile
+from functools import partial
+from pathlib import Path
+
+import jax
+import tyro
+from measure import interleave, new_session, show, summary, write
+
+import lare
+from lare.algorithms.table import ALGORITHMS, Kind
+from lare.credit.methods import METHODS
+from lare.training.single_agent import Session
+
+TASK, SEED, BEFORE, ROLLOUT = "HalfCheetah-v4", 0, 2000, 2000
+ONE_AGENT = [row.name for row in ALGORITHMS.values() if row.kind is not Kind.MANY_AGENTS]
+FITTING = [row.name for row in METHODS.values() if not row.for_many_only]
+
+
+def session(directory: Path, algorithm: str, method: str) -> Session:
+    """One that has just begun to update."""
+    chosen = ALGORITHMS[algorithm]
+    figures = (
+        {} if chosen.kind is Kind.ON_POLICY else {algorithm: chosen.settings.model_copy(update={"warmup": BEFORE})}
+    )
+    settings = lare.Settings(
+        **{"method": method, "algorithm": algorithm, "seed": SEED, "evaluation_episodes": 1, **figures}
+    )
+    started = new_session(directory / method, TASK, settings)
+    go_on(started, BEFORE)
+    return started
+
+
+def go_on(of: Session, steps: int) -> None:
+    """So many environment steps, to the last computation."""
+    for _ in range(steps // of.settings.turn):
+        of.advance()
+    jax.block_until_ready(of.learner)
+
+
+def main(rounds: int = 3, steps: int = 500, algorithms: tuple[str, ...] = tuple(ONE_AGENT)) -> None:
+    """Measure.
+
+    Args:
+        rounds: how often each has its turn.
+        steps: environment steps in a turn of an off-policy algorithm, a multiple of 50.
+        algorithms: which ones.
+    """
+    tables = {}
+    for algorithm in algorithms:
+        of_turn = ROLLOUT if ALGORITHMS[algorithm].kind is Kind.ON_POLICY else steps
+        with tempfile.TemporaryDirectory() as place:
+            sessions = {method: session(Path(place), algorithm, method) for method in FITTING}
+            turns = {method: partial(go_on, one, of_turn) for method, one in sessions.items()}
+            tables[algorithm] = summary(interleave(turns, rounds), of_turn, "dense")
+            for one in sessions.values():
+                one.close()
+        show(algorithm, tables[algorithm], "dense")
+    figures = {
+        "task": TASK,
+        "seeds": [SEED],
+        "rounds": rounds,
+        "steps in a turn": {"off-policy": steps, "ppo": ROLLOUT},
+    }
+    write("step_costs", {**figures, "milliseconds for a step": tables})
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_platforms", "cpu")
+    tyro.cli(main, description=__doc__)
