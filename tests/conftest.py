@@ -41,6 +41,13 @@ collect_ignore = ["toys.py", "servers.py", "recipes.py"]
 __all__ = ["PHI", "Chase", "toy_spec"]
 
 
+@pytest.fixture(autouse=True, scope="module")
+def forget_what_was_compiled():
+    """What JAX keeps of every program would grow to gigabytes, and Python would look through it again and again."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def chase() -> TaskSpec:
     return toy_spec()

@@ -2,7 +2,6 @@
 
 import contextlib
 import ctypes
-import gc
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -247,6 +246,5 @@ def ahead(function: Any, *shapes: Any) -> Any:
 
 def give_memory_back() -> None:
     """What the compiler has freed, glibc keeps for the process unless it is asked not to."""
-    gc.collect()
     with contextlib.suppress(OSError, AttributeError):  # there is another C library, or none that can be asked
         ctypes.CDLL(None).malloc_trim(0)
