@@ -465,7 +465,8 @@ def test_what_is_left_of_an_answer_is_not_the_next_one(seccomp):
     body = FORGE + 'forge(b\'{"number": "%s", "values": []}\\n\')\nfor turn in range(10**7): pass\nreturn [action]'
     program = JailedProgram("import os, sys\n" + phi(body), 2, 1, gated=False)
     assert program.call(np.zeros((1, 2)), np.zeros((1, 1))).values == ()
-    with pytest.raises(WorkerFailed, match="it said something that is no answer to what was asked"):
+    # The true answer to the first request is read alone, or with the forged one to the second behind it.
+    with pytest.raises(WorkerFailed, match=r"it said something that is no answer to what was asked|Extra data"):
         program.call(np.zeros((1, 2)), np.zeros((1, 1)))
 
 

@@ -269,5 +269,5 @@ def rliable():
             warnings.simplefilter("ignore")
             from rliable import library, metrics
     except ImportError:
-        raise LareError("lare compare needs an extra: pip install 'lare-rl[statistics]'") from None
+        raise LareError("comparisons need an extra: pip install 'lare-rl[statistics]'") from None
     return library, metrics

@@ -9,6 +9,7 @@ from lare.experiments.paper import correlations, regret, trained
 from lare.experiments.paper.budgets import Budget
 from lare.experiments.paper.exhibits import EXHIBITS, TABLE
 from lare.experiments.paper.pages import Page, write_page
+from lare.experiments.statistics import rliable
 from lare.experiments.sweep import Job, Share, check, run_sweep
 from lare.experiments.tables import rows_of, write_table
 
@@ -52,13 +53,14 @@ def reproduce(
         out: the directory for pages; all metrics of its runs are there too, as NAME.csv.
 
     Raises:
-        LareError: there is no such exhibit, or one of its runs failed.
+        LareError: there is no such exhibit, rliable is not there, or one of the runs failed.
     """
     command = f"lare reproduce {name} --budget {budget.name}"
     if name in UNTRAINED:
         return write_page(UNTRAINED[name](budget, command), out)
     if name not in EXHIBITS:
         raise LareError(f"no exhibit {name!r}; the exhibits are {', '.join(NAMES)}")
+    rliable()  # rather now than after an evening
     exhibit = EXHIBITS[name]
     jobs = trained.jobs_of(exhibit, budget, root / budget.name)
     every = [job for of_task in jobs.values() for some in of_task.values() for job in some]

@@ -18,14 +18,16 @@ from lare.training.settings import Settings
 
 CORRELATION = "credit/correlation"
 
-DIFFERENCES = (
-    "Inputs of decoders and returns are normalised by running statistics, for the baselines as for LaRe (the paper: neither).",
+OF_ONE_AGENT = (
     "Factors judge the observation that a step led to, but for Reacher-v4, whose own reward looks at the one before (the paper: "
     "the one before).",
+)
+ALWAYS = (
+    "Inputs of decoders and returns are normalised by running statistics, for the baselines as for LaRe (the paper: neither).",
     "The recorded replies are of a newer language model than the paper's.",
     "The seed of training and the draw of the language model are two things; the paper's change together.",
 )
-"""From the paper's protocol, of all exhibits."""
+"""What differs from the paper's protocol."""
 
 Jobs = Mapping[str, Mapping[str, Sequence[Job]]]
 """By task and label, one for each draw."""
@@ -74,9 +76,25 @@ def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
         "The probability that a run of the one has more than a run of the other, with its 95% interval; open where the interval "
         "holds 0.5, and where there are fewer than three seeds.",
         "## What differs from the paper",
-        items([*exhibit.differences, *DIFFERENCES]),
+        items(differences(exhibit, budget, runs)),
     ]
     return Page(exhibit.name, "\n\n".join(parts), pictures)
+
+
+def differences(exhibit: Exhibit, budget: Budget, runs: Mapping[str, Mapping[str, Sequence[Run]]]) -> Iterator[str]:
+    """From the paper, a sentence each."""
+    if budget.name != "paper":
+        yield f"Seeds: {budget.seeds} (the paper: 5)."
+        if len(runs) < len(exhibit.tasks):
+            yield f"Tasks: {len(runs)} of {len(exhibit.tasks)}."
+    one_agent = not any(
+        run.config.task.particles for of_task in runs.values() for some in of_task.values() for run in some
+    )
+    if one_agent and budget.steps is not None:
+        yield f"Environment steps: {budget.steps:,} (the paper: 1,000,000)."
+    yield from exhibit.differences
+    yield from OF_ONE_AGENT if one_agent else ()
+    yield from ALWAYS
 
 
 def opened(job: Job) -> Run:
