@@ -56,9 +56,9 @@ class CreditSettings(Checked):
     """diaster: updates of its decoder before each chunk of those of an off-policy algorithm."""
     ridge: Annotated[float, Field(gt=0)] = 1.0
     """lambda of the ridge regression: so many episodes' worth of belief in no difference between steps."""
-    bottleneck: Annotated[int, Field(ge=1)] = 4
+    bottleneck: Annotated[int, Field(ge=1)] = 8
     """Size of the code in the middle of VIB."""
-    divergence: Annotated[float, Field(ge=0)] = 1e-3
+    divergence: Annotated[float, Field(ge=0)] = 5e-3
     """Weight of the code's divergence beside the squared error."""
 
 

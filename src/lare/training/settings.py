@@ -30,7 +30,13 @@ class AgentSettings(Checked):
     capacity: Annotated[int, Field(ge=1)] = 15_000
     """Episodes that the replay of a seed holds, for the decoder."""
     credit: CreditSettings = CreditSettings(
-        hidden=(64, 64, 64, 64), learning_rate=5e-4, weight_decay=1e-5, drawn_steps=10, steps=6400
+        hidden=(64, 64, 64, 64),
+        learning_rate=5e-4,
+        weight_decay=1e-5,
+        drawn_steps=10,
+        steps=6400,
+        bottleneck=4,
+        divergence=1e-3,
     )
 
 
