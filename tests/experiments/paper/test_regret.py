@@ -11,7 +11,7 @@ def test_the_page(monkeypatch):
     found = regret.page_of(BUDGETS["smoke"], "lare reproduce theory")
     rows = [line.split("|") for line in found.text.splitlines() if line.startswith(("| 1 (latent)", "| 6 "))]
     assert [row[2].strip() for row in rows] == ["6", "36"]
-    assert [row[6].strip() for row in rows] == ["3 of 3", "3 of 3"]
+    assert [row[7].strip() for row in rows] == ["3 of 3", "3 of 3"]
     means = [float(row[3].split("±")[0]) for row in rows]
     assert np.isclose(means[1] / means[0], float(rows[1][4]), atol=0.02)
     assert found.pictures["theory-regret.svg"].startswith("<svg")

@@ -43,6 +43,7 @@ def page_of(budget: Budget, command: str) -> Page:
                 "regret",
                 "to the latent one",
                 "radius l_K",
+                "largest error, in radii",
                 f"runs in which the bound always holds (promised: {1 - DELTA / 10:.0%})",
             ],
             rows,
@@ -92,6 +93,7 @@ def row(redundant: int, history: History, latent: float) -> list[str]:
         f"{rounded(mean, deviation)} ± {rounded(deviation, deviation)}",
         f"{mean / latent:.2f}",
         f"{float(history.radius[0, -1]):.1f}",
+        f"{float(np.max(np.asarray(history.error / history.radius))):.2f}",
         held([history]),
     ]
 
