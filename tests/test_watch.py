@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from lare.cli import watch
-from lare.experiments.sweep import Job
+from lare.experiments.jobs import Job
 from lare.training.settings import Plan
 from toys import toy_spec
 

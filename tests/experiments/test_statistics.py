@@ -59,6 +59,16 @@ def test_figures_by_hand(made):
     np.testing.assert_allclose(profile.value, [np.mean(np.array(values) > x) for x in profile.x])
 
 
+def test_the_chance_of_as_many_pairs_by_luck():
+    """By the tables of Mann and Whitney: of 3 against 3, all nine pairs 1 in 20, eight or more 2 in 20."""
+    low, high = np.array([1.0, 2, 3]), np.array([4.0, 5, 6])
+    assert statistics.chance_of_as_many([(high, low)]) == pytest.approx(1 / 20)
+    assert statistics.chance_of_as_many([(np.array([3.0, 5, 6]), np.array([1.0, 2, 4]))]) == pytest.approx(2 / 20)
+    assert statistics.chance_of_as_many([(low, high)]) == pytest.approx(1)
+    assert statistics.chance_of_as_many([(high, low), (high, low)]) == pytest.approx(1 / 400)
+    assert statistics.chance_of_as_many([(low, low)]) > 0.5
+
+
 def test_intervals_hold_what_they_promise():
     """Of the mean of 10 normal numbers, in most of 60 tries; a bootstrap of few is a little too sure of itself."""
     rng = np.random.default_rng(0)

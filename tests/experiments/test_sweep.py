@@ -1,17 +1,24 @@
 """Sweeps: what is asked for, what is missing, what is said of mistakes; and one that really trains."""
 
 import csv
+import fcntl
+import os
+import re
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
 import lare
 from lare.errors import LareError
-from lare.experiments import sweep
-from lare.experiments.sweep import read_sweep, run_sweep, shares, train_one
+from lare.experiments import processes
+from lare.experiments.jobs import as_json, train_one
+from lare.experiments.processes import shares
+from lare.experiments.sweep import read_sweep, run_sweep
 from lare.experiments.tables import rows_of, write_table
+from lare.training.run import open_run
 from lare.training.train import Interrupted
 from toys import At
 
@@ -44,9 +51,9 @@ def in_this_process(monkeypatch):
 
     def train(job, cores, running):
         trained.append(job.name)
-        train_one(sweep.as_json(job))
+        train_one(as_json(job))
 
-    monkeypatch.setattr(sweep, "in_a_process", train)
+    monkeypatch.setattr(processes, "in_a_process", train)
     monkeypatch.setattr(lare.training.train, "Terminal", lambda: At(-1, None))
     return trained
 
@@ -66,7 +73,7 @@ def test_every_run_that_is_asked_for(file, tmp_path):
 
 def test_what_is_done_is_left_alone_and_what_was_begun_goes_on(file, in_this_process):
     wanted, (dense, first, second) = read_sweep(file)
-    train_one(sweep.as_json(dense))
+    train_one(as_json(dense))
     stop = At(100, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(Interrupted):
         lare.train(first.task, lare.Settings(**first.plan.model_dump()), out=first.directory, listeners=[stop])
@@ -118,7 +125,9 @@ def test_one_table_of_everything(file, in_this_process, tmp_path):
 
 def test_a_run_that_fails_is_named_and_the_others_go_on(file, monkeypatch):
     wanted, jobs = read_sweep(file)
-    monkeypatch.setattr(sweep, "in_a_process", lambda job, cores, running: "no luck" if "draw3" in job.name else None)
+    monkeypatch.setattr(
+        processes, "in_a_process", lambda job, cores, running: "no luck" if "draw3" in job.name else None
+    )
     said = []
     assert run_sweep(wanted, jobs, said.append) == [jobs[2]]
     assert any(line.endswith("Reacher-v4/lare-linear-td3-draw3 failed: no luck") for line in said)
@@ -153,10 +162,44 @@ def test_on_a_local_ray(file, tmp_path):
     assert read_sweep(file)[1][0].done
 
 
+KILLED = FILE.replace('"dense", ', "").replace("[0, 3]", "[0]").replace("steps = 200", "steps = 100_000")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_sweep_that_is_stopped_or_killed_leaves_a_saved_run_and_nobody_behind(number, file, tmp_path):
+    """Ctrl-C reaches the whole group of processes, as in a terminal; the others reach the sweep alone."""
+    file.write_text(KILLED)
+    main = "from lare.cli import main; main()"
+    command = [sys.executable, "-c", main, "sweep", str(file)]
+    sweeping = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    (job,) = read_sweep(file)[1]
+    until = time.monotonic() + 120
+    while not job.begun or job.step() < 200:
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    (os.killpg if number is signal.SIGINT else os.kill)(sweeping.pid, number)
+    said = sweeping.communicate(timeout=60)[1]
+    if number is signal.SIGINT:
+        assert sweeping.returncode == 130
+        assert said.splitlines()[-1] == (
+            "lare: stopped; what was under way has saved itself, and the same command goes on"
+        )
+    with open_run(job.directory).directory.joinpath("lock").open() as lock:
+        while True:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except OSError:
+                assert time.monotonic() < until
+                time.sleep(0.1)
+    last = job.directory.with_name(job.directory.name + ".log").read_text().splitlines()[-1]
+    assert re.match(r"stopped at step \d+ and saved; go on with: lare train --resume ", last)
+
+
 def test_a_process_that_fails_says_why(file, tmp_path):
     _, jobs = read_sweep(file)
     jobs[0].directory.mkdir(parents=True)  # as if another sweep had just begun it
-    error = sweep.in_a_process(jobs[0], [], set())
+    error = processes.in_a_process(jobs[0], [], set())
     log = jobs[0].directory.with_name("dense-td3.log")
     assert error == (
         f"{jobs[0].directory} exists, and a run never overwrites another: choose another --out, or go on with --resume ({log})"
@@ -189,7 +232,7 @@ def test_a_directory_with_something_else_in_it(file, in_this_process):
     with pytest.raises(LareError) as error:
         read_sweep(file)
     assert str(error.value) == (
-        f"{jobs[0].directory} holds a run of other settings or of another task: choose another out"
+        f"{jobs[0].directory} holds a run with steps = 200, and 400 is asked for: choose another out"
     )
     jobs[1].directory.mkdir(parents=True)
     (jobs[1].directory / "thesis.tex").write_text("")
@@ -197,6 +240,25 @@ def test_a_directory_with_something_else_in_it(file, in_this_process):
     with pytest.raises(LareError) as error:
         read_sweep(file)
     assert str(error.value) == f"{jobs[1].directory} exists, and is not a run: choose another out"
+
+
+def test_a_run_of_other_figures_of_another_algorithm_is_the_same_run(file, in_this_process):
+    wanted, jobs = read_sweep(file)
+    run_sweep(wanted, jobs[:1], lambda _: None)
+    file.write_text(FILE + "sac = { gamma = 0.9 }\n")
+    assert read_sweep(file)[1][0].done
+
+
+def test_metrics_that_make_no_sense(file, in_this_process):
+    wanted, jobs = read_sweep(file)
+    run_sweep(wanted, jobs[:1], lambda _: None)
+    path = jobs[0].directory / "metrics.jsonl"
+    path.write_text('{"step": 1\n')
+    with pytest.raises(LareError, match=r"metrics\.jsonl is damaged: Expecting ',' delimiter"):
+        jobs[0].step()
+    path.write_bytes(b"\xff\n")
+    with pytest.raises(LareError, match=r"metrics\.jsonl is damaged: 'utf-8' codec can't decode byte 0xff"):
+        jobs[0].step()
 
 
 def test_more_cores_than_there_are():

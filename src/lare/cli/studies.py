@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
-from lare.cli.terminal import RunDirectories, say, show
+from lare.cli.terminal import RunDirectories, progress, say, show
+from lare.errors import LareError
 
 Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")]
 
@@ -69,9 +70,9 @@ def reproduce(
 
     Args:
         exhibit: which one, or all; without it, they are listed.
-        budget: smoke, to see that it runs; laptop, 3 seeds and a tenth of the steps on some of the tasks; paper, all of it.
+        budget: smoke, to see that it runs; laptop, 3 seeds and a twentieth of a single agent's steps, some tasks; paper, all.
         runs: where the runs are; those that are done are not trained again.
-        out: where the page goes, with its pictures and all metrics.
+        out: where the page goes, as OUT/BUDGET/NAME.md, with its pictures and all metrics.
         processes: runs at a time.
         cores: of each run.
         ray: a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
@@ -80,10 +81,23 @@ def reproduce(
     from lare.experiments.paper import reproduce as paper
     from lare.experiments.paper.budgets import BUDGETS
     from lare.experiments.sweep import Share
+    from lare.training.train import Interrupted
 
     if exhibit is None:
         show(("exhibit", "of the paper", "what it shows"), paper.listed())
         return
     share = Share(processes=processes, cores=cores)
-    for name in paper.NAMES if exhibit == "all" else (exhibit,):
-        say(f"wrote {paper.reproduce(name, BUDGETS[budget], share, runs, out, ray, watching)}")
+    if exhibit != "all":
+        say(f"wrote {paper.reproduce(exhibit, BUDGETS[budget], share, runs, out, ray, watching)}")
+        return
+    failed = 0
+    for name in paper.NAMES:
+        try:
+            say(f"wrote {paper.reproduce(name, BUDGETS[budget], share, runs, out, ray, watching)}")
+        except Interrupted:
+            raise
+        except LareError as error:  # one that fails is no reason to leave the others out
+            failed += 1
+            progress(f"{name}: {error}")
+    if failed:
+        raise LareError(f"{failed} of {len(paper.NAMES)} exhibits have no page")

@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from lare.cli.terminal import legible, progress
-from lare.experiments.sweep import Job
+from lare.errors import LareError
+from lare.experiments.jobs import Job
 
 EVERY = 2.0
 """Seconds between two looks."""
@@ -44,7 +45,7 @@ def look(jobs: Sequence[Job], bars: Progress, ended: threading.Event) -> None:
     whole = bars.add_task("all runs", total=sum(job.plan.steps for job in jobs))
     own: dict[str, TaskID] = {}
     while not ended.is_set():
-        steps = {job.name: job.step() if job.begun else 0 for job in jobs}
+        steps = {job.name: step_of(job) for job in jobs}
         bars.update(whole, completed=sum(steps.values()))
         for job in jobs:
             done = steps[job.name]
@@ -53,3 +54,11 @@ def look(jobs: Sequence[Job], bars: Progress, ended: threading.Event) -> None:
             if job.name in own:
                 bars.update(own[job.name], completed=done, visible=done < job.plan.steps)
         ended.wait(EVERY)
+
+
+def step_of(job: Job) -> int:
+    """How far it is; what is damaged is the matter of whoever trains it."""
+    try:
+        return job.step() if job.begun else 0
+    except LareError:
+        return 0

@@ -11,7 +11,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -94,8 +93,8 @@ class Comparison:
     profiles: Mapping[str, Band]
     """Share of runs that score more than x."""
     normalised: bool
-    last: Mapping[str, Scores]
-    """At the last step, for each seed a mean over the draws."""
+    groups: Mapping[str, "Group"]
+    """The scores themselves, by label."""
 
 
 @dataclass(frozen=True)
@@ -131,34 +130,25 @@ def compare(runs: Mapping[str, Sequence[Run]], key: str = RETURN) -> Comparison:
         {label: band(steps, scores, curve_of_iqm) for label, scores in by_seed.items()},
         {label: band(taus, scores, lambda scores: share_above(scores, taus)) for label, scores in last.items()},
         len(tasks) > 1,
-        last,
+        {group.label: group for group in groups},
     )
 
 
 def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """The runs by method; with the algorithm where several are compared, and with whatever else tells runs of a method apart."""
-    plans = [flat(run.config.settings.model_dump(exclude=TOLD_APART)) for run in runs]
+    plans = [run.config.settings.in_force() for run in runs]
     several = len({plan["algorithm"] for plan in plans}) > 1
     found: dict[str, list[Run]] = {}
     for run, plan in zip(runs, plans, strict=True):
         alike = [other for other in plans if all(other[name] == plan[name] for name in ("method", "algorithm"))]
-        parts = [f"{name} {value}" for name, value in plan.items() if any(other[name] != value for other in alike)]
-        label = ", ".join([plan["method"], *([plan["algorithm"]] if several else []), *parts])
-        found.setdefault(label, []).append(run)
+        told = (name for name in plan if name not in IGNORED and any(other[name] != plan[name] for other in alike))
+        parts = [plan["method"], *([plan["algorithm"]] if several else []), *(f"{name} {plan[name]}" for name in told)]
+        found.setdefault(", ".join(parts), []).append(run)
     return found
 
 
-TOLD_APART = {"seed", "seeds", "draw", "steps", "chunk", "evaluate_every", "evaluation_episodes"}
+IGNORED = {"seed", "seeds", "draw", "steps", "chunk", "evaluate_every", "evaluation_episodes"}
 """Settings that make no other method of it."""
-
-
-def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Settings by their dotted names, as the command line has them."""
-    parts = (
-        flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-        for name, value in settings.items()
-    )
-    return dict(itertools.chain.from_iterable(part.items() for part in parts))
 
 
 def grouped(runs: Mapping[str, Sequence[Run]], key: str) -> tuple[list[Group], tuple[str, ...]]:
@@ -213,17 +203,34 @@ def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:
     if len(group.draws) > 1:
         (over_draws,) = estimates(group.scores[..., -1].mean(axis=1), lambda scores: np.array([np.mean(scores)]))
     if group.label != first:
-        better = improvement(mine, last[first])
+        (better,) = estimates((mine, last[first]), lambda *both: np.array([metrics.probability_of_improvement(*both)]))
     of_seeds = mine.mean(axis=1)
     mean, deviation = float(of_seeds.mean()), float(np.std(of_seeds, ddof=min(1, len(mine) - 1)))
     return Row(group.label, len(group.seeds), len(group.draws), iqm, mean, deviation, over_draws, better)
 
 
-def improvement(scores: Scores, others: Scores) -> Estimate:
-    """The probability that one of the scores is above one of the others."""
-    metrics = rliable()[1]
-    (found,) = estimates((scores, others), lambda *both: np.array([metrics.probability_of_improvement(*both)]))
-    return found
+def chance_of_as_many(pairs: Sequence[tuple[Float[np.ndarray, " ours"], Float[np.ndarray, " theirs"]]]) -> float:
+    """How likely it is that so many pairs, or more, are won by luck: Mann and Whitney's test, exact, over several tasks.
+
+    U = sum over tasks and over all pairs of [ours > theirs] + [ours = theirs] / 2; its distribution, were both alike, is that
+    over all ways to deal out the values of each task.
+    """
+    chances, won = {0.0: 1.0}, 0.0
+    for ours, theirs in pairs:
+        values = np.concatenate([ours, theirs])
+        won += pairs_won(ours, theirs)
+        ways = [list(chosen) for chosen in itertools.combinations(range(len(values)), len(ours))]
+        dealt = [pairs_won(values[chosen], np.delete(values, chosen)) for chosen in ways]
+        grown: dict[float, float] = {}
+        for (before, chance), one in itertools.product(chances.items(), dealt):
+            grown[before + one] = grown.get(before + one, 0.0) + chance / len(ways)
+        chances = grown
+    return min(1.0, sum(chance for total, chance in chances.items() if total >= won))
+
+
+def pairs_won(ours: Float[np.ndarray, " ours"], theirs: Float[np.ndarray, " theirs"]) -> float:
+    """Of all pairs, ties half."""
+    return float(np.sum(ours[:, None] > theirs) + 0.5 * np.sum(ours[:, None] == theirs))
 
 
 def curve_of_iqm(scores: Scores) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any
 from lare.training.checkpoint import write_atomically
 from lare.training.run import CONFIG, read_config, read_metrics
 
-KEYS = ("task", "method", "algorithm", "judges", "draw", "seed", "step")
+KEYS = ("task", "run", "method", "algorithm", "judges", "draw", "seed", "step")
 
 
 def rows_of(directories: Iterable[Path]) -> list[dict[str, Any]]:
@@ -22,6 +22,7 @@ def rows_of(directories: Iterable[Path]) -> list[dict[str, Any]]:
         plan = config.settings
         run = {
             "task": config.task.name,
+            "run": directory.name,
             "method": plan.method,
             "algorithm": plan.algorithm,
             "judges": plan.judges or config.task.judges,

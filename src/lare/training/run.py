@@ -96,6 +96,10 @@ def function_file(task: TaskSpec, role: TaskSpec) -> str:
     return FUNCTION if role is task else f"latent_function_{task.team(role)}.py"
 
 
+class Busy(LareError):
+    """Another process is training in the run's directory."""
+
+
 @dataclass(frozen=True)
 class Run:
     """A run on the disk."""
@@ -216,10 +220,13 @@ def read_config(directory: Path) -> Config:
 
 
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
-    """Every complete line of a run's metrics.jsonl, in order."""
+    """Every complete line of a run's metrics.jsonl, in order. Raises `LareError` where one makes no sense."""
     path = directory / METRICS
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
-    return [json.loads(line) for line in lines if line.endswith("\n")]
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
+        return [json.loads(line) for line in lines if line.endswith("\n")]
+    except (OSError, ValueError) as error:
+        raise LareError(f"{path} is damaged: {error}") from error
 
 
 def open_run(directory: str | Path) -> Run:
@@ -251,5 +258,5 @@ def locked(run: Run) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise LareError(f"another process is training in {run.directory}") from None
+            raise Busy(f"another process is training in {run.directory}") from None
         yield

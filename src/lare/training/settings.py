@@ -1,5 +1,6 @@
 """Every setting of a run. Together with the task and the latent functions they say all that a run depends on."""
 
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
@@ -146,6 +147,14 @@ class Plan(Settings):
         """The figures of the algorithm."""
         return getattr(self, self.algorithm)
 
+    def in_force(self) -> dict[str, Any]:
+        """All that matters here, by dotted names as on the command line: not the figures of other algorithms."""
+        kind = ALGORITHMS[self.algorithm].kind
+        idle = {*ALGORITHMS, "rollout", "agents", "credit"} - {self.algorithm}
+        idle -= {"agents"} if kind is Kind.MANY_AGENTS else {"credit"}
+        idle -= {"rollout"} if kind is Kind.ON_POLICY else set()
+        return dict(dotted(self.model_dump(exclude=idle)))
+
     @property
     def episodes(self) -> int:
         """Episodes of many agents to make room for: no more than the run can fill, and at least those of an update."""
@@ -155,6 +164,15 @@ class Plan(Settings):
     def rows(self) -> int:
         """Observations to make room for: no more than the run can fill."""
         return min(self.capacity, 2 * self.steps + 2)
+
+
+def dotted(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Settings within settings, in a row."""
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from dotted(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def decide(settings: Settings, task: TaskSpec) -> Plan:

@@ -6,6 +6,8 @@ import numpy as np
 
 from lare.experiments.paper import correlations
 from lare.experiments.paper.budgets import BUDGETS
+from lare.latent.design import DesignFailed
+from lare.llm.recording import Recorder
 from lare.tasks.spec import load_task
 from toys import toy_spec
 
@@ -38,3 +40,16 @@ def test_the_page(monkeypatch):
     assert cells[3:] == ["10 of 10", "2 of 2"]
     means = [float(cell.split()[0]) for cell in cells[1:3]]
     assert 0 < means[0] < means[1] < 1
+
+
+def test_a_draw_of_which_nothing_passes_is_counted(phi, monkeypatch):
+    def design(task, draw):
+        if draw == 1:
+            raise DesignFailed("no attempt passed", Recorder(task.name, "factors", None), "recorded")
+        return phi
+
+    monkeypatch.setattr(correlations, "design", design)
+    assert correlations.designed(toy_spec(), 3) == [phi, None, phi]
+    states, factors = correlations.of_entries(correlations.random_steps(toy_spec(), 1), "before", [])
+    assert states.split()[1] == "(2),"
+    assert factors == "-"

@@ -8,13 +8,13 @@ import pytest
 
 from lare.credit.methods import METHODS
 from lare.errors import LareError
-from lare.experiments import statistics, sweep
+from lare.experiments import processes, statistics
+from lare.experiments.jobs import as_json, train_one
 from lare.experiments.paper.budgets import BUDGETS
 from lare.experiments.paper.exhibits import ERROR, EXHIBITS, TABLE
 from lare.experiments.paper.reproduce import NAMES, UNTRAINED, listed, reproduce
 from lare.experiments.paper.trained import jobs_of, verdict
-from lare.experiments.statistics import Estimate
-from lare.experiments.sweep import Share, train_one
+from lare.experiments.sweep import Share
 from lare.llm.recording import shipped_recordings
 from lare.training import train as training
 from lare.training.run import describe
@@ -28,26 +28,27 @@ def few_repetitions(monkeypatch):
     monkeypatch.setattr(statistics, "REPETITIONS", 50)
 
 
-@pytest.fixture
-def made_up(monkeypatch):
-    """Instead of training: metrics in which each method has a return of its own, its place in the table of methods."""
+def write_run(value):
+    """Instead of training: metrics with a return and an error made up from plan and seed."""
 
     def train(job, cores, running):
         job.directory.mkdir(parents=True)
         (job.directory / "config.json").write_text(describe(job.task, job.plan, ()).model_dump_json())
-        place = list(METHODS).index(job.plan.method)
-        measured = {
-            "evaluation/return": place,
-            "evaluation/x_position": place,
-            ERROR: 0.1 * place,
-            "credit/correlation": 0.5,
-        }
-        lines = [
-            {"step": job.plan.steps // part, "seed": seed} | measured for part in (2, 1) for seed in job.plan.all_seeds
-        ]
+        lines = []
+        for step in (job.plan.steps // 2, job.plan.steps):
+            for seed in job.plan.all_seeds:
+                found = float(value(job.plan, seed))
+                measured = {"evaluation/return": found, "evaluation/x_position": found, ERROR: 0.1 * found}
+                lines.append({"step": step, "seed": seed, **measured, "credit/correlation": 0.5})
         (job.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
-    monkeypatch.setattr(sweep, "in_a_process", train)
+    return train
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    """Each method has a return of its own, its place in the table of methods."""
+    monkeypatch.setattr(processes, "in_a_process", write_run(lambda plan, _: list(METHODS).index(plan.method)))
 
 
 @pytest.mark.parametrize("exhibit", TABLE, ids=lambda exhibit: exhibit.name)
@@ -95,34 +96,44 @@ def test_every_exhibit_becomes_a_page(name, made_up, tmp_path):
     for task in exhibit.tasks[:1]:
         assert f"]({name}-{task}.svg)" in text
         assert (page.parent / f"{name}-{task}.svg").read_text().startswith("<svg")
-    assert (page.parent / f"{name}.csv").read_text().startswith("task,method,algorithm,")
+    assert (page.parent / f"{name}.csv").read_text().startswith("task,run,method,")
 
 
 def test_figures_claims_and_verdicts(made_up, tmp_path):
-    """With three seeds: errors are the place in the table of methods, a tenth of it."""
-    budget = BUDGETS["laptop"]
-    text = reproduce("errors", budget, Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    """With three seeds on two tasks: errors are the place in the table of methods, a tenth of it; more is worse."""
+    text = reproduce("errors", BUDGETS["laptop"], Share(), tmp_path / "runs", tmp_path / "out").read_text()
     places = {label: list(METHODS).index(name) / 10 for label, name in (("RD", "rd"), ("LaRe-RRDu", "lare-rrdu"))}
     assert "50,000 environment steps, seeds 0 to 2, draw 0 of the language model." in text
     assert f"| RD | {places['RD']:.3f} [{places['RD']:.3f}, {places['RD']:.3f}] |" in text
     assert "| 0.7 ± 0.5 |" in text
-    wrong = "the other way round, 0.000 [0.000, 0.000]"
     assert places["RD"] < places["LaRe-RRDu"]
-    assert f"| RD errs more than LaRe-RRDu | {wrong} | {wrong} |" in text
+    assert "| LaRe-RRDu errs less than RD | 0 of 9 | 0 of 9 | 1.000 | the other way round |" in text
+
+
+def test_draws_are_what_is_compared_where_there_are_several(tmp_path, monkeypatch):
+    """Seeds differ by next to nothing, draws by much: three draws do not settle anything, however many seeds agree."""
+    monkeypatch.setattr(
+        processes, "in_a_process", write_run(lambda plan, seed: plan.draw * 1000 + plan.candidates + seed)
+    )
+    text = reproduce("candidates", BUDGETS["laptop"], Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    assert "| n = 5 is above n = 1 | 6 of 9 |" in text
+    assert "| open |" in text
+    rows = (tmp_path / "out" / "laptop" / "candidates.csv").read_text().splitlines()
+    assert len({tuple(row.split(",")[:8]) for row in rows[1:]}) == len(rows) - 1 == 2 * 3 * 3 * 2
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "seeds", "said"),
-    [(0.6, 1.0, 3, "yes"), (0.5, 1.0, 3, "open"), (0.0, 0.4, 3, "the other way round"), (1.0, 1.0, 2, "open")],
+    ("for_it", "against", "said"),
+    [(0.025, 1.0, "yes"), (0.05, 1.0, "open"), (0.5, 0.5, "open"), (1.0, 0.02, "the other way round")],
 )
-def test_a_verdict_needs_seeds_and_an_interval(low, high, seeds, said):
-    assert verdict(Estimate((low + high) / 2, low, high), seeds) == said
+def test_verdicts(for_it, against, said):
+    assert verdict(for_it, against) == said
 
 
 def test_what_is_shared_or_done_is_not_trained_again(made_up, monkeypatch, tmp_path):
     reproduce("bottleneck", SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
     trained = []
-    monkeypatch.setattr(sweep, "in_a_process", lambda job, *_: trained.append(job.name) or "no")
+    monkeypatch.setattr(processes, "in_a_process", lambda job, *_: trained.append(job.name) or "no")
     reproduce("bottleneck", SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
     assert trained == []
     with pytest.raises(LareError, match=r"^1 of 3 runs failed, so there is no page: Reacher-v4/rd-td3$"):
@@ -139,14 +150,55 @@ def test_remarks_outlive_a_page(made_up, tmp_path):
 
 def test_an_exhibit_that_is_trained(command, monkeypatch, tmp_path):
     """The whole way, from the command line; the runs in this process, whose compiler is told to hurry."""
-    monkeypatch.setattr(sweep, "in_a_process", lambda job, cores, running: train_one(sweep.as_json(job)))
+    monkeypatch.setattr(processes, "in_a_process", lambda job, cores, running: train_one(as_json(job)))
     monkeypatch.setattr(training, "Terminal", lambda: At(-1, None))
     status, out, err = command("reproduce", "errors", "--budget", "smoke")
-    assert (status, out) == (0, "wrote results/errors.md\n"), err
+    assert (status, out) == (0, "wrote results/smoke/errors.md\n"), err
     assert err.splitlines()[-1].startswith("3 of 3: Reacher-v4/")
     assert (tmp_path / "runs" / "reproduce" / "smoke" / "Reacher-v4" / "rrdu-td3" / "checkpoint").is_dir()
-    row = next(line for line in (tmp_path / "results" / "errors.md").read_text().splitlines() if "| RD |" in line)
+    row = next(
+        line for line in (tmp_path / "results" / "smoke" / "errors.md").read_text().splitlines() if "| RD |" in line
+    )
     assert np.isfinite(float(row.split("|")[3].split("±")[0]))
+
+
+def test_a_budget_that_teaches_nothing_says_so(made_up, tmp_path):
+    text = reproduce("sparse", SMOKE, Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    assert "it runs, and learns nothing.**" in text
+    text = reproduce("triangle-area", SMOKE, Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    assert "* Environment steps: 600 (the paper: 2,050,000)." in text
+
+
+@pytest.mark.parametrize(
+    ("prepare", "message"),
+    [
+        (lambda out: out.write_text(""), "nothing can be written into {out}/smoke: Not a directory"),
+        (
+            lambda out: (out / "smoke" / "sparse.csv").mkdir(parents=True),
+            "nothing can be written into {out}/smoke: Is a directory",
+        ),
+    ],
+)
+def test_where_nothing_can_be_written_nothing_is_trained(prepare, message, monkeypatch, tmp_path):
+    monkeypatch.setattr(processes, "in_a_process", lambda *_: pytest.fail("trained"))
+    out = tmp_path / "out"
+    prepare(out)
+    with pytest.raises(LareError) as error:
+        reproduce("sparse", SMOKE, Share(), tmp_path / "runs", out)
+    assert str(error.value) == message.format(out=out)
+
+
+def test_all_of_them_goes_on_after_one_that_fails(command, made_up, monkeypatch):
+    def made(name, *_):
+        if name == "errors":
+            raise LareError("no luck")
+        return Path(name)
+
+    monkeypatch.setattr("lare.experiments.paper.reproduce.reproduce", made)
+    status, out, err = command("reproduce", "all", "--budget", "smoke")
+    assert status == 2
+    assert out.split() == [word for name in NAMES if name != "errors" for word in ("wrote", name)]
+    assert err == f"errors: no luck\nlare: 1 of {len(NAMES)} exhibits have no page\n"
 
 
 def test_the_list(command):

@@ -1,5 +1,6 @@
 """Table 1 of the paper: how much of the true reward is in states and in factors, and how many replies run as they come."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -9,13 +10,14 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from lare.experiments.credit import correlations
 from lare.experiments.paper.budgets import Budget
 from lare.experiments.paper.pages import Page, items, table
-from lare.latent.design import design, examine
+from lare.latent.design import DesignFailed, design, examine
+from lare.latent.function import LatentFunction
 from lare.llm.recording import shipped_recordings
 from lare.tasks.environment import make
 from lare.tasks.particles.table import find_particle_task
 from lare.tasks.particles.task import ACTIONS, STEPS
 from lare.tasks.particles.world import State
-from lare.tasks.spec import TaskSpec, load_task
+from lare.tasks.spec import Judges, TaskSpec, load_task
 
 TITLE = "What states and factors know of the true reward"
 PRINTED = {
@@ -47,8 +49,13 @@ class Steps(NamedTuple):
 
 def page_of(budget: Budget, command: str) -> Page:
     """Measure, and write it beside the paper's figures."""
-    tasks = [load_task(name) for name in PRINTED]
-    found = {task.name: (of_entries(task, budget), of_replies(task, budget)) for task in tasks}
+    rows = []
+    for task in map(load_task, PRINTED):
+        functions = designed(task, budget.functions)
+        passed = [function for function in functions if function is not None]
+        entries = of_entries(random_steps(task, budget.episodes), task.judges, passed)
+        alone = of_replies(task, budget.functions)
+        rows.append([task.name, *entries, alone, f"{len(passed)} of {len(functions)}"])
     head = (
         "",
         "states: correlation (entries), best",
@@ -61,7 +68,7 @@ def page_of(budget: Budget, command: str) -> Page:
         f"The paper's table 1, by `{command}`: {budget.episodes} episodes of random actions, {budget.functions} of the "
         "recorded draws of the language model. Absolute correlation (Pearson's) of an entry with the true reward of the same "
         "step: mean over the entries, and the best one; of factors the mean over the draws.",
-        table(head, ([name, *entries, *replies] for name, (entries, replies) in found.items())),
+        table(head, rows),
         "## What the paper says",
         table(
             ("", "states", "factors", "without pre-verification", "with"),
@@ -73,31 +80,40 @@ def page_of(budget: Budget, command: str) -> Page:
     return Page("table-1", "\n\n".join(parts))
 
 
-def of_entries(task: TaskSpec, budget: Budget) -> tuple[str, str]:
-    """Correlations of states, and of the factors of each draw."""
-    steps = random_steps(task, budget.episodes)
+def designed(task: TaskSpec, draws: int) -> list[LatentFunction | None]:
+    """The function of each draw; None where no attempt passed."""
+    found: list[LatentFunction | None] = []
+    for draw in range(draws):
+        try:
+            found.append(design(task, draw=draw))
+        except DesignFailed:
+            found.append(None)
+    return found
+
+
+def of_entries(steps: Steps, judges: Judges, functions: Sequence[LatentFunction]) -> tuple[str, str]:
+    """Correlations of states, and of the factors of each function."""
     state = np.abs(correlations(steps.after, steps.reward))
-    sizes, means, best = [], [], []
-    for draw in range(budget.functions):
-        function = design(task, draw=draw)
-        factors = function.of_steps(steps.before, steps.action, steps.after, task.judges)
-        found = np.abs(correlations(factors, steps.reward))
-        sizes.append(factors.shape[1]), means.append(np.nanmean(found)), best.append(np.nanmax(found))
+    of_states = f"{np.nanmean(state):.2f} ({len(state)}), {np.nanmax(state):.2f}"
+    if not functions:
+        return of_states, "-"
+    found = []
+    for function in functions:
+        found.append(
+            np.abs(correlations(function.of_steps(steps.before, steps.action, steps.after, judges), steps.reward))
+        )
         function.close()
-    return (
-        f"{np.nanmean(state):.2f} ({len(state)}), {np.nanmax(state):.2f}",
-        f"{np.mean(means):.2f} ({np.mean(sizes):.1f}), {np.mean(best):.2f}",
-    )
+    mean, size, best = (np.mean([measure(one) for one in found]) for measure in (np.nanmean, len, np.nanmax))
+    return of_states, f"{mean:.2f} ({size:.1f}), {best:.2f}"
 
 
-def of_replies(task: TaskSpec, budget: Budget) -> tuple[str, str]:
-    """Shares of single candidates that pass as they come, and of designs that end with a function."""
-    recordings = [one for draw in range(budget.functions) for one in shipped_recordings("factors", draw)]
+def of_replies(task: TaskSpec, draws: int) -> str:
+    """Share of single candidates that pass as they come."""
+    recordings = [one for draw in range(draws) for one in shipped_recordings("factors", draw)]
     exchanges = [exchange for one in recordings if one.task == task.name for exchange in one.exchanges]
     replies = [reply for exchange in exchanges if exchange.stage == "candidate" for reply in exchange.replies]
     passed = [not examine(reply, task, "factors").errors for reply in replies]
-    designed = [bool(design(task, draw=draw).source) for draw in range(budget.functions)]
-    return f"{sum(passed)} of {len(passed)}", f"{sum(designed)} of {len(designed)}"
+    return f"{sum(passed)} of {len(passed)}"
 
 
 def random_steps(task: TaskSpec, episodes: int) -> Steps:

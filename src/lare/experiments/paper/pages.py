@@ -36,6 +36,8 @@ def write_page(page: Page, directory: Path) -> Path:
             (directory / name).write_text(svg + "\n", encoding="utf-8")
         text = page.text.rstrip() + "\n" + remarks
         write_atomically(path, lambda file: file.write(text.encode()))
+    except UnicodeDecodeError as error:
+        raise LareError(f"{path} is there and is no text, so no remarks can be kept: move it away") from error
     except OSError as error:
         raise LareError(f"{path} cannot be written: {error.strerror or error}") from error
     return path

@@ -3,14 +3,16 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from lare.errors import LareError
+from lare.experiments.jobs import Job, check
 from lare.experiments.paper import correlations, regret, trained
 from lare.experiments.paper.budgets import Budget
 from lare.experiments.paper.exhibits import EXHIBITS, TABLE
 from lare.experiments.paper.pages import Page, write_page
 from lare.experiments.statistics import rliable
-from lare.experiments.sweep import Job, Share, check, run_sweep
+from lare.experiments.sweep import Share, run_sweep
 from lare.experiments.tables import rows_of, write_table
 
 UNTRAINED: dict[str, Callable[[Budget, str], Page]] = {
@@ -50,17 +52,19 @@ def reproduce(
 
     Args:
         root: the directory for all runs of a budget.
-        out: the directory for pages; all metrics of its runs are there too, as NAME.csv.
+        out: the directory for pages, OUT/BUDGET/NAME.md; all metrics of its runs are there too, as NAME.csv.
 
     Raises:
         LareError: there is no such exhibit, rliable is not there, or one of the runs failed.
     """
     command = f"lare reproduce {name} --budget {budget.name}"
-    if name in UNTRAINED:
-        return write_page(UNTRAINED[name](budget, command), out)
-    if name not in EXHIBITS:
+    if name not in NAMES:
         raise LareError(f"no exhibit {name!r}; the exhibits are {', '.join(NAMES)}")
-    rliable()  # rather now than after an evening
+    # What would fail after an evening fails now.
+    place = room_for(out / budget.name, name)
+    if name in UNTRAINED:
+        return write_page(UNTRAINED[name](budget, command), place)
+    rliable()
     exhibit = EXHIBITS[name]
     jobs = trained.jobs_of(exhibit, budget, root / budget.name)
     every = [job for of_task in jobs.values() for some in of_task.values() for job in some]
@@ -71,6 +75,20 @@ def reproduce(
     if failed:
         names = ", ".join(job.name for job in failed)
         raise LareError(f"{len(failed)} of {len(every)} runs failed, so there is no page: {names}")
-    page = write_page(trained.page_of(exhibit, budget, jobs, command), out)
-    write_table(rows_of(job.directory for job in every), out / name)
-    return page
+    page = trained.page_of(exhibit, budget, jobs, command)
+    write_table(rows_of(job.directory for job in every), place / name)
+    return write_page(page, place)
+
+
+def room_for(directory: Path, name: str) -> Path:
+    """A directory in which a page and its table can be written. Raises `LareError` where they can not."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for path in (directory / f"{name}.md", directory / f"{name}.csv"):
+            if path.exists():
+                path.open("a").close()
+        with TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        raise LareError(f"nothing can be written into {directory}: {error.strerror}") from error
+    return directory

@@ -7,16 +7,34 @@ import numpy as np
 
 from lare.credit.methods import Encoder, find_method
 from lare.experiments import figures
+from lare.experiments.jobs import Job, job_of
 from lare.experiments.paper.budgets import Budget
-from lare.experiments.paper.exhibits import ERROR, RETURN, TRAVELLED, Claim, Contender, Exhibit
+from lare.experiments.paper.exhibits import ERROR, TRAVELLED, Claim, Contender, Exhibit
 from lare.experiments.paper.pages import Page, items, table
-from lare.experiments.statistics import REPETITIONS, Comparison, Estimate, compare, improvement, rounded
-from lare.experiments.sweep import Job, job_of
+from lare.experiments.statistics import (
+    REPETITIONS,
+    RETURN,
+    Comparison,
+    Group,
+    chance_of_as_many,
+    compare,
+    pairs_won,
+    rounded,
+)
 from lare.tasks.spec import load_task
 from lare.training.run import Run, read_config
 from lare.training.settings import Settings
 
 CORRELATION = "credit/correlation"
+
+LEVEL = 0.025
+"""A claim counts as decided where luck alone would give as many pairs at most so often."""
+JUDGED = (
+    "So many pairs of runs, one of each, in which it is so (a run is a seed; where both have several draws, a draw, mean over its "
+    f"seeds). p: the chance of as many or more by luck, over all tasks, exact (Mann and Whitney). Decided at {LEVEL}, for it or "
+    "against it, each claim by itself: of twenty where there is no difference, one would be. Three seeds on one task decide "
+    "nothing: p is 0.05 at least."
+)
 
 OF_ONE_AGENT = (
     "Factors judge the observation that a step led to, but for Reacher-v4, whose own reward looks at the one before (the paper: "
@@ -40,17 +58,17 @@ def tasks_of(exhibit: Exhibit, budget: Budget) -> tuple[str, ...]:
 def jobs_of(exhibit: Exhibit, budget: Budget, root: Path) -> Jobs:
     """Every run that an exhibit needs. Exhibits that need the same one share it."""
     return {
-        name: {one.label: list(jobs_of_contender(one, exhibit, budget, name, root)) for one in exhibit.contenders}
+        name: {one.label: list(jobs_of_contender(one, budget, name, root)) for one in exhibit.contenders}
         for name in tasks_of(exhibit, budget)
     }
 
 
-def jobs_of_contender(one: Contender, exhibit: Exhibit, budget: Budget, name: str, root: Path) -> Iterator[Job]:
+def jobs_of_contender(one: Contender, budget: Budget, name: str, root: Path) -> Iterator[Job]:
     task = load_task(name)
     steps = budget.steps_of_many if task.particles else budget.steps
     usual = {"method": one.method, "algorithm": one.algorithm, "steps": steps, "seeds": budget.seeds}
     latent = find_method(one.method).encoder is Encoder.LATENT
-    for draw in range(min(exhibit.draws, budget.draws, one.draws) if latent else 1):
+    for draw in range(min(budget.draws, one.draws) if latent else 1):
         yield job_of(root, task, Settings(**{**one.settings, **budget.settings, **usual, "draw": draw}))
 
 
@@ -72,9 +90,8 @@ def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
         protocol([run for of_task in runs.values() for some in of_task.values() for run in some]),
         *(part for name in jobs for part in of_one_task(exhibit, name, runs[name], found[name])),
         "## What the paper says, and what came out",
-        table(["the paper", *found], (claimed(*pair, exhibit, found) for pair in pairs(exhibit.claims))),
-        "The probability that a run of the one has more than a run of the other, with its 95% interval; open where the interval "
-        "holds 0.5, and where there are fewer than three seeds.",
+        table(["the paper", *found, "p", "here"], (claimed(*pair, exhibit, found) for pair in pairs(exhibit.claims))),
+        JUDGED,
         "## What differs from the paper",
         items(differences(exhibit, budget, runs)),
     ]
@@ -90,8 +107,11 @@ def differences(exhibit: Exhibit, budget: Budget, runs: Mapping[str, Mapping[str
     one_agent = not any(
         run.config.task.particles for of_task in runs.values() for some in of_task.values() for run in some
     )
-    if one_agent and budget.steps is not None:
-        yield f"Environment steps: {budget.steps:,} (the paper: 1,000,000)."
+    steps, theirs = (budget.steps, 1_000_000) if one_agent else (budget.steps_of_many, 2_050_000)
+    if steps is not None:
+        yield f"Environment steps: {steps:,} (the paper: {theirs:,})."
+    if budget.settings:
+        yield "**Networks of a few units, small batches, two episodes in an evaluation: it runs, and learns nothing.**"
     yield from exhibit.differences
     yield from OF_ONE_AGENT if one_agent else ()
     yield from ALWAYS
@@ -128,7 +148,7 @@ def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], 
     beside = ["the paper"] if printed else [] if key == ERROR else ["error of the proxy reward", "its correlation"]
     several = len(runs) and max(len(some) for some in runs.values()) > 1
     head = ["", f"{meaning(key)}: IQM [95%]", "mean ± sd", *(["mean [95%] over draws"] if several else []), *beside]
-    rows = []
+    step, rows = int(found.curves[found.rows[0].label].x[-1]), []
     for row in found.rows:
         cells = [
             row.label,
@@ -140,27 +160,27 @@ def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], 
         if printed:
             cells.append(printed.get(row.label, "-"))
         elif key != ERROR:
-            cells += [spread(runs[row.label], ERROR), spread(runs[row.label], CORRELATION)]
+            cells += [spread(runs[row.label], of_credit, step) for of_credit in (ERROR, CORRELATION)]
         rows.append(cells)
     yield table(head, rows)
+    few = " (of fewer than four it is the mean)" if min(row.seeds for row in found.rows) < 4 else ""
     yield (
-        f"At step {int(found.curves[found.rows[0].label].x[-1]):,}. IQM: interquartile mean, its interval by {REPETITIONS:,} "
-        "stratified bootstraps over the seeds; sd: standard deviation over the seeds."
+        f"At step {step:,}. IQM: interquartile mean over the seeds{few}, its interval by {REPETITIONS:,} stratified bootstraps; "
+        "sd: standard deviation over the seeds."
     )
 
 
-def spread(runs: Iterable[Run], key: str) -> str:
-    """Mean and standard deviation at the last evaluation, over seeds and draws; a dash where there is none."""
-    values = [line[key] for run in runs for line in last_lines(run) if line.get(key) is not None]
-    if not values:
+def spread(runs: Sequence[Run], key: str, step: int) -> str:
+    """Mean and standard deviation over the seeds at a step, each seed a mean over its draws; a dash where there is none."""
+    by_seed: dict[int, list[float]] = {}
+    for line in (line for run in runs for line in run.metrics()):
+        if line["step"] == step and line.get(key) is not None:
+            by_seed.setdefault(line["seed"], []).append(line[key])
+    if not by_seed:
         return "-"
+    values = [np.mean(values) for values in by_seed.values()]
     deviation = float(np.std(values, ddof=min(1, len(values) - 1)))
     return f"{rounded(float(np.mean(values)), deviation)} ± {rounded(deviation, deviation)}"
-
-
-def last_lines(run: Run) -> Iterator[dict]:
-    lines = run.metrics()
-    return (line for line in lines if line["step"] == lines[-1]["step"])
 
 
 def meaning(key: str) -> str:
@@ -177,14 +197,30 @@ def pairs(claims: Iterable[Claim]) -> Iterator[tuple[str, str]]:
 
 
 def claimed(better: str, worse: str, exhibit: Exhibit, found: Mapping[str, Comparison]) -> list[str]:
-    """A row: what is claimed, and whether it is so on each task."""
-    than = "errs more than" if exhibit.key == ERROR else "is above"
-    chances = [(improvement(one.last[better], one.last[worse]), len(one.last[better])) for one in found.values()]
-    return [f"{better} {than} {worse}", *(f"{verdict(chance, seeds)}, {chance}" for chance, seeds in chances)]
+    """A row: what is claimed, in how many pairs of runs it is so on each task, and what that says of all of them."""
+    pairs = [units(one.groups[better], one.groups[worse]) for one in found.values()]
+    if exhibit.key == ERROR:
+        pairs = [(-ours, -theirs) for ours, theirs in pairs]
+    counts = [f"{pairs_won(ours, theirs):g} of {len(ours) * len(theirs)}" for ours, theirs in pairs]
+    chance = chance_of_as_many(pairs)
+    decided = verdict(chance, chance_of_as_many([(theirs, ours) for ours, theirs in pairs]))
+    return [
+        f"{better} {'errs less than' if exhibit.key == ERROR else 'is above'} {worse}",
+        *counts,
+        f"{chance:.3f}",
+        decided,
+    ]
 
 
-def verdict(chance: Estimate, seeds: int) -> str:
-    """Of a claim, by the probability of improvement. Of fewer than three seeds nothing can be said."""
-    if seeds < 3 or chance.low <= 0.5 <= chance.high:
-        return "open"
-    return "yes" if chance.low > 0.5 else "the other way round"
+def units(one: Group, other: Group) -> tuple[np.ndarray, np.ndarray]:
+    """What two labels are compared by at the last step: their draws where both have several, else their seeds."""
+    axis = 1 if min(len(one.draws), len(other.draws)) > 1 else 0
+    ours, theirs = (group.scores[..., 0, -1].mean(axis=axis) for group in (one, other))
+    return ours, theirs
+
+
+def verdict(chance: float, contrary: float) -> str:
+    """Of a claim, by the chances of as many pairs for it and against it."""
+    if chance <= LEVEL:
+        return "yes"
+    return "the other way round" if contrary <= LEVEL else "open"

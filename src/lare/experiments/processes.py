@@ -1,0 +1,133 @@
+"""Runs on this machine: each a process of its own on cores of its own, which outlives nobody."""
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+
+from lare.errors import LareError
+from lare.experiments.jobs import Job, as_json, train_one
+from lare.training.run import Busy
+
+PATIENCE = 60.0
+"""Seconds that a run is waited for, which another process has just been told to end."""
+
+
+def in_processes(
+    jobs: Sequence[Job], processes: int, cores: int, said: Callable[[str], None]
+) -> Generator[tuple[Job, str | None], None, None]:
+    """Train, so many at a time; gives each job as it ends, and what went wrong.
+
+    Whoever stops listening stops all of them: those under way save themselves first.
+
+    Raises:
+        LareError: there are not as many cores.
+    """
+    slots: queue.Queue[list[int]] = queue.Queue()
+    for share in shares(processes, cores):
+        slots.put(share)
+    running: set[subprocess.Popen] = set()
+
+    def train(job: Job) -> str | None:
+        share = slots.get()
+        said(f"{job.name} begins" + (f" again at step {job.step()}" if job.begun else ""))
+        try:
+            return in_a_process(job, share, running)
+        finally:
+            slots.put(share)
+
+    pool = ThreadPoolExecutor(processes)
+    futures = {pool.submit(train, job): job for job in jobs}
+    try:
+        yield from ((futures[future], future.result()) for future in as_completed(futures))
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in list(running):
+            process.send_signal(signal.SIGINT)
+        pool.shutdown()
+
+
+def shares(processes: int, cores: int) -> list[list[int]]:
+    """Which cores each process gets; none in particular where the system cannot say.
+
+    Raises:
+        LareError: there are not as many.
+    """
+    if not hasattr(os, "sched_getaffinity"):
+        return [[] for _ in range(processes)]
+    usable = sorted(os.sched_getaffinity(0))
+    if processes * cores > len(usable):
+        raise LareError(
+            f"processes = {processes} of cores = {cores} are {processes * cores} cores, and this machine lends {len(usable)}"
+        )
+    return [usable[place * cores : (place + 1) * cores] for place in range(processes)]
+
+
+def in_a_process(job: Job, cores: list[int], running: set[subprocess.Popen]) -> str | None:
+    """Train one run in a process of its own; returns what went wrong. What the process says is in RUN.log."""
+    job.directory.parent.mkdir(parents=True, exist_ok=True)
+    log = job.directory.with_name(job.directory.name + ".log")
+    order = json.dumps({"job": as_json(job), "cores": cores})
+    with log.open("a", encoding="utf-8") as file:
+        command = [sys.executable, "-m", "lare.experiments.processes"]
+        # In a session of its own, so that Ctrl-C reaches it once, through us.
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=file, stderr=file, text=True, start_new_session=True
+        )
+        running.add(process)
+        assert process.stdin is not None
+        try:
+            with contextlib.suppress(BrokenPipeError), process.stdin:  # which stays open as long as this process lives
+                process.stdin.write(order + "\n")
+                process.stdin.flush()
+                process.wait()
+            process.wait()
+        finally:
+            running.discard(process)
+    if process.returncode == 0:
+        return None
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines() or [f"exit status {process.returncode}"]
+    return f"{lines[-1]} ({log})"
+
+
+def main() -> None:
+    """What `in_a_process` starts: one run, told in the first line of standard input. The end of it is that of who asked."""
+    order = json.loads(sys.stdin.readline())
+    threading.Thread(target=end_with_the_input, daemon=True).start()
+    if order["cores"]:
+        os.sched_setaffinity(0, order["cores"])
+    try:
+        patiently(order["job"])
+    except LareError as error:
+        sys.stderr.write(f"{error}\n")
+        sys.exit(2)
+
+
+def end_with_the_input() -> None:
+    """Save and stop, as after Ctrl-C, when nobody is there any more who wanted this run."""
+    while os.read(0, 1):  # past Python's buffer, whose lock would be held at the end
+        pass
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def patiently(order: dict) -> None:
+    """Train, as soon as a process that was there before has let go of the run."""
+    until = time.monotonic() + PATIENCE
+    while True:
+        try:
+            return train_one(order)
+        except Busy:
+            if time.monotonic() > until:
+                raise
+            time.sleep(1)
+
+
+if __name__ == "__main__":
+    main()
