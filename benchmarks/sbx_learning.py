@@ -113,6 +113,9 @@ def main(
         warmup: random steps before the first update; ppo has none.
     """
     every = evaluate_every or (10_000 if algorithm == "ppo" else 5000)
+    turn = int(PPO["n_steps"]) if algorithm == "ppo" else 1
+    if every % turn or steps % every:
+        raise SystemExit(f"steps = {steps} must be a multiple of evaluate-every = {every}, and that one of {turn}")
     out.mkdir(parents=True)
     settings = {"steps": steps, "seeds": seeds}
     (out / "config.json").write_text(
