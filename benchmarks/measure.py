@@ -123,6 +123,6 @@ def new_session(directory: Path, task_name: str, settings: lare.Settings) -> Ses
 
 def advance(session: Session, steps: int) -> None:
     """`steps` environment steps of each seed, to the last computation."""
-    for _ in range(steps // session.settings.chunk):
+    for _ in range(steps // session.settings.turn):
         session.advance()
     jax.block_until_ready(session.learner)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import jax
 import tyro
-from measure import interleave, new_session, show, summary, write
+from measure import advance, interleave, new_session, show, summary, write
 
 import lare
 from lare.algorithms.table import ALGORITHMS, Kind
@@ -36,15 +36,8 @@ def session(directory: Path, algorithm: str, method: str) -> Session:
         **{"method": method, "algorithm": algorithm, "seed": SEED, "evaluation_episodes": 1, **figures}
     )
     started = new_session(directory / method, TASK, settings)
-    go_on(started, BEFORE)
+    advance(started, BEFORE)
     return started
-
-
-def go_on(of: Session, steps: int) -> None:
-    """So many environment steps, to the last computation."""
-    for _ in range(steps // of.settings.turn):
-        of.advance()
-    jax.block_until_ready(of.learner)
 
 
 def main(rounds: int = 3, steps: int = 500, algorithms: tuple[str, ...] = tuple(ONE_AGENT)) -> None:
@@ -60,7 +53,7 @@ def main(rounds: int = 3, steps: int = 500, algorithms: tuple[str, ...] = tuple(
         of_turn = ROLLOUT if ALGORITHMS[algorithm].kind is Kind.ON_POLICY else steps
         with tempfile.TemporaryDirectory() as place:
             sessions = {method: session(Path(place), algorithm, method) for method in FITTING}
-            turns = {method: partial(go_on, one, of_turn) for method, one in sessions.items()}
+            turns = {method: partial(advance, one, of_turn) for method, one in sessions.items()}
             tables[algorithm] = summary(interleave(turns, rounds), of_turn, "dense")
             for one in sessions.values():
                 one.close()

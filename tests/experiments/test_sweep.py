@@ -169,17 +169,10 @@ KILLED = FILE.replace('"dense", ', "").replace("[0, 3]", "[0]").replace("steps =
 def test_a_sweep_that_is_stopped_or_killed_leaves_a_saved_run_and_nobody_behind(number, file, tmp_path):
     """Ctrl-C reaches the whole group of processes, as in a terminal; the others reach the sweep alone."""
     file.write_text(KILLED)
-    main = "from lare.cli import main; main()"
-    command = [sys.executable, "-c", main, "sweep", str(file)]
-    sweeping = subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        # Where these tests run in the background of a shell, what they start would be deaf to Ctrl-C.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+    # Where these tests run in the background of a shell, what they start would be deaf to Ctrl-C.
+    hearing = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{hearing}; from lare.cli import main; main()", "sweep", str(file)]
+    sweeping = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
     (job,) = read_sweep(file)[1]
     until = time.monotonic() + 120
     while not job.begun or job.step() < 200:

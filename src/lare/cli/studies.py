@@ -87,13 +87,17 @@ def reproduce(
         show(("exhibit", "of the paper", "what it shows"), paper.listed())
         return
     share = Share(processes=processes, cores=cores)
+
+    def make(name: str) -> None:
+        say(f"wrote {paper.reproduce(name, BUDGETS[budget], share, runs, out, ray, watching)}")
+
     if exhibit != "all":
-        say(f"wrote {paper.reproduce(exhibit, BUDGETS[budget], share, runs, out, ray, watching)}")
+        make(exhibit)
         return
     failed = 0
     for name in paper.NAMES:
         try:
-            say(f"wrote {paper.reproduce(name, BUDGETS[budget], share, runs, out, ray, watching)}")
+            make(name)
         except Interrupted:
             raise
         except LareError as error:  # one that fails is no reason to leave the others out

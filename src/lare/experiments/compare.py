@@ -7,8 +7,8 @@ from pathlib import Path
 from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.html import note, table, write_page
-from lare.experiments.statistics import REFERENCES, REPETITIONS, Band, Comparison, by_label, compare, rounded
-from lare.training.run import CONFIG, Run, read_config
+from lare.experiments.statistics import REFERENCES, REPETITIONS, Band, Comparison, by_label, compare, plus_minus
+from lare.training.run import CONFIG, Run, read_measured
 
 HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "better than first [95%]")
 
@@ -24,8 +24,7 @@ def find_runs(places: Sequence[Path]) -> list[Run]:
         found = [place] if (place / CONFIG).is_file() else sorted(path.parent for path in place.glob(f"*/*/{CONFIG}"))
         if not found:
             raise LareError(f"{place} is no run, and there is none in it")
-        # What they measured is all that is needed of them: their functions are left alone.
-        runs += [Run(directory, read_config(directory), ()) for directory in found]
+        runs += map(read_measured, found)
     return runs
 
 
@@ -37,7 +36,7 @@ def cells(comparison: Comparison) -> list[tuple[str, ...]]:
             str(row.seeds),
             str(row.draws),
             str(row.iqm),
-            f"{rounded(row.mean, row.deviation)} ± {rounded(row.deviation, row.deviation)}",
+            plus_minus(row.mean, row.deviation),
             "-" if row.over_draws is None else str(row.over_draws),
             "-" if row.better is None else str(row.better),
         )

@@ -11,6 +11,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -52,6 +53,11 @@ def rounded(number: float, spread: float) -> str:
     """A number to three digits of its spread, or to three places where it has none."""
     places = 3 if spread <= 0 else min(max(2 - math.floor(math.log10(spread)), 0), 3)
     return f"{number:.{places}f}"
+
+
+def plus_minus(mean: float, deviation: float) -> str:
+    """A mean and its standard deviation."""
+    return f"{rounded(mean, deviation)} ± {rounded(deviation, deviation)}"
 
 
 @dataclass(frozen=True)
@@ -161,6 +167,7 @@ def grouped(runs: Mapping[str, Sequence[Run]], key: str) -> tuple[list[Group], t
         )
     curves: dict[tuple[str, str, int, int], tuple[Run, dict[int, float]]] = {}
     for label, run in ((label, run) for label, of_label in runs.items() for run in of_label):
+        lines = run.metrics()
         for seed in run.seeds:
             place = (label, run.config.task.name, run.config.settings.draw, seed)
             if place in curves:
@@ -168,7 +175,7 @@ def grouped(runs: Mapping[str, Sequence[Run]], key: str) -> tuple[list[Group], t
                 raise LareError(
                     f"{run.directory} and {other} are both {label} on {place[1]} with seed {seed}: leave one out"
                 )
-            curves[place] = run, curve(run, seed, key)
+            curves[place] = run, curve(lines, seed, key)
     steps = sorted(set.intersection(*(set(values) for _, values in curves.values())))
     if not steps:
         raise LareError("the runs have no step in common at which all of them were evaluated")
@@ -189,11 +196,9 @@ def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[
     return Group(label, tuple(seeds), tuple(draws), tuple(steps), np.array(scores))
 
 
-def curve(run: Run, seed: int, key: str = RETURN) -> dict[int, float]:
+def curve(lines: Sequence[Mapping[str, Any]], seed: int, key: str) -> dict[int, float]:
     """What was measured, by step."""
-    return {
-        line["step"]: float(line[key]) for line in run.metrics() if line["seed"] == seed and line.get(key) is not None
-    }
+    return {line["step"]: float(line[key]) for line in lines if line["seed"] == seed and line.get(key) is not None}
 
 
 def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:

@@ -30,8 +30,12 @@ class Episode:
 
     observation: Float[np.ndarray, "steps_and_one observation"]
     action: Float[np.ndarray, "steps action"]
-    total: float
-    """R."""
+    reward: Float[np.ndarray, " steps"]
+
+    @property
+    def total(self) -> float:
+        """R."""
+        return float(sum(self.reward))
 
 
 def episodes_of(task: TaskSpec, policy: Policy | None = None, count: int = EPISODES, seed: int = 0) -> list[Episode]:
@@ -41,15 +45,17 @@ def episodes_of(task: TaskSpec, policy: Policy | None = None, count: int = EPISO
     found = []
     for number in range(count):
         observation, _ = environment.reset(seed=seed + number)
-        observations, actions, total, ended = [observation], [], 0.0, False
+        observations, actions, rewards, ended = [observation], [], [], False
         while not ended:
             action = environment.action_space.sample() if policy is None else policy(observation)
             observation, reward, terminated, truncated, _ = environment.step(action)
             observations.append(observation)
             actions.append(action)
-            total += float(reward)
+            rewards.append(float(reward))
             ended = terminated or truncated
-        found.append(Episode(np.asarray(observations, np.float32), np.asarray(actions, np.float32), total))
+        found.append(
+            Episode(np.asarray(observations, np.float32), np.asarray(actions, np.float32), np.asarray(rewards))
+        )
     environment.close()
     return found
 

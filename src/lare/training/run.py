@@ -229,6 +229,11 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
         raise LareError(f"{path} is damaged: {error}") from error
 
 
+def read_measured(directory: Path) -> Run:
+    """A run of which only what it measured is wanted: its functions are left alone. Raises `LareError` as `read_config`."""
+    return Run(directory, read_config(directory), ())
+
+
 def open_run(directory: str | Path) -> Run:
     """Read a run directory; its latent function is verified again before anything executes it.
 

@@ -12,8 +12,8 @@ from lare.experiments.paper.budgets import Budget
 from lare.experiments.paper.pages import Page, items, table
 from lare.latent.design import DesignFailed, design, examine
 from lare.latent.function import LatentFunction
+from lare.latent.reflect import episodes_of
 from lare.llm.recording import shipped_recordings
-from lare.tasks.environment import make
 from lare.tasks.particles.table import find_particle_task
 from lare.tasks.particles.task import ACTIONS, STEPS
 from lare.tasks.particles.world import State
@@ -122,18 +122,9 @@ def random_steps(task: TaskSpec, episodes: int) -> Steps:
 
 
 def of_one(task: TaskSpec, episodes: int) -> Steps:
-    environment = make(task.environment, task.max_episode_steps)
-    environment.action_space.seed(0)
-    rows = []
-    for seed in range(episodes):
-        observation, ended = environment.reset(seed=seed)[0], False
-        while not ended:
-            action = environment.action_space.sample()
-            after, reward, terminated, truncated, _ = environment.step(action)
-            rows.append((observation, action, after, reward))
-            observation, ended = after, terminated or truncated
-    environment.close()
-    return Steps(*(np.asarray(part, np.float32) for part in zip(*rows, strict=True)))
+    played = episodes_of(task, count=episodes)
+    rows = [(one.observation[:-1], one.action, one.observation[1:], one.reward.astype(np.float32)) for one in played]
+    return Steps(*map(np.concatenate, zip(*rows, strict=True)))
 
 
 def of_agents(name: str, episodes: int) -> Steps:

@@ -22,14 +22,13 @@ class Page:
 
 
 def write_page(page: Page, directory: Path) -> Path:
-    """Write a page and its pictures, and keep the remarks of the one before.
+    """Write a page and its pictures into a directory that is there, and keep the remarks of the one before.
 
     Raises:
         LareError: they cannot be written.
     """
     path = directory / f"{page.name}.md"
     try:
-        directory.mkdir(parents=True, exist_ok=True)
         before = path.read_text(encoding="utf-8") if path.exists() else ""
         remarks = before[before.index(REMARKS) :] if REMARKS in before else ""
         for name, svg in page.pictures.items():

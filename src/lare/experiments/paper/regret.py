@@ -1,7 +1,7 @@
 """Propositions 1 and 2 of the paper on small tabular problems: does the bound hold, and does the latent regret grow?"""
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import jax
 import numpy as np
@@ -12,7 +12,7 @@ from lare.experiments import figures
 from lare.experiments.figures import Points
 from lare.experiments.paper.budgets import Budget
 from lare.experiments.paper.pages import Page, items, table
-from lare.experiments.statistics import rounded
+from lare.experiments.statistics import plus_minus
 from lare.theory import History, Table
 
 TITLE = "Regret with a latent table, and with a raw one"
@@ -91,17 +91,17 @@ def row(redundant: int, history: History, latent: float) -> list[str]:
     return [
         label(redundant),
         str(Table(CORES, redundant, ACTIONS).size),
-        f"{rounded(mean, deviation)} ± {rounded(deviation, deviation)}",
+        plus_minus(mean, deviation),
         f"{mean / latent:.2f}",
         f"{float(history.radius[0, -1]):.1f}",
         f"{float(np.max(np.asarray(history.error / history.radius))):.2f}",
-        held([history]),
+        held(history),
     ]
 
 
-def held(histories: Iterable[History]) -> str:
+def held(history: History) -> str:
     """In how many runs the bound held at every episode."""
-    always = np.concatenate([np.asarray(theory.coverage(history)) == 1 for history in histories])
+    always = np.asarray(theory.coverage(history)) == 1
     return f"{always.sum()} of {always.size}"
 
 

@@ -19,10 +19,10 @@ from lare.experiments.statistics import (
     chance_of_as_many,
     compare,
     pairs_won,
-    rounded,
+    plus_minus,
 )
 from lare.tasks.spec import load_task
-from lare.training.run import Run, read_config
+from lare.training.run import Run, read_measured
 from lare.training.settings import Settings
 
 CORRELATION = "credit/correlation"
@@ -79,34 +79,33 @@ def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
         LareError: the runs do not make up a whole table.
     """
     runs = {
-        name: {label: [opened(job) for job in some] for label, some in of_task.items()}
+        name: {label: [read_measured(job.directory) for job in some] for label, some in of_task.items()}
         for name, of_task in jobs.items()
     }
+    every = [run for of_task in runs.values() for some in of_task.values() for run in some]
+    one_agent = not any(run.config.task.particles for run in every)
     found = {name: compare(of_task, exhibit.measure(name)) for name, of_task in runs.items()}
     pictures = {f"{exhibit.name}-{name}.svg": picture(one, exhibit.measure(name)) for name, one in found.items()}
     parts = [
         f"# {exhibit.title}",
         f"The paper's {exhibit.source}, by `{command}`.",
-        protocol([run for of_task in runs.values() for some in of_task.values() for run in some]),
+        protocol(every),
         *(part for name in jobs for part in of_one_task(exhibit, name, runs[name], found[name])),
         "## What the paper says, and what came out",
         table(["the paper", *found, "p", "here"], (claimed(*pair, exhibit, found) for pair in pairs(exhibit.claims))),
         JUDGED,
         "## What differs from the paper",
-        items(differences(exhibit, budget, runs)),
+        items(differences(exhibit, budget, len(runs), one_agent)),
     ]
     return Page(exhibit.name, "\n\n".join(parts), pictures)
 
 
-def differences(exhibit: Exhibit, budget: Budget, runs: Mapping[str, Mapping[str, Sequence[Run]]]) -> Iterator[str]:
+def differences(exhibit: Exhibit, budget: Budget, tasks: int, one_agent: bool) -> Iterator[str]:
     """From the paper, a sentence each."""
     if budget.name != "paper":
         yield f"Seeds: {budget.seeds} (the paper: 5)."
-        if len(runs) < len(exhibit.tasks):
-            yield f"Tasks: {len(runs)} of {len(exhibit.tasks)}."
-    one_agent = not any(
-        run.config.task.particles for of_task in runs.values() for some in of_task.values() for run in some
-    )
+        if tasks < len(exhibit.tasks):
+            yield f"Tasks: {tasks} of {len(exhibit.tasks)}."
     steps, theirs = (budget.steps, 1_000_000) if one_agent else (budget.steps_of_many, 2_050_000)
     if steps is not None:
         yield f"Environment steps: {steps:,} (the paper: {theirs:,})."
@@ -115,10 +114,6 @@ def differences(exhibit: Exhibit, budget: Budget, runs: Mapping[str, Mapping[str
     yield from exhibit.differences
     yield from OF_ONE_AGENT if one_agent else ()
     yield from ALWAYS
-
-
-def opened(job: Job) -> Run:
-    return Run(job.directory, read_config(job.directory), ())
 
 
 def protocol(runs: Sequence[Run]) -> str:
@@ -146,14 +141,14 @@ def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], 
     yield f"## {name}"
     yield f"![{name}]({exhibit.name}-{name}.svg)"
     beside = ["the paper"] if printed else [] if key == ERROR else ["error of the proxy reward", "its correlation"]
-    several = len(runs) and max(len(some) for some in runs.values()) > 1
+    several = max(len(some) for some in runs.values()) > 1
     head = ["", f"{meaning(key)}: IQM [95%]", "mean ± sd", *(["mean [95%] over draws"] if several else []), *beside]
     step, rows = int(found.curves[found.rows[0].label].x[-1]), []
     for row in found.rows:
         cells = [
             row.label,
             str(row.iqm),
-            f"{rounded(row.mean, row.deviation)} ± {rounded(row.deviation, row.deviation)}",
+            plus_minus(row.mean, row.deviation),
         ]
         if several:
             cells.append("-" if row.over_draws is None else str(row.over_draws))
@@ -180,7 +175,7 @@ def spread(runs: Sequence[Run], key: str, step: int) -> str:
         return "-"
     values = [np.mean(values) for values in by_seed.values()]
     deviation = float(np.std(values, ddof=min(1, len(values) - 1)))
-    return f"{rounded(float(np.mean(values)), deviation)} ± {rounded(deviation, deviation)}"
+    return plus_minus(float(np.mean(values)), deviation)
 
 
 def meaning(key: str) -> str:
