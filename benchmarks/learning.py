@@ -1,4 +1,4 @@
-"""Learning curves: the methods side by side. MuJoCo: 3 seeds, 100 thousand steps; particle tasks: 1000 updates.
+"""Learning curves on MuJoCo: the methods side by side, 3 seeds, 100 thousand steps.
 
     python benchmarks/learning.py run RUNS [TASK/LABEL ...]   train what is missing, go on with the rest
     python benchmarks/learning.py keep RUNS                   copy what is finished to results/learning
@@ -20,7 +20,6 @@ import numpy as np
 import lare
 from lare.credit.decomposition import CreditSettings
 from lare.experiments import figures
-from lare.training.settings import AgentSettings
 
 PUBLISHED = {"credit": CreditSettings(normalise=False)}
 
@@ -40,47 +39,27 @@ HALF_CHEETAH = {
     "lare-rrdu-chunk-1000": {"method": "lare-rrdu", "chunk": 1000},
 }
 OTHERS = {name: HALF_CHEETAH[name] for name in ("lare-rrdu", "rrdu", "dense")}
-MUJOCO = {"steps": 100_000, "seeds": 3}
-
-SMALL: dict[str, dict[str, Any]] = {
-    name: {"method": name} for name in ("lare-rd", "rd", "dense", "lare-rd-shared", "rrd", "episodic", "stas", "arel")
+EXPERIMENTS: dict[str, dict[str, dict[str, Any]]] = {
+    "HalfCheetah-v4": HALF_CHEETAH,
+    "Reacher-v4": OTHERS,
+    "Walker2d-v4": OTHERS,
+    "HumanoidStandup-v4": OTHERS,
 }
-USUAL = AgentSettings()
-FEW = USUAL.model_copy(update={"credit": USUAL.credit.model_copy(update={"steps": 800})})
-for slow in ("stas", "arel"):
-    # 32 episodes in an update of the decoder, not 256: it is 13 to 27 times as expensive as that of the others.
-    SMALL[slow]["agents"] = FEW
-LARGE = {name: SMALL[name] for name in ("lare-rd", "rd", "dense")}
-COMPETITIVE = {name: SMALL[name] for name in ("lare-rd", "rd")}
-
-EXPERIMENTS: dict[str, tuple[dict[str, int], dict[str, dict[str, Any]]]] = {
-    "HalfCheetah-v4": (MUJOCO, HALF_CHEETAH),
-    "Reacher-v4": (MUJOCO, OTHERS),
-    "Walker2d-v4": (MUJOCO, OTHERS),
-    "HumanoidStandup-v4": (MUJOCO, OTHERS),
-    **dict.fromkeys(("CN-6", "PP-6", "TriangleArea"), ({"seeds": 3}, SMALL)),
-    **dict.fromkeys(("CN-15", "PP-15", "CN-30", "PP-30"), ({"seeds": 1}, LARGE)),
-    "CompetitivePP-6": ({"seeds": 3}, COMPETITIVE),
-}
-"""For each task what all of its runs have in common, and what each run has."""
+"""For each task the runs, and the settings of each."""
+COMMON: dict[str, Any] = {"steps": 100_000, "seeds": 3}
 KEPT = Path(__file__).parent / "results" / "learning"
-PICTURED = (
-    *("lare-rrdu", "lare-rrdu-published", "rrdu", "rrdu-published", "dense", "episodic"),
-    *("lare-rd", "rd", "lare-rd-shared", "rrd", "stas", "arel"),
-)
-"""As many as there are colours, for any of the tasks."""
+PICTURED = ("lare-rrdu", "lare-rrdu-published", "rrdu", "rrdu-published", "dense", "episodic", "lare-rd", "rd")
 
 
 def run(directory: Path, wanted: list[str]) -> None:
-    names = [f"{task}/{label}" for task, (_, labels) in EXPERIMENTS.items() for label in labels]
+    names = [f"{task}/{label}" for task, labels in EXPERIMENTS.items() for label in labels]
     for name in wanted or names:
         task, label = name.split("/")
         out = directory / name
         if out.exists():
             lare.resume(out)
         else:
-            common, labels = EXPERIMENTS[task]
-            lare.train(task, lare.Settings(**common, **labels[label]), out=out)
+            lare.train(task, lare.Settings(**COMMON, **EXPERIMENTS[task][label]), out=out)
 
 
 def keep(directory: Path) -> None:

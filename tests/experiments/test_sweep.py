@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -160,6 +161,13 @@ def test_on_a_local_ray(file, tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stderr.splitlines()[-1] == "1 of 1: Reacher-v4/lare-linear-td3-draw0 is done"
     assert read_sweep(file)[1][0].done
+
+
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parents[2] / "benchmarks").glob("sweeps/*.toml")), ids=lambda path: path.stem
+)
+def test_the_sweeps_of_the_benchmarks_can_be_trained(path):
+    assert read_sweep(path)[1]
 
 
 KILLED = FILE.replace('"dense", ', "").replace("[0, 3]", "[0]").replace("steps = 200", "steps = 100_000")

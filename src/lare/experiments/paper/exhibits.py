@@ -78,7 +78,7 @@ FEW_EPISODES = {"agents": USUAL.model_copy(update={"credit": USUAL.credit.model_
 AREL = Contender("AREL", "arel", settings=FEW_EPISODES)
 STAS = Contender("STAS", "stas", settings=FEW_EPISODES)
 ATTENTION = "AREL and STAS are fitted on 32 episodes at a time instead of 256: all 256 take 77 and 156 minutes a seed."
-AGENTS = (DENSE, EPISODIC, RD, AREL, STAS, LARE_RD, SHARED)
+AGENTS = (DENSE, EPISODIC, RD, RRD, AREL, STAS, LARE_RD, SHARED)
 ABOVE_AGENTS = Claim("LaRe-RD", ("episodic", "RD", "AREL", "STAS", "LaRe without agent decomposition"))
 
 
