@@ -14,6 +14,7 @@ from typing import Any
 import jax
 
 import lare
+from lare.source import source
 from lare.training.run import create
 from lare.training.settings import decide
 from lare.training.single_agent import Session, start
@@ -94,7 +95,7 @@ def write(name: str, figures: Mapping[str, Any]) -> None:
 
 def provenance() -> dict[str, Any]:
     """The command, the machine and the versions of all packages that figures depend on."""
-    versions = {"python": platform.python_version()}
+    versions = {"lare": source(), "python": platform.python_version()}
     for package in PACKAGES:
         try:
             versions[package] = version(package)

@@ -1,6 +1,6 @@
 """The run directory: what a run leaves on the disk, and reading it again.
 
-config.json          every setting, the package version, the spec's and the function's hash
+config.json          every setting, versions and commit, the spec's and the function's hash
 latent_function.py   the phi in use, and .json: replies, checks; where teams learn, latent_function_TEAM.py
 metrics.jsonl        one JSON object a line, for each seed and evaluation
 checkpoint/          see checkpoint.py
@@ -21,10 +21,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-import lare
 from lare.errors import Checked, LareError
 from lare.latent.evaluator import LatentRewardError
 from lare.latent.function import LatentFunction, load
+from lare.source import source
 from lare.tasks.spec import Judges, TaskSpec, is_discrete, time_limit
 from lare.training.checkpoint import STATE, write_atomically
 from lare.training.settings import Plan
@@ -40,7 +40,7 @@ class Config(Checked):
     """config.json."""
 
     lare: str
-    """Version of the package."""
+    """Version of the package, and the commit in a checkout."""
     settings: Plan
     task: TaskSpec
     task_sha256: str
@@ -73,7 +73,7 @@ def describe(task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) ->
             f"agents.capacity = {plan.agents.capacity} is less than the {plan.agents.episodes} episodes of an update"
         )
     return Config(
-        lare=lare.__version__,
+        lare=source(),
         settings=plan,
         task=task,
         task_sha256=task.digest,

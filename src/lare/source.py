@@ -1,0 +1,29 @@
+"""Which code this is: figures are worth little without it."""
+
+import functools
+import subprocess
+from pathlib import Path
+
+import lare
+
+
+@functools.cache
+def source(directory: Path = Path(__file__).parent) -> str:
+    """Version of the package; in a checkout also the last commit that touched it, and whether it was changed since.
+
+    Where `directory` merely lies in somebody else's repository, as a virtual environment may, that one's commits are not ours.
+    """
+    commit = git(directory, "log", "-1", "--format=%h", "--abbrev=10", "--", ".")
+    if not commit:
+        return lare.__version__
+    changed = git(directory, "status", "--porcelain", "--", ".")
+    return f"{lare.__version__} ({commit}{', changed' if changed else ''})"
+
+
+def git(directory: Path, *arguments: str) -> str:
+    """What git says, or nothing."""
+    try:
+        done = subprocess.run(("git", *arguments), cwd=directory, capture_output=True, text=True, timeout=5, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return done.stdout.strip()
