@@ -14,7 +14,8 @@ from lare.errors import LareError
 from lare.latent.design import design
 from lare.latent.function import load
 from lare.llm import prompts
-from lare.llm.live import Budget, LiveModel
+from lare.llm.budget import Budget
+from lare.llm.live import LiveModel
 from lare.llm.recording import read_recording, shipped_recordings
 from lare.tasks.spec import read_task
 from servers import Server, refuses, says

@@ -95,7 +95,8 @@ def design(
     """
     from lare.latent.design import DesignBroken, DesignFailed
     from lare.latent.design import design as design_function
-    from lare.llm.live import Budget, LiveModel
+    from lare.llm.budget import Budget
+    from lare.llm.live import LiveModel
     from lare.llm.model import RECORDED, recorded_model
     from lare.tasks.spec import load_task
 

@@ -1,40 +1,32 @@
 """A live language model behind any OpenAI-compatible endpoint: OpenAI, vLLM, Ollama, llama.cpp, gateways.
 
-    time-outs    120 s for a reply, all of it, headers too; 8 MB, whatever its status
+    time-outs    see `bounded`
     retries      408, 409, 429, 5xx and broken connections, with back-off or as long as the server says
     structure    asked for as a JSON schema; of servers that know none, as a JSON object; else only in words
-    budget       requests and tokens, counted before each request so that they are never passed
+    budget       see `budget`
     the key      from the environment, into the request, and nowhere else
 
 What a reply says is read by `reply`, whatever way it was asked for.
 """
 
-import importlib
 import json
 import os
-import queue
 import re
-import threading
 import time
-import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from lare.errors import LareError
+from lare.llm.bounded import LARGEST_BODY, TIMEOUT, TooMuch, bound, in_time
+from lare.llm.budget import Budget, BudgetSpent
 from lare.llm.prompts import Message
-
-TIMEOUT = 120.0
-"""Seconds for one reply."""
 
 TRIES = 6
 """Of one request, the first included."""
 
 LONGEST_WAIT = 60.0
 """Seconds between two tries, whatever the server asks for."""
-
-LARGEST_BODY = 8 << 20
-"""Bytes of an answer."""
 
 REPLY_TOKENS, SHORTEST_REPLY = 16_384, 1024
 """The most that a reply may have; halved as long as the model allows less, down to the second."""
@@ -47,9 +39,6 @@ NOT_SENT = ("Connect", *HOPELESS)
 
 PLAIN = {"Accept-Encoding": "identity"}
 """What is not packed needs no room to be unpacked."""
-
-MOST_TOKENS = 1 << 40
-"""A server that counts more does not know what it says."""
 
 SCHEMA = {
     "type": "object",
@@ -71,62 +60,6 @@ LIMITS = ("max_completion_tokens", "max_tokens")
 
 class ModelFailed(LareError):
     """The model could not be asked, or gave nothing that can be read as an answer."""
-
-
-class BudgetSpent(LareError):
-    """The next request might pass the budget."""
-
-
-@dataclass
-class Budget:
-    """What a design may cost, and what it has cost so far."""
-
-    requests: int = 60
-    tokens: int = 400_000
-    requests_made: int = 0
-    tokens_in: int = 0
-    tokens_out: int = 0
-    estimated: bool = False
-    """Whether a server said nothing of tokens, and they were counted as bytes."""
-
-    def allow(self, messages: Sequence[Message]) -> int:
-        """How many tokens the reply to a request may have. No token is shorter than a byte.
-
-        Raises:
-            BudgetSpent: there is no request, or no token, left.
-        """
-        if self.requests_made >= self.requests:
-            raise BudgetSpent(f"the budget of {self.requests} requests is spent")
-        left = self.tokens - self.tokens_in - self.tokens_out - most_tokens(messages)
-        if left < 1:
-            used = self.tokens_in + self.tokens_out
-            raise BudgetSpent(f"the next request might pass the budget of {self.tokens:,} tokens ({used:,} are used)")
-        return left
-
-    def count(self, usage: Any, messages: Sequence[Message], reply: str) -> None:
-        """Add what a reply cost, by the server's own count where it gives one."""
-        try:
-            tokens_in, tokens_out = int(usage["prompt_tokens"]), int(usage["completion_tokens"])
-            if not 0 <= min(tokens_in, tokens_out) <= max(tokens_in, tokens_out) <= MOST_TOKENS:
-                raise ValueError("no number of tokens")
-        except (TypeError, KeyError, ValueError, OverflowError):
-            tokens_in, tokens_out = most_tokens(messages), len(reply.encode(errors="replace"))
-            self.estimated = True
-        self.tokens_in += tokens_in
-        self.tokens_out += tokens_out
-
-    def summary(self, prices: tuple[float, float] | None = None) -> str:
-        """What was used, in a line; `prices` are those of a million tokens in and out."""
-        counted = " (counted as bytes: the server gave no numbers)" if self.estimated else ""
-        text = f"{self.requests_made} requests, {self.tokens_in:,} tokens in, {self.tokens_out:,} out{counted}"
-        if prices is not None:
-            text += f", {(self.tokens_in * prices[0] + self.tokens_out * prices[1]) / 1e6:.4f} by the given prices"
-        return text
-
-
-def most_tokens(messages: Sequence[Message]) -> int:
-    """No request has more tokens than this: one for each byte, and a few around each message."""
-    return sum(len(message["content"].encode(errors="replace")) + 16 for message in messages)
 
 
 @dataclass
@@ -309,63 +242,6 @@ class Failure:
     again: bool
     wait: float | None = 0.0
     """Seconds until the next try; 0 where nobody has said, None where something else is tried at once."""
-
-
-class TooMuch(Exception):
-    """An answer has no end."""
-
-
-def bound(response: Any) -> None:
-    """Let the body of an answer, of whatever status, be read in time and no further than it may go."""
-    # Which HTTP library is beneath depends on the client's version; a stream must be one of its own kind.
-    library = importlib.import_module(type(response).__module__.partition(".")[0])
-
-    class Bounded(library.SyncByteStream):
-        def __init__(self, stream: Any):
-            self.stream = stream
-
-        def __iter__(self) -> Iterator[bytes]:
-            size, deadline = 0, time.monotonic() + TIMEOUT
-            for chunk in self.stream:
-                piece = chunk if unpacked is None else unpacked.decompress(chunk, LARGEST_BODY + 1)
-                size += len(piece)
-                if size > LARGEST_BODY:
-                    raise TooMuch(f"the answer has more than {LARGEST_BODY >> 20} MB")
-                if time.monotonic() > deadline:
-                    raise TimeoutError(f"the answer was not complete after {TIMEOUT:.0f} s")
-                yield piece
-
-        def close(self) -> None:
-            self.stream.close()
-
-    # A few bytes can unpack to gigabytes, so that is done here, no further than the answer may go.
-    packing = response.headers.pop("content-encoding", "identity").strip().lower()
-    if packing not in ("identity", "", "gzip", "deflate"):
-        raise OSError(f"the answer is packed as {packing}, which nobody asked for")
-    unpacked = zlib.decompressobj(47) if packing in ("gzip", "deflate") else None
-    response.stream = Bounded(response.stream)
-
-
-def in_time(fetch: Callable[[], bytes]) -> bytes:
-    """What `fetch` returns or raises. Raises `TimeoutError` where it does neither in time: a server may say its headers letter by
-    letter, and each one starts a socket's clock anew.
-    """
-    outcome: queue.SimpleQueue[tuple[bytes, BaseException | None]] = queue.SimpleQueue()
-
-    def run() -> None:
-        try:
-            outcome.put((fetch(), None))
-        except BaseException as error:
-            outcome.put((b"", error))
-
-    threading.Thread(target=run, daemon=True).start()
-    try:
-        body, error = outcome.get(timeout=1.1 * TIMEOUT)  # the sockets' own clocks come first, and say more
-    except queue.Empty:
-        raise TimeoutError(f"the answer was not complete after {TIMEOUT:.0f} s") from None
-    if error is not None:
-        raise error
-    return body
 
 
 def seconds(retry_after: str | None) -> float:

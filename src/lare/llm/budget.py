@@ -1,0 +1,67 @@
+"""What a design may cost: requests and tokens, counted before each request so that they are never passed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lare.errors import LareError
+from lare.llm.prompts import Message
+
+MOST_TOKENS = 1 << 40
+"""A server that counts more does not know what it says."""
+
+
+class BudgetSpent(LareError):
+    """The next request might pass the budget."""
+
+
+@dataclass
+class Budget:
+    """What a design may cost, and what it has cost so far."""
+
+    requests: int = 60
+    tokens: int = 400_000
+    requests_made: int = 0
+    tokens_in: int = 0
+    tokens_out: int = 0
+    estimated: bool = False
+    """Whether a server said nothing of tokens, and they were counted as bytes."""
+
+    def allow(self, messages: Sequence[Message]) -> int:
+        """How many tokens the reply to a request may have. No token is shorter than a byte.
+
+        Raises:
+            BudgetSpent: there is no request, or no token, left.
+        """
+        if self.requests_made >= self.requests:
+            raise BudgetSpent(f"the budget of {self.requests} requests is spent")
+        left = self.tokens - self.tokens_in - self.tokens_out - most_tokens(messages)
+        if left < 1:
+            used = self.tokens_in + self.tokens_out
+            raise BudgetSpent(f"the next request might pass the budget of {self.tokens:,} tokens ({used:,} are used)")
+        return left
+
+    def count(self, usage: Any, messages: Sequence[Message], reply: str) -> None:
+        """Add what a reply cost, by the server's own count where it gives one."""
+        try:
+            tokens_in, tokens_out = int(usage["prompt_tokens"]), int(usage["completion_tokens"])
+            if not 0 <= min(tokens_in, tokens_out) <= max(tokens_in, tokens_out) <= MOST_TOKENS:
+                raise ValueError("no number of tokens")
+        except (TypeError, KeyError, ValueError, OverflowError):
+            tokens_in, tokens_out = most_tokens(messages), len(reply.encode(errors="replace"))
+            self.estimated = True
+        self.tokens_in += tokens_in
+        self.tokens_out += tokens_out
+
+    def summary(self, prices: tuple[float, float] | None = None) -> str:
+        """What was used, in a line; `prices` are those of a million tokens in and out."""
+        counted = " (counted as bytes: the server gave no numbers)" if self.estimated else ""
+        text = f"{self.requests_made} requests, {self.tokens_in:,} tokens in, {self.tokens_out:,} out{counted}"
+        if prices is not None:
+            text += f", {(self.tokens_in * prices[0] + self.tokens_out * prices[1]) / 1e6:.4f} by the given prices"
+        return text
+
+
+def most_tokens(messages: Sequence[Message]) -> int:
+    """No request has more tokens than this: one for each byte, and a few around each message."""
+    return sum(len(message["content"].encode(errors="replace")) + 16 for message in messages)
