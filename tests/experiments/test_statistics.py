@@ -7,7 +7,7 @@ import pytest
 
 from lare.errors import LareError
 from lare.experiments import statistics
-from lare.experiments.compare import find_runs, write_comparison
+from lare.experiments.compare import cells, find_runs, what_scores_are, write_comparison
 from lare.experiments.statistics import by_label
 from lare.training.run import Run, describe
 from lare.training.settings import Settings, decide
@@ -154,5 +154,15 @@ def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):
     found = find_runs([tmp_path / "runs"])
     assert [run.config.settings.method for run in found] == ["dense", "rd"]
     assert find_runs([tmp_path / "runs" / "Chase" / "a"])[0].directory == found[0].directory
+    assert [run.directory for run in find_runs([tmp_path / "runs" / "Chase"])] == [run.directory for run in found]
     with pytest.raises(LareError, match=r"nothing is no run, and there is none in it$"):
         find_runs([tmp_path / "nothing"])
+
+
+def test_single_seeds_have_no_intervals(made):
+    compared = statistics.compare(by_label([made("a", [-347.3176]), made("b", [2.0], method="rd")]))
+    assert cells(compared) == [
+        ("dense", "1", "1", "-347.3", "-347.3", "-", "-"),
+        ("rd", "1", "1", "2.000", "2.000", "-", "-"),
+    ]
+    assert what_scores_are(compared).endswith(" at step 100, the last at which all runs were evaluated.")

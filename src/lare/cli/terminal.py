@@ -15,6 +15,9 @@ RunDirectory = Annotated[Positional[Path], tyro.conf.arg(metavar="RUN")]
 RunDirectories = Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN")]
 Kind = Literal["factors", "reward"]
 
+WIDTH = 200
+"""Characters in a line of a file."""
+
 
 def legible(text: str) -> str:
     """A text that does not steer the terminal: some of what is printed a stranger has said."""
@@ -26,7 +29,7 @@ def say(text: str) -> None:
 
 
 def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table; its first column is never broken."""
+    """Print a table; its first column is never broken, and none where no terminal says how wide it is."""
     from rich.console import Console
     from rich.table import Table
 
@@ -34,7 +37,7 @@ def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     table.columns[0].no_wrap = True
     for row in rows:
         table.add_row(*row)
-    Console().print(table)
+    Console(width=None if sys.stdout.isatty() else WIDTH).print(table)
 
 
 def progress(text: str) -> None:

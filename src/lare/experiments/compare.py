@@ -14,14 +14,14 @@ HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draw
 
 
 def find_runs(places: Sequence[Path]) -> list[Run]:
-    """The runs that are given, and those in directories that are given, as that of a sweep.
+    """The runs that are given, and those in directories that are given, or one level further down, as in a sweep's.
 
     Raises:
         LareError: there is none in one of them.
     """
     runs = []
     for place in places:
-        found = [place] if (place / CONFIG).is_file() else sorted(path.parent for path in place.glob(f"*/*/{CONFIG}"))
+        found = sorted(path.parent for depth in ("", "*/", "*/*/") for path in place.glob(depth + CONFIG))
         if not found:
             raise LareError(f"{place} is no run, and there is none in it")
         runs += map(read_measured, found)
@@ -46,10 +46,12 @@ def cells(comparison: Comparison) -> list[tuple[str, ...]]:
 
 def what_scores_are(comparison: Comparison) -> str:
     """In a sentence or two."""
+    step = int(comparison.curves[comparison.rows[0].label].x[-1])
+    when = f"at step {step:,}, the last at which all runs were evaluated"
     if not comparison.normalised:
-        return f"Scores are true returns on {comparison.tasks[0]} at the last evaluation that all runs share."
+        return f"Scores are true returns on {comparison.tasks[0]} {when}."
     ends = (f"{task}: 0 is {REFERENCES[task][0]:g}, 1 is {REFERENCES[task][1]:g}" for task in comparison.tasks)
-    return f"Scores are true returns at the last evaluation that all runs share, between fixed ends. {'; '.join(ends)}."
+    return f"Scores are true returns {when}, between fixed ends. {'; '.join(ends)}."
 
 
 def write_comparison(runs: Sequence[Run], out: Path) -> Comparison:
@@ -71,7 +73,7 @@ def body(title: str, comparison: Comparison) -> Iterable[str]:
         what_scores_are(comparison)
         + f" IQM: interquartile mean. Intervals: stratified bootstrap over the seeds, {REPETITIONS} "
         "repetitions; over the draws of the language model where it says draws. sd: standard deviation over the seeds. Better than "
-        "first: the probability that a run scores more than one of the first method."
+        "first: the probability that a run scores more than one of the first method. A single seed has no interval."
     )
     score = "score" if comparison.normalised else "true return"
     yield from figure("Learning", comparison.curves, "environment steps", f"IQM of the {score}", steps=True)

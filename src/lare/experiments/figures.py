@@ -45,8 +45,18 @@ def new_figure(rows: int = 1, height: float = 3.4) -> tuple[Figure, np.ndarray]:
         return figure, figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
 
 
-def curves(by_name: Mapping[str, Curve], label: str, *, from_zero: bool = False) -> str:
-    """Means over seeds as lines, the standard deviation over seeds as a band."""
+def curves(
+    by_name: Mapping[str, Curve],
+    label: str,
+    *,
+    from_zero: bool = False,
+    marks: Mapping[str, float] | None = None,
+    random_until: float = 0,
+) -> str:
+    """Means over seeds as lines, the standard deviation over seeds as a band.
+
+    `marks` are values to measure by, each a dotted line with its name; the steps that random actions took are shaded.
+    """
     figure, (axes,) = new_figure()
     for colour, (name, (steps, values)) in zip(COLOURS * len(by_name), by_name.items(), strict=False):
         mean = values.mean(axis=0)
@@ -56,9 +66,15 @@ def curves(by_name: Mapping[str, Curve], label: str, *, from_zero: bool = False)
             axes.fill_between(steps, mean - spread, mean + spread, color=colour, alpha=0.18, linewidth=0)
     if from_zero:
         axes.set_ylim(bottom=0)
+    for name, value in (marks or {}).items():
+        axes.axhline(value, color="#888888", linewidth=1, linestyle=":")
+        axes.annotate(name, (1, value), (0, 2), axes.get_yaxis_transform(), "offset points", ha="right", fontsize=9)
+    if random_until:
+        axes.axvspan(0, random_until, color="#eeeeee", linewidth=0, zorder=0)
     axes.set(xlabel="environment steps", ylabel=label)
     axes.xaxis.set_major_formatter(in_thousands)
-    legend_above(axes)
+    if len(by_name) > 1:
+        legend_above(axes)
     return svg(figure)
 
 
@@ -72,11 +88,11 @@ Points = Float[np.ndarray, " points"]
 def bands(
     by_name: Mapping[str, tuple[Points, Points, Points, Points]], across: str, up: str, steps: bool = False
 ) -> str:
-    """Curves (x, y), each with an interval (low, high) at every point; `steps` where x counts them."""
+    """Curves (x, y), each with an interval (low, high) at every point. Where x counts no `steps`, y is a share: stairs."""
     figure, (axes,) = new_figure()
     for colour, (name, (x, y, low, high)) in zip(COLOURS * len(by_name), by_name.items(), strict=False):
-        axes.plot(x, y, color=colour, label=name)
-        axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0)
+        axes.plot(x, y, color=colour, label=name, drawstyle="default" if steps else "steps-post")
+        axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if steps else "post")
     axes.set(xlabel=across, ylabel=up)
     if steps:
         axes.xaxis.set_major_formatter(in_thousands)
@@ -84,32 +100,51 @@ def bands(
     return svg(figure)
 
 
+WINDOW = 100
+"""Steps of an episode that can be told apart in a picture."""
+
+
+def window(steps: int) -> slice:
+    """Those that are shown: all, or as many as can be told apart from the middle of a long episode."""
+    first = max(0, (steps - WINDOW) // 2)
+    return slice(first, min(steps, first + WINDOW))
+
+
 def credit(
     reward: Float[np.ndarray, " steps"],
     proxy: Float[np.ndarray, " steps"],
     uncertainty: Float[np.ndarray, " steps"] | None = None,
 ) -> str:
-    """Proxy and true reward of an episode, step by step."""
-    figure, (axes,) = new_figure()
+    """Proxy and true reward of an episode: step by step, and every step as a point."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 3.2), layout="constrained")
+        axes, scatter = figure.subplots(1, 2, width_ratios=(2.1, 1))
+    shown = window(len(reward))
+    x = np.arange(shown.start, shown.stop)
     if uncertainty is not None:
-        band = (proxy - uncertainty, proxy + uncertainty)
-        axes.fill_between(np.arange(len(proxy)), *band, color=COLOURS[0], alpha=0.2, linewidth=0)
+        band = (proxy[shown] - uncertainty[shown], proxy[shown] + uncertainty[shown])
+        axes.fill_between(x, *band, color=COLOURS[0], alpha=0.2, linewidth=0)
         # A band that leaves the picture must not flatten the curves in it.
-        low, high = (pick(np.append(reward, proxy)) for pick in (np.min, np.max))
+        low, high = (pick(np.append(reward[shown], proxy[shown])) for pick in (np.min, np.max))
         axes.set_ylim(low - (high - low), high + (high - low))
-    axes.plot(reward, color="#999999", linewidth=1.6, label="true reward")
-    axes.plot(proxy, color=COLOURS[0], linewidth=0.9, label="proxy reward")
+    axes.plot(x, reward[shown], color="#777777", linewidth=1.8, label="true reward")
+    axes.plot(x, proxy[shown], color=COLOURS[0], linewidth=1.2, label="proxy reward")
     axes.set(xlabel="step of the episode", ylabel="reward")
     legend_above(axes)
+    ends = [pick(np.append(reward, proxy)) for pick in (np.min, np.max)]
+    scatter.plot(ends, ends, color="#999999", linewidth=1)
+    scatter.scatter(reward, proxy, color=COLOURS[0], s=6, alpha=0.4, linewidths=0)
+    scatter.set(xlabel="true reward", ylabel="proxy reward")
     return svg(figure)
 
 
 def courses(factors: Float[np.ndarray, "steps factors"], names: Sequence[str]) -> str:
-    """Each factor over an episode, one under the other."""
-    figure, rows = new_figure(len(names), height=0.5 + 0.95 * len(names))
-    for colour, axes, name, column in zip(COLOURS * len(names), rows, names, factors.T, strict=False):
-        axes.plot(column, color=colour, linewidth=0.9)
-        axes.set_title(name, loc="left", fontsize=10, pad=2)
+    """Each factor over the same steps, one under the other."""
+    figure, rows = new_figure(len(names), height=0.6 + 1.05 * len(names))
+    shown = window(len(factors))
+    for colour, axes, name, column in zip(COLOURS * len(names), rows, names, factors[shown].T, strict=False):
+        axes.plot(np.arange(shown.start, shown.stop), column, color=colour, linewidth=1.1)
+        axes.set_title(name, loc="left", fontsize=10, pad=5)
         axes.tick_params(labelsize=9)
         axes.locator_params(axis="y", nbins=3)
     rows[-1].set_xlabel("step of the episode")

@@ -8,15 +8,19 @@ from typing import Any
 
 import numpy as np
 
-import lare
 from lare.credit.methods import find_method
 from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
 from lare.experiments.credit import DELTA, credit_of, factor_labels
 from lare.experiments.html import function_text, note, table, write_page
+from lare.experiments.statistics import REFERENCES, RETURN
+from lare.source import source
 from lare.training.run import Run, open_run
 from lare.training.settings import Settings, decide
+
+TOP = "True rewards, for a million steps of the best public TD3,"
+"""What the upper ends of `REFERENCES` are."""
 
 
 def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> Path:
@@ -45,6 +49,7 @@ def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> P
         parts.extend(learning(task, chosen))
     for name, run in zip(names, opened, strict=True):
         parts.extend(details(name, run))
+    parts.append(note(f"Drawn by LaRe {source()}."))
     return write_page(path, title, "\n".join(parts))
 
 
@@ -95,7 +100,8 @@ def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
     ]
     explained = (
         "Return: mean true return at the last evaluation. Credit error: mean |proxy reward - "
-        "true reward| over the newest steps; correlation: Pearson's, over the same. ±: standard deviation over seeds."
+        "true reward| over the newest steps; correlation: Pearson's, over the same."
+        + (" ±: standard deviation over seeds." if max(len(run.seeds) for run in runs) > 1 else "")
     )
     return table(head, rows, range(2, 7)) + note(explained)
 
@@ -115,13 +121,30 @@ def learning(task: str, runs: dict[str, Run]) -> Iterable[str]:
         "credit/error": "mean |proxy - true reward|",
         "credit/correlation": "correlation of proxy and true reward",
     }
+    axes = {"credit/error": "reward", "credit/correlation": "correlation"}
+    marks = {"random actions": REFERENCES[task][0]} if task in REFERENCES else {}
+    random = {getattr(run.config.settings.of_algorithm, "warmup", 0) for run in runs.values()}
+    random_until = random.pop() if len(random) == 1 else 0
     for key in shown:
         found = {name: points for name, run in runs.items() if (points := curve(run, key)) is not None}
         if found:
             label = titles.get(key, key.removeprefix("evaluation/"))
             yield f"<h3>{escape(label[0].upper() + label[1:])}</h3>"
-            yield figures.curves(found, label, from_zero=key == "credit/error")
-    yield note("Line: mean over seeds. Band: ± one standard deviation over seeds.")
+            yield figures.curves(
+                found,
+                axes.get(key, label),
+                from_zero=key == "credit/error",
+                marks=marks if key == RETURN else None,
+                random_until=random_until,
+            )
+    explained = [
+        "Line: mean over seeds. Band: ± one standard deviation over seeds."
+        if max(len(run.seeds) for run in runs.values()) > 1
+        else "One seed: another one may end elsewhere.",
+        *(["Grey: random actions, before the first update."] if random_until else []),
+        *([f"{TOP} reach {REFERENCES[task][1]:,g}."] if task in REFERENCES else []),
+    ]
+    yield note(" ".join(explained))
 
 
 def details(name: str, run: Run) -> Iterable[str]:
@@ -139,8 +162,10 @@ def one_agent_details(run: Run) -> Iterable[str]:
     if credit is not None:
         yield f"<h3>Credit over one episode ({len(credit.reward)} steps)</h3>"
         yield figures.credit(credit.reward, credit.proxy, credit.uncertainty)
+        steps = figures.window(len(credit.reward))
         yield note(
-            "The last training episode of the first seed, exploration included, judged by the newest decoder. "
+            "The last training episode of the first seed, exploration included, judged by the newest decoder: "
+            f"steps {steps.start} to {steps.stop}, and all of its steps as points. "
             f"Return {credit.reward.sum():.1f}, sum of the proxy rewards {credit.proxy.sum():.1f}."
             + (
                 ""
@@ -177,7 +202,11 @@ def settings_table(run: Run) -> str:
     """What differs from the defaults in sight, everything else folded away."""
     usual = decide(Settings(), run.config.task)
     chosen, defaults = (flatten(plan.model_dump()) for plan in (run.config.settings, usual))
-    rows = [(key, json.dumps(value)) for key, value in chosen.items() if value != defaults[key] or key == "method"]
+    rows = [
+        (key, value if isinstance(value, str) else json.dumps(value))
+        for key, value in chosen.items()
+        if value != defaults[key] or key in ("method", "algorithm")
+    ]
     config = run.config
     rows.append(("LaRe", f"{config.lare}; {', '.join(f'{name} {number}' for name, number in config.versions.items())}"))
     rows.append(("machine", config.machine))
@@ -185,7 +214,6 @@ def settings_table(run: Run) -> str:
     return (
         table(("setting", "value"), rows)
         + f"<details><summary>Everything (config.json)</summary><pre>{everything}</pre></details>"
-        + note(f"Drawn by LaRe {lare.__version__}.")
     )
 
 

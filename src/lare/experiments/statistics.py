@@ -38,26 +38,36 @@ Scores = Float[np.ndarray, "runs tasks *steps"]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number and its 95% interval."""
+    """A number and its 95% interval; none where the bootstrap has a single run to draw from."""
 
     value: float
     low: float
     high: float
 
     def __str__(self) -> str:
+        if self.low == self.high:
+            return rounded(self.value, 0.0)
         shown = (rounded(number, self.high - self.low) for number in (self.value, self.low, self.high))
         return "{} [{}, {}]".format(*shown)
 
 
 def rounded(number: float, spread: float) -> str:
-    """A number to three digits of its spread, or to three places where it has none."""
-    places = 3 if spread <= 0 else min(max(2 - math.floor(math.log10(spread)), 0), 3)
+    """A number to three digits of its spread, or to four of its own where it has none; never more than three places."""
+    digits, size = (2, spread) if spread > 0 else (3, abs(number))
+    places = min(max(digits - math.floor(math.log10(size)), 0), 3) if size > 0 else 3
     return f"{number:.{places}f}"
 
 
-def plus_minus(mean: float, deviation: float) -> str:
-    """A mean and its standard deviation."""
+def plus_minus(mean: float, deviation: float | None) -> str:
+    """A mean and its standard deviation, if there is one."""
+    if deviation is None:
+        return rounded(mean, 0.0)
     return f"{rounded(mean, deviation)} ± {rounded(deviation, deviation)}"
+
+
+def mean_and_deviation(values: Float[np.ndarray, " seeds"]) -> tuple[float, float | None]:
+    """Over the seeds. A single one deviates from nothing."""
+    return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
 
 
 @dataclass(frozen=True)
@@ -70,12 +80,12 @@ class Row:
     iqm: Estimate
     """Interquartile mean, its interval over the seeds."""
     mean: float
-    deviation: float
-    """Standard deviation over the seeds of their means over the tasks."""
+    deviation: float | None
+    """Standard deviation over the seeds of their means over the tasks; None where there is one seed."""
     over_draws: Estimate | None
     """The mean, its interval over the draws; None where there is one draw."""
     better: Estimate | None
-    """Probability that a run of it scores more than one of the first method; None for the first."""
+    """Probability that a run of it scores more than one of the first method; None for the first, and of single seeds."""
 
 
 @dataclass(frozen=True)
@@ -207,10 +217,9 @@ def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:
     over_draws = better = None
     if len(group.draws) > 1:
         (over_draws,) = estimates(group.scores[..., -1].mean(axis=1), lambda scores: np.array([np.mean(scores)]))
-    if group.label != first:
+    if group.label != first and min(len(mine), len(last[first])) > 1:
         (better,) = estimates((mine, last[first]), lambda *both: np.array([metrics.probability_of_improvement(*both)]))
-    of_seeds = mine.mean(axis=1)
-    mean, deviation = float(of_seeds.mean()), float(np.std(of_seeds, ddof=min(1, len(mine) - 1)))
+    mean, deviation = mean_and_deviation(mine.mean(axis=1))
     return Row(group.label, len(group.seeds), len(group.draws), iqm, mean, deviation, over_draws, better)
 
 

@@ -18,6 +18,7 @@ from lare.experiments.statistics import (
     Group,
     chance_of_as_many,
     compare,
+    mean_and_deviation,
     pairs_won,
     plus_minus,
 )
@@ -173,9 +174,7 @@ def spread(runs: Sequence[Run], key: str, step: int) -> str:
             by_seed.setdefault(line["seed"], []).append(line[key])
     if not by_seed:
         return "-"
-    values = [np.mean(values) for values in by_seed.values()]
-    deviation = float(np.std(values, ddof=min(1, len(values) - 1)))
-    return plus_minus(float(np.mean(values)), deviation)
+    return plus_minus(*mean_and_deviation(np.array([np.mean(values) for values in by_seed.values()])))
 
 
 def meaning(key: str) -> str:
