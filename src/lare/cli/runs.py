@@ -1,5 +1,7 @@
 """Runs: train, evaluate, report, and let two of them meet."""
 
+import os
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -60,17 +62,21 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
         episodes: episodes for each seed. A single agent acts without noise, agents of particle tasks as in training.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
+    if video is not None and sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # which needs no screen; it is read when MuJoCo is imported
     from lare.experiments.evaluation import evaluate_run, record_video
-    from lare.training.run import open_run
+    from lare.training.run import open_run, read_config
 
+    if video is not None:
+        if not read_config(run).task.particles:
+            progress("filming an episode; without a graphics card that may take minutes")
+        record_video(run, video)
+        say(f"wrote {video}")
     returns = evaluate_run(run, episodes)
     for team, of_team in returns.items():
         for seed, of_seed in zip(open_run(run).seeds, of_team, strict=True):
             named = f"{team}, " if len(returns) > 1 else ""
             say(f"{named}seed {seed}: return {of_seed.mean():.1f} ± {of_seed.std():.1f} over {episodes} episodes")
-    if video is not None:
-        record_video(run, video)
-        say(f"wrote {video}")
 
 
 def report(runs: RunDirectories, out: Path | None = None) -> None:

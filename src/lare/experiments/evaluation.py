@@ -1,6 +1,7 @@
 """The policy of a finished (or stopped) run, evaluated and filmed, for one agent and for many."""
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,15 @@ from jaxtyping import Float
 
 from lare.errors import LareError
 from lare.experiments import agents
+from lare.tasks.episodic import EpisodicReward
 from lare.tasks.particles.drawing import FRAMES_PER_SECOND
 from lare.tasks.spec import TaskSpec, check_against_environment
 from lare.training.environments import Policy, Stream, episode_seed, evaluate, make_episodic, to_bounds
 from lare.training.run import Run, open_run
 from lare.training.single_agent import compiled, load_learner
+
+FRAME = {"width": 320, "height": 320}
+"""Pixels of a MuJoCo film: its usual 480 by 480 take twice as long, and as much room."""
 
 
 def load_policy(run: Run) -> Policy:
@@ -71,27 +76,42 @@ def record_video(directory: str | Path, path: str | Path) -> None:
         LareError: the environment cannot be drawn on this machine, or the file cannot be written.
     """
     run, path = open_run(directory), Path(path)
+    check_video(path)
     if run.config.task.particles:
-        write_video(path, agents.frames(run), FRAMES_PER_SECOND)
+        write_video(path, agents.frames(run), 1 / FRAMES_PER_SECOND)
         return
-    camera = {"camera_name": "track"} if has_tracking_camera(run) else {}
+    camera = {"camera_name": "track", **FRAME} if has_tracking_camera(run) else {}
     environment = make_episodic(run.config.task, render_mode="rgb_array", **camera)
     policy, fps = load_policy(run), environment.metadata.get("render_fps", 30)
+    # Browsers play a GIF at 50 frames a second at most, and a frame may take long where there is no graphics card.
+    every = max(1, round(fps / 25)) if path.suffix == ".gif" else 1
+    write_video(path, list(drawn(run, environment, policy, every)), every / fps)
+
+
+def drawn(run: Run, environment: EpisodicReward, policy: Policy, every: int) -> Iterator[np.ndarray]:
+    """Pictures of every so many steps of an episode. Raises `LareError` where this machine draws none."""
     observation, _ = environment.reset(seed=episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
-    frames, ended = [], False
+    ended, step = False, 0
+    while not ended:
+        if step % every == 0:
+            yield picture(environment)
+        everyone = np.broadcast_to(np.asarray(observation, np.float32), (len(run.seeds), len(observation)))
+        action = to_bounds(policy(everyone)[0], environment.action_space)
+        observation, _, terminated, truncated, _ = environment.step(action)
+        ended, step = terminated or truncated, step + 1
+
+
+def picture(environment: EpisodicReward) -> np.ndarray:
+    """The environment as it is now."""
     try:
-        while not ended:
-            frames.append(environment.render())
-            everyone = np.broadcast_to(np.asarray(observation, np.float32), (len(run.seeds), len(observation)))
-            action = to_bounds(policy(everyone)[0], environment.action_space)
-            observation, _, terminated, truncated, _ = environment.step(action)
-            ended = terminated or truncated
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of graphics libraries that find no screen: another one may do without
+            return np.asarray(environment.render())
     except Exception as error:  # a missing display shows itself in as many ways as there are graphics libraries
         raise LareError(
-            f"{run.config.task.environment} cannot be drawn here: {error}; without a screen, MUJOCO_GL=egl or "
-            "MUJOCO_GL=osmesa in the environment may help"
+            f"{environment.spec.id if environment.spec else 'the environment'} cannot be drawn here: "
+            f"{error}; without a screen, MUJOCO_GL=egl in the environment may help"
         ) from error
-    write_video(path, frames, fps)
 
 
 def has_tracking_camera(run: Run) -> bool:
@@ -103,16 +123,21 @@ def has_tracking_camera(run: Run) -> bool:
     return "track" in names
 
 
-def write_video(path: Path, frames: list, fps: int) -> None:
+def check_video(path: Path) -> None:
+    """Raise `LareError` where a video could not be written, before the work is done."""
+    if path.suffix not in (".gif", ".mp4"):
+        raise LareError(f"{path} is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]")
+    if not path.parent.is_dir():
+        raise LareError(f"the video {path} cannot be written: there is no directory {path.parent}")
+
+
+def write_video(path: Path, frames: Sequence[np.ndarray], seconds: float) -> None:
+    """Write pictures that are shown for so many seconds each. Raises `LareError` where that cannot be done."""
     import imageio.v3 as imageio
 
+    timing: dict[str, Any] = {"duration": 1000 * seconds, "loop": 0} if path.suffix == ".gif" else {"fps": 1 / seconds}
     try:
-        if path.suffix == ".gif":
-            # Browsers play a GIF at 50 frames a second at most.
-            every = max(1, round(fps / 25))
-            imageio.imwrite(path, frames[::every], duration=1000 * every // fps, loop=0)
-        else:
-            imageio.imwrite(path, frames, fps=fps)
+        imageio.imwrite(path, list(frames), **timing)
     except (OSError, ValueError, ImportError, TypeError) as error:
         raise LareError(
             f"the video {path} cannot be written: {error}; .gif always works, .mp4 needs lare-rl[video]"

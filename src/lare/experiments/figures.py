@@ -51,7 +51,7 @@ def curves(
     *,
     from_zero: bool = False,
     marks: Mapping[str, float] | None = None,
-    random_until: float = 0,
+    random_until: int = 0,
 ) -> str:
     """Means over seeds as lines, the standard deviation over seeds as a band.
 

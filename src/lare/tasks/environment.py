@@ -1,6 +1,7 @@
 """Gymnasium environments, made so that what goes wrong is said in one line."""
 
 import logging
+import os
 import warnings
 from typing import Any
 
@@ -28,4 +29,6 @@ def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) 
         except (Exception, SystemExit) as error:
             logging.getLogger(__name__).debug("making %s failed", environment, exc_info=True)
             reason = str(error).strip().splitlines() or [type(error).__name__]
-            raise LareError(f"environment {environment!r} cannot be made: {reason[0]}") from error
+            library = os.environ.get("MUJOCO_GL")
+            missing = f" (is MUJOCO_GL={library} installed?)" if library and isinstance(error, AttributeError) else ""
+            raise LareError(f"environment {environment!r} cannot be made: {reason[0]}{missing}") from error
