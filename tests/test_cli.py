@@ -9,6 +9,7 @@ from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import METHODS
 from lare.latent.checks import CHECKS
 from lare.llm.prompts import candidate
+from lare.source import source
 from lare.tasks.spec import read_task, shipped_tasks
 from toys import PHI
 
@@ -33,6 +34,40 @@ def test_tasks_are_listed(command):
     assert ["Reacher-v4", "11", "2", "before", "one"] in rows
     assert ["CN-30", "26", "5", "after", "many"] in rows
     assert ["CompetitivePP-6-prey", "24", "5", "after", "of", "one", "team"] in rows
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ("train Task --steps 1e5", "--steps 1e5: not of the kind INT; see lare train --help"),
+        ("train Task --step 9", "unrecognized options: --step, 9 (did you mean '--steps'?); see lare train --help"),
+        ("trian", "unrecognized options: trian (did you mean 'train'?); see lare --help"),
+        ("evaluate a b", "unrecognized options: b; see lare evaluate --help"),
+        ("evaluate", "Missing from lare evaluate: RUN a run directory. (required); see lare evaluate --help"),
+        ("design Task --price 1", "--price 1: not of the kind {FLOAT FLOAT}; see lare design --help"),
+        ("train Task --seeds", "Missing value for argument '--seeds'. Expected 1 values; see lare train --help"),
+        (
+            "train Task --td3.gamma high",
+            "Error parsing --td3.gamma: could not convert string to float: 'high'; see lare train --help",
+        ),
+        ("compare", "say which runs to compare"),
+        ("report", "say which runs to report on"),
+    ],
+)
+def test_a_mistake_on_the_command_line_is_one_line(arguments, line, command):
+    assert command(*arguments.split()) == (2, "", f"lare: {line}\n")
+
+
+def test_an_unknown_choice_lists_those_there_are(command):
+    status, _, err = command("train", "Task", "--algorithm", "dqn")
+    assert status == 2
+    assert err.startswith("lare: invalid choice 'dqn' for argument '--algorithm'. Expected one of (")
+    assert all(repr(name) in err for name in ALGORITHMS)
+    assert "'None'" not in err
+
+
+def test_the_version_names_the_commit(command):
+    assert command("--version") == (0, f"{source()}\n", "")
 
 
 def test_methods_are_listed(command):

@@ -1,5 +1,7 @@
 """What the user is told when something that they gave cannot be used."""
 
+import difflib
+from collections.abc import Iterable
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -25,7 +27,7 @@ class Checked(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise LareError(first_problem(error)) from error
+            raise LareError(first_problem(error, tuple(type(self).model_fields))) from None
 
 
 def shortened(value: Any) -> str:
@@ -34,15 +36,23 @@ def shortened(value: Any) -> str:
     return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]}..."
 
 
-def first_problem(error: ValidationError) -> str:
-    """The first thing that pydantic found wrong, in one line, and how many more there are."""
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """A hint at the nearest of the names that there are, or at one that holds this one, if there is any."""
+    names = list(known)
+    within = [one for one in names if len(name) > 2 and name.lower() in one.lower()]
+    close = difflib.get_close_matches(name, names, n=1) or within[:1]
+    return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def first_problem(error: ValidationError, known: Iterable[str] = ()) -> str:
+    """The first thing that pydantic found wrong, in one line, and how many more there are; `known` keys are what was meant."""
     problems = error.errors()
     first = problems[0]
     where, what = ".".join(str(part) for part in first["loc"]), first["msg"].removeprefix("Value error, ")
     if first["type"] == "missing":
         said = f"the key {where!r} is missing"
     elif first["type"] == "extra_forbidden":
-        said = f"there is no key {where!r}"
+        said = f"there is no key {where!r}{did_you_mean(where, known)}"
     elif where:
         said = f"{where} = {shortened(first['input'])}: {what.lower()}"
     else:

@@ -85,6 +85,7 @@ def test_like_over_two_generations(spec_file, tmp_path):
         ({"action": None}, "task '{file}': the key 'action' is missing"),
         ({"action": None, "observation": None}, "task '{file}': the key 'observation' is missing (and 1 more)"),
         ({"reward": "1 a step"}, "task '{file}': there is no key 'reward'"),
+        ({"judge": "after"}, "task '{file}': there is no key 'judge' (did you mean 'judges'?)"),
         ({"description": "  "}, "task '{file}': description = '  ': string should have at least 1 character"),
         ({"judges": "during"}, "task '{file}': judges = 'during': input should be 'before', 'after' or 'both'"),
         ({"name": "a/b"}, "task '{file}': name = 'a/b': string should match pattern '^[\\w.\\-]+$'"),
@@ -158,16 +159,21 @@ def test_a_file_that_is_no_spec_is_refused(tmp_path, content, message):
     [
         ("HalfCheeta-v4", " (did you mean 'HalfCheetah-v4'?)"),
         ("walker2d-v4", " (did you mean 'Walker2d-v4'?)"),
+        ("cheetah", " (did you mean 'HalfCheetah-v4'?)"),
         ("chess", ""),
         ("", ""),
         ("/", ""),
-        ("no/such/file.toml", ""),
     ],
 )
 def test_an_unknown_task_is_refused(task, hint):
     with pytest.raises(LareError) as error:
         load_task(task)
     assert str(error.value) == f"no task {task!r}{hint}: neither a file nor one of the shipped tasks, {NAMES}"
+
+
+def test_a_file_that_is_not_there():
+    with pytest.raises(LareError, match=r"^there is no task file no/such/file\.toml$"):
+        load_task("no/such/file.toml")
 
 
 def test_teams_have_specs_of_their_own():

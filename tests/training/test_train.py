@@ -67,6 +67,16 @@ def test_a_worker_that_is_killed_or_starved_stops_the_run_and_harms_nothing(numb
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
+def test_a_run_says_what_is_random_and_what_is_done_already(small, tmp_path):
+    heard = At(-1, None)
+    lare.train(toy_spec(), small(steps=180, method="dense"), out=tmp_path / "run", listeners=[heard])
+    warmup = small().td3.warmup
+    assert heard.messages == [f"the first {warmup:,} steps are random: nothing is learned from them yet"]
+    heard = At(-1, None)
+    lare.resume(tmp_path / "run", listeners=[heard])
+    assert heard.messages == ["nothing is left to do: it had come to its end"]
+
+
 def test_the_isolation_stands_in_the_config(small, phi, tmp_path):
     run = lare.train(toy_spec(), small(steps=60), function=phi, out=tmp_path / "run", listeners=[])
     assert run.config.isolation == phi.evaluator(2, 1).isolation

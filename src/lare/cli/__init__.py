@@ -9,13 +9,14 @@ import os
 import sys
 import traceback
 
-import tyro
-
 from lare.cli.functions import design, new_task, prompt, verify
 from lare.cli.lists import algorithms, methods, tasks
+from lare.cli.parse import parse
 from lare.cli.runs import cross_play, evaluate, report, train
 from lare.cli.studies import compare, reproduce, sweep
+from lare.cli.terminal import say
 from lare.errors import LareError
+from lare.source import source
 
 DESCRIPTION = "Train reinforcement learning on episodic rewards, through latent rewards that a language model wrote."
 COMMANDS = {
@@ -44,7 +45,10 @@ def main() -> None:
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     try:
-        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="lare", description=DESCRIPTION, args=arguments)
+        if arguments == ["--version"]:
+            say(source())
+        else:
+            parse(COMMANDS, DESCRIPTION, arguments)()
     except LareError as error:
         if debug:
             traceback.print_exc()

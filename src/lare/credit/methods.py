@@ -5,12 +5,11 @@ returns, `decoder` what it is. The two ends of the table fit nothing: `dense` tr
 return, paid at the last step. The rows serve one agent and many; those that need several agents say so.
 """
 
-import difflib
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
-from lare.errors import LareError
+from lare.errors import LareError, did_you_mean
 
 
 class Encoder(StrEnum):
@@ -224,6 +223,4 @@ def find_method(name: str) -> Method:
     """
     if name in METHODS:
         return METHODS[name]
-    close = difflib.get_close_matches(name, METHODS, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    raise LareError(f"no method {name!r}{hint}; the methods are {', '.join(METHODS)}")
+    raise LareError(f"no method {name!r}{did_you_mean(name, METHODS)}; the methods are {', '.join(METHODS)}")

@@ -17,8 +17,10 @@ def find_runs(places: Sequence[Path]) -> list[Run]:
     """The runs that are given, and those in directories that are given, or one level further down, as in a sweep's.
 
     Raises:
-        LareError: there is none in one of them.
+        LareError: there is none in one of them, or nothing is given.
     """
+    if not places:
+        raise LareError("say which runs to compare")
     runs = []
     for place in places:
         found = sorted(path.parent for depth in ("", "*/", "*/*/") for path in place.glob(depth + CONFIG))

@@ -123,7 +123,7 @@ def learning(task: str, runs: dict[str, Run]) -> Iterable[str]:
     }
     axes = {"credit/error": "reward", "credit/correlation": "correlation"}
     marks = {"random actions": REFERENCES[task][0]} if task in REFERENCES else {}
-    random = {getattr(run.config.settings.of_algorithm, "warmup", 0) for run in runs.values()}
+    random = {run.config.settings.warmup for run in runs.values()}
     random_until = random.pop() if len(random) == 1 else 0
     for key in shown:
         found = {name: points for name, run in runs.items() if (points := curve(run, key)) is not None}

@@ -1,6 +1,5 @@
 """A task: an environment and the texts that describe it, read from TOML and checked against the environment."""
 
-import difflib
 import hashlib
 import tomllib
 from importlib.resources import files
@@ -11,7 +10,7 @@ import gymnasium
 from gymnasium.spaces import Box
 from pydantic import ConfigDict, Field, model_validator
 
-from lare.errors import Checked, LareError
+from lare.errors import Checked, LareError, did_you_mean
 from lare.tasks.environment import make
 from lare.tasks.particles import NAMES, NAMESPACE, TEAMS
 from lare.tasks.spaces import Choice
@@ -124,8 +123,9 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     elif is_file(task):
         text = read_text(Path(task))
     else:
-        close = difflib.get_close_matches(task, shipped_tasks(), n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        if task.endswith(".toml"):
+            raise LareError(f"there is no task file {task}")
+        hint = did_you_mean(task, shipped_tasks())
         raise LareError(
             f"no task {task!r}{hint}: neither a file nor one of the shipped tasks, {', '.join(shipped_tasks())}"
         )

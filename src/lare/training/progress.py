@@ -1,5 +1,6 @@
 """What a run says while it goes: a live line on a terminal, plain lines elsewhere; TensorBoard events if asked for."""
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -74,7 +75,17 @@ class Terminal:
         if self.progress:
             self.progress.update(self.progress.task_ids[0], figures=summary(metrics))
         else:
-            self.said(f"step {metrics[0]['step']:>{len(str(self.steps))}} of {self.steps}: {summary(metrics)}")
+            step = metrics[0]["step"]
+            self.said(
+                f"step {step:>{len(str(self.steps))}} of {self.steps}: {summary(metrics)}{self.left(step, metrics)}"
+            )
+
+    def left(self, step: int, metrics: Metrics) -> str:
+        """How long the rest takes at the pace of the last steps; nothing as long as there are no updates, which take the time."""
+        rate = mean(metrics, "time/steps_per_second")
+        if not rate or mean(metrics, "critic/loss") is None or step >= self.steps:
+            return ""
+        return f", {math.ceil((self.steps - step) / rate / 60)} min left"
 
     def said(self, message: str) -> None:
         self.console.print(message, highlight=False, markup=False, soft_wrap=True)

@@ -114,12 +114,17 @@ class Plan(Settings):
         for name, steps in (
             ("steps", self.steps),
             ("evaluate_every", self.evaluate_every),
-            (f"{self.algorithm}.warmup", getattr(self.of_algorithm, "warmup", 0)),
+            (f"{self.algorithm}.warmup", self.warmup),
         ):
             if steps % self.turn:
                 near = max(1, round(steps / self.turn)) * self.turn
                 raise ValueError(f"{name} = {steps} is not a multiple of {self.what_a_turn_is}: take {near}")
         return self
+
+    @property
+    def warmup(self) -> int:
+        """Steps of random actions before the first update."""
+        return getattr(self.of_algorithm, "warmup", 0)
 
     @property
     def turn(self) -> int:

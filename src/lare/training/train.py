@@ -125,6 +125,10 @@ def finish(
             listener.said(message)
         if run.function is not None:
             listener.said(f"the latent function runs in {isolation(run.config.task, run.function)}")
+        if session.step < settings.warmup:
+            listener.said(f"the first {settings.warmup:,} steps are random: nothing is learned from them yet")
+        if session.step >= settings.steps:
+            listener.said("nothing is left to do: it had come to its end")
         listener.started(f"{run.config.task.name} {settings.method}", session.step, settings.steps)
     clock = Clock(session.step)
     try:

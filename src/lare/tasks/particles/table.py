@@ -1,8 +1,6 @@
 """The particle tasks, by name."""
 
-import difflib
-
-from lare.errors import LareError
+from lare.errors import LareError, did_you_mean
 from lare.tasks.particles import navigation, predator_prey
 from lare.tasks.particles.task import ParticleTask
 from lare.tasks.particles.triangle_area import triangle_area
@@ -26,6 +24,4 @@ def find_particle_task(name: str) -> ParticleTask:
     """
     if name in TASKS:
         return TASKS[name]
-    close = difflib.get_close_matches(name, TASKS, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    raise LareError(f"no particle task {name!r}{hint}; the particle tasks are {', '.join(TASKS)}")
+    raise LareError(f"no particle task {name!r}{did_you_mean(name, TASKS)}; the particle tasks are {', '.join(TASKS)}")
