@@ -99,7 +99,7 @@ def test_whatever_speaks_of_rewards_is_left_out(tmp_path):
         "Tells of a chase.\nThe goal is to catch the *target*.\nSee the docs.\n1. Truncation: after 20 steps."
     )
     assert task.observation == "2 entries.\nA target.\nIt returns nothing."
-    assert task.action == "1 entries, each between -2 and 2.\n1: The second row; -"
+    assert task.action == "1 entry, between -2 and 2.\n1: The second row; -"
     assert drafted.left_out == 3
     assert "3 sentences or rows" in drafted.toml
 
@@ -191,3 +191,10 @@ def test_a_draft_keeps_the_goal():
 def test_an_id_without_a_version_is_written_with_it():
     drafted = draft("CartPole")
     assert 'environment = "CartPole-v1"' in drafted.toml
+
+
+def test_what_points_at_a_picture_is_left_out():
+    """Pendulum's documentation speaks of a diagram that no text shows."""
+    text = draft("Pendulum-v1").toml
+    assert "diagram" not in text
+    assert "The system consists of a pendulum" in text

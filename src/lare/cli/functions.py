@@ -46,10 +46,12 @@ def new_task(
     drafted = draft(environment)
     path = out or Path(f"{environment.rpartition(':')[2].replace('/', '-')}.toml")
     write_new(path, drafted.toml, "--out")
-    say(f"wrote {path}; {drafted.left_out} sentences or rows that spoke of rewards were left out")
+    left_out = f"; {drafted.left_out} sentences or rows that spoke of rewards were left out" if drafted.left_out else ""
+    say(f"wrote {path}{left_out}")
     for key in drafted.missing:
         say(f"  fill in: {key} (the environment does not document it)")
-    say(f"read it, then: lare prompt {path}; lare design {path} --model NAME --out phi.py")
+    say(f"read it, then: lare design {path} --model NAME --out phi.py")
+    say(f"or, without a model: write phi.py by what lare prompt {path} says; --method rrdu needs none")
 
 
 def design(

@@ -28,6 +28,7 @@ SENTENCE = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
 FIGURE = re.compile(r"^```\{.*?^```|<[^<>\n]+>", re.MULTILINE | re.DOTALL)
 NOISE = re.compile(r"^!\[|^:?-{3,}|^```|^\s*$")
+ELSEWHERE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.IGNORECASE)
 """What says nothing without a page around it."""
 
 
@@ -74,8 +75,8 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
     if texts["description"]:
         texts["description"] += ending(sections)
     heads = {
-        "observation": f"{observation_size} entries{flattened(raw.observation_space)}.",
-        "action": f"{action_size} entries{chosen(environment.action_space)}{bounds(environment.action_space)}.",
+        "observation": f"{entries(observation_size)}{flattened(raw.observation_space)}.",
+        "action": f"{entries(action_size)}{chosen(environment.action_space)}{bounds(environment.action_space)}.",
     }
     wanted = {
         "description": "what is to be solved, and what the goal is; not a word about the reward",
@@ -137,7 +138,9 @@ def plain(text: str) -> list[str]:
         else:
             paragraph.append(stripped)
     unset = [re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line).replace("**", "").replace("`", "").strip() for line in lines]
-    return [re.sub(r"\$?\\?[a-z]*\{?\\infty\}?\$?", "inf", line) for line in unset if line]
+    return [
+        re.sub(r"\$?\\?[a-z]*\{?\\infty\}?\$?", "inf", line) for line in unset if line and not ELSEWHERE.search(line)
+    ]
 
 
 def row(line: str) -> str:
@@ -173,6 +176,10 @@ def ending(sections: dict[str, str]) -> str:
     return ""
 
 
+def entries(number: int) -> str:
+    return "1 entry" if number == 1 else f"{number} entries"
+
+
 def flattened(space: gymnasium.Space) -> str:
     if isinstance(space, gymnasium.spaces.Discrete):
         return ", all 0 but one: the number of the state"
@@ -191,7 +198,8 @@ def bounds(space: gymnasium.Space) -> str:
     if isinstance(space, Choice) or not isinstance(space, gymnasium.spaces.Box):
         return ""
     low, high = set(map(float, space.low)), set(map(float, space.high))
-    return f", each between {low.pop():g} and {high.pop():g}" if len(low) == len(high) == 1 else ""
+    each = "each " if space.shape != (1,) else ""
+    return f", {each}between {low.pop():g} and {high.pop():g}" if len(low) == len(high) == 1 else ""
 
 
 def quoted(text: str) -> str:
