@@ -308,7 +308,7 @@ def test_config_says_what_the_run_depends_on(small, phi, tmp_path):
     config = json.loads((run.directory / "config.json").read_text())
     assert config["function_sha256"] == [phi.digest]
     assert config["task_sha256"] == toy_spec().digest
-    assert config["lare"] == lare.__version__
+    assert config["lare"] == source()
     assert config["settings"]["td3"]["hidden"] == [8]
     source = run.directory / "latent_function.py"
     source.write_text(source.read_text().replace("effort", "other"))
