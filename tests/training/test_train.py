@@ -18,6 +18,7 @@ from lare.algorithms.table import ALGORITHMS, Kind
 from lare.credit.methods import METHODS, Encoder
 from lare.errors import LareError
 from lare.latent.function import verified
+from lare.source import source
 from lare.training import checkpoint, single_agent
 from lare.training.environments import EnvironmentFault
 from lare.training.run import open_run
