@@ -311,8 +311,8 @@ def test_config_says_what_the_run_depends_on(small, phi, tmp_path):
     assert config["task_sha256"] == toy_spec().digest
     assert config["lare"] == source()
     assert config["settings"]["td3"]["hidden"] == [8]
-    source = run.directory / "latent_function.py"
-    source.write_text(source.read_text().replace("effort", "other"))
+    written = run.directory / "latent_function.py"
+    written.write_text(written.read_text().replace("effort", "other"))
     with pytest.raises(LareError, match="is not the function that this run was trained with: its hash changed"):
         open_run(run.directory)
 
