@@ -62,13 +62,13 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
         episodes: episodes for each seed. A single agent acts without noise, agents of particle tasks as in training.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
-    if video is not None and sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # which needs no screen; it is read when MuJoCo is imported
     from lare.experiments.evaluation import evaluate_run, record_video
     from lare.training.run import open_run, read_config
 
     if video is not None:
         if not read_config(run).task.particles:
+            if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+                os.environ.setdefault("MUJOCO_GL", "egl")  # which needs no screen; it is read when MuJoCo is imported
             progress("filming an episode; without a graphics card that may take minutes")
         record_video(run, video)
         say(f"wrote {video}")

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 from jaxtyping import Float
 
@@ -38,7 +39,12 @@ def policy_of(directory: str | Path, task: TaskSpec) -> Callable[[np.ndarray], n
     run = open_run(directory)
     if run.config.task.environment != task.environment or task.particles:
         raise LareError(f"{directory} is a run of {run.config.task.name}: its policy cannot play {task.name}")
-    policy, space = load_policy(run), make_episodic(task).action_space
+    return first_seed(run, make_episodic(task).action_space)
+
+
+def first_seed(run: Run, space: gymnasium.Space) -> Callable[[np.ndarray], np.ndarray]:
+    """The deterministic policy of the first seed, from one observation to one action within the space."""
+    policy = load_policy(run)
 
     def act(observation: np.ndarray) -> np.ndarray:
         everyone = np.broadcast_to(np.asarray(observation, np.float32), (len(run.seeds), len(observation)))
@@ -82,22 +88,21 @@ def record_video(directory: str | Path, path: str | Path) -> None:
         return
     camera = {"camera_name": "track", **FRAME} if has_tracking_camera(run) else {}
     environment = make_episodic(run.config.task, render_mode="rgb_array", **camera)
-    policy, fps = load_policy(run), environment.metadata.get("render_fps", 30)
+    fps = environment.metadata.get("render_fps", 30)
     # Browsers play a GIF at 50 frames a second at most, and a frame may take long where there is no graphics card.
     every = max(1, round(fps / 25)) if path.suffix == ".gif" else 1
-    write_video(path, list(drawn(run, environment, policy, every)), every / fps)
+    write_video(path, list(drawn(run, environment, every)), every / fps)
 
 
-def drawn(run: Run, environment: EpisodicReward, policy: Policy, every: int) -> Iterator[np.ndarray]:
+def drawn(run: Run, environment: EpisodicReward, every: int) -> Iterator[np.ndarray]:
     """Pictures of every so many steps of an episode. Raises `LareError` where this machine draws none."""
+    act = first_seed(run, environment.action_space)
     observation, _ = environment.reset(seed=episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
     ended, step = False, 0
     while not ended:
         if step % every == 0:
             yield picture(environment)
-        everyone = np.broadcast_to(np.asarray(observation, np.float32), (len(run.seeds), len(observation)))
-        action = to_bounds(policy(everyone)[0], environment.action_space)
-        observation, _, terminated, truncated, _ = environment.step(action)
+        observation, _, terminated, truncated, _ = environment.step(act(observation))
         ended, step = terminated or truncated, step + 1
 
 
