@@ -4,7 +4,7 @@ from lare.cli.terminal import show
 
 
 def tasks() -> None:
-    """List the tasks that come with the package."""
+    """List the tasks that come with the package. `lare prompt TASK` says what one is about."""
     from lare.tasks.spec import read_task, shipped_tasks
 
     specs = [read_task(name) for name in shipped_tasks()]

@@ -100,6 +100,11 @@ class Method:
         return self.reward not in (Reward.TRUE, Reward.EPISODIC)
 
     @property
+    def latent(self) -> bool:
+        """Whether it needs a function that a language model wrote."""
+        return self.encoder is Encoder.LATENT
+
+    @property
     def kind(self) -> Literal["factors", "reward"]:
         """What a language model is asked for, where the encoder is its function."""
         return "reward" if self.reward is Reward.DESIGNED else "factors"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import lare
-from lare.credit.methods import Encoder, find_method
+from lare.credit.methods import find_method
 from lare.errors import LareError
 from lare.latent.design import CANDIDATES
 from lare.tasks.spec import TaskSpec
@@ -43,7 +43,7 @@ class Job:
 def job_of(root: Path, task: TaskSpec, settings: Settings) -> Job:
     """A run in its place: ROOT/TASK/METHOD-ALGORITHM, with the draw and an unusual number of candidates where they matter."""
     plan, ending = decide(settings, task), ""
-    if find_method(plan.method).encoder is Encoder.LATENT:
+    if find_method(plan.method).latent:
         ending = f"-draw{plan.draw}" + (f"-candidates{plan.candidates}" if plan.candidates != CANDIDATES else "")
     return Job(root / task.name / f"{plan.method}-{plan.algorithm}{ending}", task, plan)
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from lare.algorithms.table import Name
-from lare.credit.methods import Encoder, find_method
+from lare.credit.methods import find_method
 from lare.errors import Checked, LareError
 from lare.experiments.cluster import on_ray
 from lare.experiments.jobs import Job, check, job_of
@@ -76,7 +76,7 @@ def jobs_of(sweep: Sweep, path: Path) -> Iterator[Job]:
     root = path.parent / (sweep.out or Path("runs") / path.stem)
     for name, method, algorithm in product(sweep.tasks, sweep.methods, sweep.algorithms or (None,)):
         task = load_task(path.parent / name if name.endswith(".toml") else name)
-        draws = sweep.draws if find_method(method).encoder is Encoder.LATENT else sweep.draws[:1]
+        draws = sweep.draws if find_method(method).latent else sweep.draws[:1]
         for draw in draws:
             settings = Settings(**{**sweep.settings, "method": method, "algorithm": algorithm, "draw": draw})
             yield job_of(root, task, settings)

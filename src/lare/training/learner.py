@@ -108,7 +108,7 @@ def init(key: PRNGKeyArray, recipe: Recipe) -> Learner:
 
 def features(steps: Step | Draw, method: Method) -> Float[Array, "batch features"]:
     """What the method's decoder sees of some steps."""
-    if method.encoder is Encoder.LATENT:
+    if method.latent:
         return jnp.asarray(steps.factors)
     # A Gaussian may choose beyond the bounds; what happened is that the bound was taken.
     rows = [steps.observation, jnp.clip(steps.action, -1, 1)]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lare.credit.closed_form import LARGEST_CHOICE
-from lare.credit.methods import Encoder, Fit, Method, Reward, find_method
+from lare.credit.methods import Fit, Method, Reward, find_method
 from lare.errors import LareError
 from lare.latent.design import design
 from lare.latent.function import LatentFunction, per_role
@@ -60,7 +60,7 @@ def chosen_functions(
 ) -> tuple[LatentFunction, ...]:
     """One for each role of the task, designed where none was given; none for a method that needs none."""
     method = find_method(plan.method)
-    if method.encoder is not Encoder.LATENT:
+    if not method.latent:
         return ()
     if given is None:
         asked = partial(design, kind=method.kind, draw=plan.draw, candidates=plan.candidates)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lare.credit.methods import Encoder, find_method
+from lare.credit.methods import find_method
 from lare.experiments import figures
 from lare.experiments.jobs import Job, job_of
 from lare.experiments.paper.budgets import Budget
@@ -68,7 +68,7 @@ def jobs_of_contender(one: Contender, budget: Budget, name: str, root: Path) -> 
     task = load_task(name)
     steps = budget.steps_of_many if task.particles else budget.steps
     usual = {"method": one.method, "algorithm": one.algorithm, "steps": steps, "seeds": budget.seeds}
-    latent = find_method(one.method).encoder is Encoder.LATENT
+    latent = find_method(one.method).latent
     for draw in range(min(budget.draws, one.draws) if latent else 1):
         yield job_of(root, task, Settings(**{**one.settings, **budget.settings, **usual, "draw": draw}))
 
