@@ -48,7 +48,8 @@ def test_one_proxy_reward_for_each_agent_at_each_step(decoder):
         decoded = decoder(features(), key)
         assert decoded.r_hat.shape == (EPISODES * STEPS, AGENTS)
         assert np.isfinite(decoded.r_hat).all()
-        assert float(decoded.penalty) >= 0
+        assert decoded.penalty.shape == (EPISODES * STEPS,)
+        assert (np.asarray(decoded.penalty) >= 0).all()
 
 
 def test_at_use_nothing_is_drawn(decoder):
@@ -75,7 +76,7 @@ def test_a_bottleneck_costs_its_divergence():
     bottleneck = made("bottleneck")
     mean, log_variance = np.split(np.asarray(bottleneck.encoder(features())), 2, axis=-1)
     want = 0.1 * 0.5 * (np.exp(log_variance) + mean**2 - 1 - log_variance).sum(axis=-1).mean()
-    assert float(bottleneck(features(), KEY).penalty) == pytest.approx(want, rel=1e-5)
+    assert float(bottleneck(features(), KEY).penalty.mean()) == pytest.approx(want, rel=1e-5)
 
 
 def test_arel_gives_every_agent_the_same_and_costs_its_variance():
@@ -83,7 +84,7 @@ def test_arel_gives_every_agent_the_same_and_costs_its_variance():
     given = by_episode(decoded.r_hat)
     np.testing.assert_array_equal(given, np.broadcast_to(given[..., :1], given.shape))
     want = 20 / STEPS**2 * given[..., 0].var(axis=1, ddof=1).mean()
-    assert float(decoded.penalty) == pytest.approx(want, rel=1e-4)
+    assert float(decoded.penalty.mean()) == pytest.approx(want, rel=1e-4)
 
 
 @pytest.mark.parametrize(("normalise", "sum_form"), [(False, True), (True, False)])

@@ -61,7 +61,8 @@ def test_unbiased_loss_has_the_expectation_of_the_full_one():
     target, lengths, weight = jnp.full(draws, mean_reward), jnp.full(draws, length), jnp.ones(draws)
     full = (r_hat.mean() - mean_reward) ** 2
     biased = float(losses.squared_error(jnp.asarray(rows.mean(axis=1)), target, weight))
-    unbiased = float(losses.unbiased_squared_error(jnp.asarray(rows), target, lengths, weight))
+    variance = losses.subsampling_variance(jnp.asarray(rows), lengths)
+    unbiased = float(losses.unbiased_squared_error(jnp.asarray(rows.mean(axis=1)), target, weight, variance))
     extra = r_hat.var(ddof=1) * (1 - drawn / length) / drawn
     assert unbiased == pytest.approx(full, abs=0.01)
     assert biased == pytest.approx(full + extra, abs=0.01)

@@ -1,10 +1,13 @@
 """What each method reads and is rewarded with."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import TABLE, Fit, Reward
 from lare.normalise import magnitude
 from lare.training import learner as common
@@ -53,6 +56,51 @@ def test_parts_of_episodes_stay_inside_them():
     assert drawn.steps.shape == (7, 24)
     assert (np.asarray(drawn.steps) >= first).all()
     assert (np.asarray(drawn.steps) < first + length).all()
+    # Of three steps, four cannot be drawn: all of them belong, and the fourth place holds none.
+    belongs = np.asarray(drawn.episode).reshape(7, 6, 4) < 6
+    np.testing.assert_array_equal(belongs.sum(axis=2), np.minimum(drawn.episodes.length, 4))
+    assert (np.asarray(drawn.episodes.length) == 3).any()
+
+
+@pytest.mark.parametrize("drawn", [4, 10])
+def test_the_unbiased_loss_has_the_expectation_of_the_full_one_for_episodes_of_any_length(drawn):
+    """Lengths from 3 to 12: with K = 10, three of the five episodes are shorter. RRD's loss is larger."""
+    losses = {}
+    for name in ("rrd", "rrdu"):
+        chosen = recipe(name, credit=CreditSettings(hidden=(8,), drawn_steps=drawn, steps=40_000 * drawn))
+        learner = stored(chosen)
+        steep = jax.tree.map(lambda weight: 6 * weight, learner.credit.decoder)  # steps that differ
+        learner = learner._replace(credit=learner.credit._replace(decoder=steep))
+        draws = common.draw_parts_of_episodes(learner.replay, jax.random.key(3), 1, chosen)
+        _, measured = common.fit(
+            learner.credit, learner.replay, jax.tree.map(lambda one: one[0], draws), jax.random.key(0), chosen
+        )
+        losses[name] = float(measured["credit/loss"])
+    every = replay.read(learner.replay, jnp.arange(sum(LENGTHS)))
+    unit, ends = float(magnitude(learner.credit.scale)), np.cumsum(LENGTHS)[:-1]
+    r_hat, r = np.asarray(common.proxy_rewards(every, learner, chosen)) / unit, np.asarray(every.reward) / unit
+    errors = [
+        (one.mean() - true.mean()) ** 2 for one, true in zip(np.split(r_hat, ends), np.split(r, ends), strict=True)
+    ]
+    chosen_how_often = np.bincount(np.searchsorted(ends, draws.episodes.first[0], side="right"), minlength=5) / 40_000
+    want = float(chosen_how_often @ errors)
+    assert losses["rrdu"] == pytest.approx(want, rel=0.02)
+    assert losses["rrd"] > 1.05 * want
+
+
+@pytest.mark.parametrize("method", ["rd", "rrd", "rrdu", "vib-rd", "vib-rrdu"])
+def test_padding_counts_for_nothing(method):
+    chosen = recipe(method)
+    learner = stored(chosen)
+    draws = jax.tree.map(lambda one: one[0], common.draw_credit(learner.replay, jax.random.key(2), 1, chosen))
+    padding = np.asarray(draws.episode) >= len(draws.episodes.length)
+    assert padding.any()
+    elsewhere = draws._replace(steps=jnp.where(padding, 40, draws.steps))
+    assert (np.asarray(draws.steps) != elsewhere.steps).any()
+    one, other = (
+        common.fit(learner.credit, learner.replay, each, jax.random.key(0), chosen) for each in (draws, elsewhere)
+    )
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-7), one, other)
 
 
 @pytest.mark.parametrize("method", ["dense", "episodic", "lare-rrdu", "ircr", "llm-reward"])

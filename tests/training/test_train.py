@@ -19,7 +19,7 @@ from lare.credit.methods import METHODS, Encoder
 from lare.errors import LareError
 from lare.latent.function import verified
 from lare.source import source
-from lare.training import checkpoint, single_agent
+from lare.training import checkpoint, replay, single_agent
 from lare.training.environments import EnvironmentFault
 from lare.training.run import open_run
 from lare.training.settings import RolloutSettings
@@ -184,6 +184,21 @@ def test_an_episode_that_cannot_be_restored_is_dropped_and_said(small, tmp_path)
         for seed in (0, 1)
     ]
     assert run.metrics()[-1]["step"] == 240
+
+
+def test_what_is_played_after_a_dropped_episode_is_all_in_the_next_checkpoint(small, tmp_path):
+    spec, out = toy_spec(environment="toys/Forgetful-v0"), tmp_path / "run"
+    with pytest.raises(Interrupted):
+        lare.train(spec, small(method="rrdu"), out=out, listeners=[At(108, lambda: signal.raise_signal(signal.SIGINT))])
+    with pytest.raises(Interrupted):
+        lare.resume(out, listeners=[At(132, lambda: signal.raise_signal(signal.SIGINT))])
+    held = single_agent.load_learner(open_run(out))[1].replay
+    for seed in (0, 1):
+        one = jax.tree.map(lambda leaf, seed=seed: leaf[seed], held)
+        steps = replay.read(one, jax.numpy.arange(one.transitions))
+        returns = np.bincount(one.episode[: one.transitions], np.asarray(steps.reward))
+        np.testing.assert_allclose(returns[: one.episodes], one.episode_return[: one.episodes], rtol=1e-5)
+        assert one.episodes > 5
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -83,5 +83,7 @@ class AREL(eqx.Module):
             x = jnp.swapaxes(agent(jnp.swapaxes(x, 1, 2), None), 1, 2)
         first, second, last = self.read_out
         y = last(jnp.sum(second(first(x)), axis=1))[..., 0]
-        penalty = VARIANCE_PENALTY / steps**2 * jnp.mean(jnp.var(y, axis=1, ddof=1))
-        return Decoded(jnp.broadcast_to(y.reshape(rows, 1), (rows, agents)), penalty)
+        penalty = VARIANCE_PENALTY / steps**2 * jnp.var(y, axis=1, ddof=1, keepdims=True)
+        return Decoded(
+            jnp.broadcast_to(y.reshape(rows, 1), (rows, agents)), jnp.broadcast_to(penalty, y.shape).reshape(rows)
+        )

@@ -41,7 +41,7 @@ class Linear(eqx.Module):
     bias: Float[Array, ""]
 
     def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
-        return Decoded(features @ self.weight + self.bias, jnp.zeros(()))
+        return Decoded(features @ self.weight + self.bias, jnp.zeros(len(features)))
 
 
 class Totals(NamedTuple):

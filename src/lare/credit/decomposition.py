@@ -65,7 +65,8 @@ class CreditSettings(Checked):
 class Episodes(NamedTuple):
     """Steps of some episodes, and what those episodes returned.
 
-    For K drawn steps, rows = episodes * K, in order; for Diaster, episodes * the longest that there can be.
+    For K drawn steps, rows = episodes * K, in order, and padding where an episode has fewer; for Diaster, episodes * the
+    longest that there can be.
     """
 
     features: Float[Array, "rows *agents features"]
@@ -182,16 +183,20 @@ def loss_and_gradient(
             return decoder.loss(seen, episodes.length, target, weight, key)
         decoded = decode(decoder, state, episodes.features, settings, key)
         r_hat = jnp.mean(decoded.r_hat.reshape(len(episodes.features), -1), axis=1)
-        return losses_of(r_hat) + decoded.penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
+        belongs = (episodes.episode >= 0) & (episodes.episode < len(target))
+        penalty = jnp.sum(jnp.where(belongs, decoded.penalty, 0)) / jnp.maximum(jnp.sum(belongs), 1)
+        return losses_of(r_hat) + penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
 
     def losses_of(r_hat: Float[Array, " rows"]) -> Float[Array, ""]:
         if fit is Fit.ALL_STEPS:
             mean = losses.episode_means(r_hat, episodes.episode, episodes.length)
             return losses.squared_error(mean, target, weight)
         drawn = r_hat.reshape(len(target), -1)
+        mean = losses.episode_means(r_hat, episodes.episode, jnp.minimum(episodes.length, drawn.shape[1]))
         if fit is Fit.DRAWN_STEPS:
-            return losses.squared_error(jnp.mean(drawn, axis=1), target, weight)
-        return losses.unbiased_squared_error(drawn, target, episodes.length, weight)
+            return losses.squared_error(mean, target, weight)
+        variance = losses.subsampling_variance(drawn, episodes.length)
+        return losses.unbiased_squared_error(mean, target, weight, variance)
 
     return jax.value_and_grad(loss_of)(state.decoder)
 

@@ -55,7 +55,7 @@ class Diaster(eqx.Module):
 
     def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
         """What the step model says."""
-        return Decoded(self.step(features)[..., 0], jnp.zeros(()))
+        return Decoded(self.step(features)[..., 0], jnp.zeros(len(features)))
 
     def pieces(
         self, features: Float[Array, "batch steps features"], begins: Bool[Array, "batch steps"]

@@ -12,14 +12,15 @@ from jaxtyping import Array, Float, Int
 
 
 def episode_means(
-    r_hat: Float[Array, " steps"], episode: Int[Array, " steps"], length: Int[Array, " episodes"]
+    r_hat: Float[Array, " steps"], episode: Int[Array, " steps"], steps: Int[Array, " episodes"]
 ) -> Float[Array, " episodes"]:
-    """mean_t r_hat_t of episodes that lie one behind the other.
+    """mean_t r_hat_t of the steps that are here of each episode: all T, or K that were drawn.
 
     `episode` numbers the episode of each step; a step whose number is outside 0..B-1 belongs to none and counts nowhere.
+    `steps` says how many there are of each.
     """
-    total = jnp.zeros(length.shape, r_hat.dtype).at[episode].add(r_hat, mode="drop")
-    return total / jnp.maximum(length, 1)
+    total = jnp.zeros(steps.shape, r_hat.dtype).at[episode].add(r_hat, mode="drop")
+    return total / jnp.maximum(steps, 1)
 
 
 def squared_error(
@@ -40,8 +41,8 @@ def subsampling_variance(
     """Var(mean of K) = Var_K(r_hat) * (1 - K/T) / K: what drawing K of T steps adds to the squared error.
 
     `Var_K` is the sample variance (divided by K - 1), and the finite-population factor (1 - K/T) holds for drawing
-    without replacement. RRD-unbiased subtracts it (Ren et al., 2022, Appendix). Where K >= T there is nothing to
-    correct and the value is 0, never negative.
+    without replacement. RRD-unbiased subtracts it (Ren et al., 2022, Appendix). Where K >= T all T steps have been
+    taken and there is nothing to correct: the value is 0, never negative.
     """
     drawn = r_hat.shape[1]
     fraction = jnp.maximum(1 - drawn / jnp.maximum(length, 1), 0)
@@ -49,14 +50,14 @@ def subsampling_variance(
 
 
 def unbiased_squared_error(
-    r_hat: Float[Array, "episodes K"],
+    mean: Float[Array, " episodes"],
     target: Float[Array, " episodes"],
-    length: Int[Array, " episodes"],
     weight: Float[Array, " episodes"],
+    variance: Float[Array, " episodes"],
 ) -> Float[Array, ""]:
-    """RRD-unbiased: the loss of RRD less the variance that the drawing adds, so that its expectation is RD's loss."""
-    correction = jnp.sum(weight * subsampling_variance(r_hat, length)) / jnp.maximum(jnp.sum(weight > 0), 1)
-    return squared_error(jnp.mean(r_hat, axis=1), target, weight) - correction
+    """RRD-unbiased: the loss of RRD less the `subsampling_variance`, so that its expectation is RD's loss."""
+    correction = jnp.sum(weight * variance) / jnp.maximum(jnp.sum(weight > 0), 1)
+    return squared_error(mean, target, weight) - correction
 
 
 def episode_weight(

@@ -128,4 +128,4 @@ class STAS(eqx.Module):
         order = jnp.arange(agents) if key is None else jax.random.permutation(order_key, agents)
         drop = None if key is None else drop
         x = self.coalitions(jnp.swapaxes(x, 1, 2) + self.number[order], drawn_key, drop)
-        return Decoded(self.last(x)[..., 0].reshape(rows, agents), jnp.zeros(()))
+        return Decoded(self.last(x)[..., 0].reshape(rows, agents), jnp.zeros(rows))

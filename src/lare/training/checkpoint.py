@@ -87,7 +87,7 @@ def save(
         with np.load(directory / STATE, allow_pickle=False) as saved:
             start, segments = saved[".replay.next_row"], json.loads(str(saved["segments"]))
     # The frontier row is saved again: it held only the newest observation when it was saved before. And where an
-    # episode was dropped on resuming, its rows have been written anew.
+    # episode has just been dropped, the end has come back.
     start = np.minimum(start, end)
     count = end - start + 1
     width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations

@@ -91,7 +91,7 @@ class Lane:
         return before, taken, reward, self.observation, bool(terminated), bool(terminated or truncated)
 
     def checked(self, value: object, what: str) -> np.ndarray:
-        array = np.asarray(value, np.float32)
+        array = np.array(value, np.float32)  # a copy: the environment may write the next one into the same memory
         if not np.isfinite(array).all():
             bad = array[~np.isfinite(array)][0]
             raise EnvironmentFault(

@@ -166,13 +166,14 @@ def draw_credit(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -
 
 
 def draw_parts_of_episodes(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> CreditDraws:
-    """K steps of each of `steps // K` episodes, for RRD."""
+    """K steps of each of `steps // K` episodes, for RRD; of a shorter episode all, and padding."""
     episodes_key, steps_key = jax.random.split(key)
     drawn, count = recipe.credit.drawn_steps, max(1, recipe.credit.steps // recipe.credit.drawn_steps)
     episodes = replay.draw_episodes(held, episodes_key, (updates, count))
     steps = episodes.first[..., None] + replay.draw_steps(steps_key, episodes.length, drawn)
-    episode = jnp.broadcast_to(jnp.repeat(jnp.arange(count), drawn), (updates, count * drawn))
-    return CreditDraws(steps.reshape(updates, -1), episode, episodes)
+    belongs = jnp.arange(drawn) < episodes.length[..., None]
+    episode = jnp.where(belongs, jnp.arange(count)[:, None], count)
+    return CreditDraws(steps.reshape(updates, -1), episode.reshape(updates, -1), episodes)
 
 
 def draw_padded_episodes(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> CreditDraws:

@@ -228,12 +228,11 @@ def draw_episodes(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> 
 
 
 def draw_steps(key: PRNGKeyArray, length: Int[Array, "*episodes"], drawn: int) -> Int[Array, "*episodes {drawn}"]:
-    """K of the steps 0..T-1 of each episode, without replacement; with replacement where T < K.
+    """K of the steps 0..T-1 of each episode, without replacement; where T < K all of them, and then the last one again.
 
     Floyd's algorithm (Bentley and Floyd, 1987): for j = T-K .. T-1 take a uniform t of 0..j, or j where t was taken
     before. O(K^2) on K numbers, whatever T is, for all the episodes at once.
     """
-    repeats_key, key = jax.random.split(key)
     uniform = jax.random.uniform(key, (drawn, *length.shape))
 
     def take(chosen: Int[Array, "*episodes K"], turn: tuple[Int[Scalar, ""], Float[Array, "*episodes"]]):
@@ -245,5 +244,5 @@ def draw_steps(key: PRNGKeyArray, length: Int[Array, "*episodes"], drawn: int) -
 
     nothing = jnp.full((*length.shape, drawn), -1, jnp.int32)
     distinct, _ = jax.lax.scan(take, nothing, (jnp.arange(drawn), uniform))
-    repeats = jax.random.randint(repeats_key, distinct.shape, 0, length[..., None])
-    return jnp.where((length >= drawn)[..., None], distinct, repeats)
+    whole = jnp.minimum(jnp.arange(drawn), length[..., None] - 1)
+    return jnp.where((length >= drawn)[..., None], distinct, whole)

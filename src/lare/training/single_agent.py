@@ -123,6 +123,7 @@ class Session:
                 )
         if any(dropped):
             self.learner = drop(self.learner, jnp.asarray(dropped))
+            self.save()  # before a new episode is in the rows of the dropped one, which the checkpoint has as written
         return messages
 
     def close(self) -> None:

@@ -187,7 +187,7 @@ def fit(
     assert recipe.method.fit is not None
     held, settings, way = learner.replay, recipe.agents.credit, recipe.method.fit
     count = max(1, settings.steps // STEPS)
-    drawn = STEPS if way is Fit.ALL_STEPS else settings.drawn_steps
+    drawn = STEPS if way is Fit.ALL_STEPS else min(settings.drawn_steps, STEPS)
     parts = count // math.gcd(count, max(1, PART // (drawn * recipe.task.agents)))
     length, ones = jnp.full(count, STEPS), jnp.ones(count)
 
