@@ -2,11 +2,11 @@
 
 Every decoder is called with rows of features, in one shape:
 
-    decoder(features [rows *agents features], key) -> Decoded(r_hat [rows *agents], penalty)
+    decoder(features [rows *agents features], key) -> Decoded(r_hat [rows *agents], penalty [rows])
 
-The mean of `penalty` is added to the loss of the return decomposition. `key` is for decoders that draw while they learn; without one
-they give what the algorithm is to be trained on. Those that look across steps and agents have files of their own,
-`arel.py` and `stas.py`; their rows must be whole episodes, one behind the other.
+The mean of `penalty` is added to the loss of the return decomposition. `key` is for decoders that draw while they
+learn; without one they give what the algorithm is to be trained on. Those that look across steps and agents have files
+of their own, `arel.py` and `stas.py`; their rows must be whole episodes, one behind the other.
 """
 
 from typing import NamedTuple
