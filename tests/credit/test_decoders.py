@@ -13,13 +13,13 @@ from lare.credit.attention import LayerNorm, attend, causal
 from lare.credit.decoders import Bottleneck, StepDecoder
 from lare.credit.decomposition import CreditSettings, Episodes
 from lare.credit.methods import TABLE, Decoder, Fit
-from lare.credit.stas import STAS
+from lare.credit.stas import STAS, USED
 
 EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
 KEY = jax.random.key(1)
 KINDS = {
-    "step": partial(StepDecoder, FEATURES, (8,)),
-    "bottleneck": partial(Bottleneck, FEATURES, (8,), 2, 0.1),
+    "step": partial(StepDecoder, FEATURES, (8,), 2.0),
+    "bottleneck": partial(Bottleneck, FEATURES, (16,), 2, (8,), 0.1, 2.0),
     "arel": partial(AREL, FEATURES, STEPS),
     "stas": partial(STAS, FEATURES, STEPS, AGENTS),
 }
@@ -121,6 +121,15 @@ def test_attention_against_plain_sums():
             weights = np.exp(scores) / np.exp(scores).sum()
             want = weights @ value[: token + 1, head]
             np.testing.assert_allclose(got[token, 3 * head : 3 * head + 3], want, rtol=1e-4, atol=1e-6)
+
+
+def test_stas_at_use_is_a_mean_over_draws():
+    """Which is nearer to the mean over many than a single draw is."""
+    stas, x = made("stas"), jnp.asarray(np.random.default_rng(0).normal(size=(2, STEPS, AGENTS, 128)), jnp.float32)
+    draws = np.stack([stas.among_agents(x, key, None) for key in jax.random.split(jax.random.key(5), 60)])
+    used = np.mean([stas.among_agents(x, key, None) for key in jax.random.split(jax.random.key(0), USED)], axis=0)
+    mean = draws.mean(axis=0)
+    assert np.abs(used - mean).mean() < 0.6 * np.abs(draws - mean).mean()
 
 
 def test_layer_norm():

@@ -57,6 +57,25 @@ def test_sum_form_learns_too():
     assert np.corrcoef(r_hat, reward)[0, 1] > 0.9
 
 
+def test_many_agents_decoder_soon_reaches_the_size_of_rare_rewards():
+    """One step of one agent in 200 pays 10, and a factor says which; the mean reward of an episode is 0.05."""
+    agents, steps, episodes, settings = 6, 25, 64, CreditSettings(hidden=(64, 64, 64, 64), learning_rate=5e-4)
+    rng = np.random.default_rng(0)
+    paid = rng.uniform(size=(episodes, steps, agents)) < 0.005
+    noise = rng.normal(size=paid.shape)
+    rows = jnp.asarray(np.stack([paid, noise], axis=-1).reshape(-1, agents, 2), jnp.float32)
+    mean_reward = jnp.asarray(10 * paid.mean(axis=(1, 2)), jnp.float32)
+    state = decomposition.init(KEY, 2, METHODS["lare-rd"], settings, steps, agents)
+    state = decomposition.observe_returns(decomposition.observe_steps(state, rows), mean_reward, mean_reward > -1)
+    episode, length, ones = jnp.repeat(jnp.arange(episodes), steps), jnp.full(episodes, steps), jnp.ones(episodes)
+    batch = Episodes(rows, episode, length, mean_reward, ones)
+    update = jax.jit(lambda state: decomposition.update(state, batch, KEY, Fit.ALL_STEPS, settings)[0])
+    for _ in range(100):
+        state = update(state)
+    r_hat = np.asarray(decomposition.proxy_rewards(state, rows, settings)).ravel()
+    assert r_hat[paid.ravel()].mean() == pytest.approx(10, abs=3)  # 1.5 without the factor of sqrt(nT)
+
+
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 @pytest.mark.parametrize("what", ["scale", "feature_scale"])
 def test_scaled_returns_and_features_train_the_same(what, factor):

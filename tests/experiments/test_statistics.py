@@ -159,6 +159,24 @@ def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):
         find_runs([tmp_path / "nothing"])
 
 
+def test_what_the_task_says_anyway_makes_no_other_method(made):
+    runs = [made("a", [1.0], method="lare-rd"), made("b", [2.0], method="lare-rd", judges=toy_spec().judges)]
+    assert list(by_label(runs)) == ["lare-rd"]
+
+
+@pytest.mark.parametrize(
+    ("mean", "spread", "shown"),
+    [
+        (4576.2, 349.1, "4576 ± 349"),
+        (0.4505, 0.115, "0.451 ± 0.115"),
+        (0.0002, 0.00021, "0.000200 ± 0.000210"),
+        (0.5, 0.0, "0.5000 ± 0.000"),
+    ],
+)
+def test_three_digits_of_the_spread(mean, spread, shown):
+    assert statistics.plus_minus(mean, spread) == shown
+
+
 def test_single_seeds_have_no_intervals(made):
     compared = statistics.compare(by_label([made("a", [-347.3176]), made("b", [2.0], method="rd")]))
     assert cells(compared) == [

@@ -21,13 +21,13 @@ def test_relabelling_is_by_the_newest_decoder():
     chosen = recipe("lare-rrdu", turn=1, credit=credit)
     learner = stored(chosen)
     after, metrics = off_policy.improve(learner, jax.random.key(0), jnp.array(0), chosen)
-    draw_key, noise_key = jax.random.split(jax.random.key(0))
+    draw_key, _, noise_key = jax.random.split(jax.random.key(0), 3)
     batch = replay.read(learner.replay, off_policy.draw(learner.replay, draw_key, 1, chosen).batch[0])
     losses = []
     for decoder in (learner.credit, after.credit):
         reward = common.rewards(batch, learner._replace(credit=decoder), chosen)
         seen = Transitions(batch.observation, batch.action, reward, batch.next_observation, batch.continues)
-        key = jax.random.split(noise_key, 1)[0]
+        _, key = jax.random.split(jax.random.split(noise_key, 1)[0])
         _, measured = td3.update(learner.algorithm, seen, key, jnp.array(0), chosen.algorithm)
         losses.append(float(measured["critic/loss"]))
     assert float(metrics["critic/loss"]) == pytest.approx(losses[1], rel=1e-4)

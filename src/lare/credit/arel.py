@@ -5,11 +5,14 @@ reward a step, which every agent gets:
 
     r_hat_{i,t} = y_t = w . sum_i h_{i,t},    penalty = 20 / T^2 E Var_t(y)
 
-(Published: 20 E Var_t(y) beside the squared error of the sum of T rewards; here, beside that of their mean.)
+(Published: 20 E Var_t(y) beside the squared error of the sum of T rewards; here, beside that of their mean. y has a factor
+of sqrt(T), as other decoders have one of sqrt(nT): see `decomposition.py`.)
 
 The published adapter of LaRe's authors reads y_t, repeated over the agents, in another order than it was written, and so
 scatters it over agents and time. Here all agents get y_t at t.
 """
+
+import math
 
 import equinox as eqx
 import jax
@@ -82,7 +85,7 @@ class AREL(eqx.Module):
             x = time(x, causal(steps))
             x = jnp.swapaxes(agent(jnp.swapaxes(x, 1, 2), None), 1, 2)
         first, second, last = self.read_out
-        y = last(jnp.sum(second(first(x)), axis=1))[..., 0]
+        y = math.sqrt(steps) * last(jnp.sum(second(first(x)), axis=1))[..., 0]
         penalty = VARIANCE_PENALTY / steps**2 * jnp.var(y, axis=1, ddof=1, keepdims=True)
         return Decoded(
             jnp.broadcast_to(y.reshape(rows, 1), (rows, agents)), jnp.broadcast_to(penalty, y.shape).reshape(rows)

@@ -27,15 +27,17 @@ class Decoded(NamedTuple):
 
 
 class StepDecoder(eqx.Module):
-    """f_psi: one MLP for every step of every agent."""
+    """f_psi: one MLP for every step of every agent, times a gain."""
 
     network: MLP
+    gain: float = eqx.field(static=True)
 
-    def __init__(self, features: int, hidden: tuple[int, ...], *, key: PRNGKeyArray):
+    def __init__(self, features: int, hidden: tuple[int, ...], gain: float, *, key: PRNGKeyArray):
+        self.gain = gain
         self.network = MLP(features, hidden, 1, key=key)
 
     def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
-        return Decoded(self.network(features)[..., 0], jnp.zeros(len(features)))
+        return Decoded(self.gain * self.network(features)[..., 0], jnp.zeros(len(features)))
 
 
 class Bottleneck(eqx.Module):
@@ -47,14 +49,24 @@ class Bottleneck(eqx.Module):
     """
 
     encoder: MLP
-    network: MLP
+    decoder: StepDecoder
     beta: float = eqx.field(static=True)
 
-    def __init__(self, features: int, hidden: tuple[int, ...], size: int, beta: float, *, key: PRNGKeyArray):
+    def __init__(
+        self,
+        features: int,
+        encoder: tuple[int, ...],
+        size: int,
+        hidden: tuple[int, ...],
+        beta: float,
+        gain: float,
+        *,
+        key: PRNGKeyArray,
+    ):
         self.beta = beta
-        encoder_key, network_key = jax.random.split(key)
-        self.encoder = MLP(features, (256,), 2 * size, key=encoder_key)
-        self.network = MLP(size, hidden, 1, key=network_key)
+        encoder_key, decoder_key = jax.random.split(key)
+        self.encoder = MLP(features, encoder, 2 * size, key=encoder_key)
+        self.decoder = StepDecoder(size, hidden, gain, key=decoder_key)
 
     def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
         mean, log_variance = jnp.split(self.encoder(features), 2, axis=-1)
@@ -62,4 +74,4 @@ class Bottleneck(eqx.Module):
         if key is not None:
             z = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
         divergence = 0.5 * jnp.sum(jnp.exp(log_variance) + mean**2 - 1 - log_variance, axis=-1)
-        return Decoded(self.network(z)[..., 0], self.beta * jnp.mean(divergence.reshape(len(features), -1), axis=1))
+        return Decoded(self.decoder(z, None).r_hat, self.beta * jnp.mean(divergence.reshape(len(features), -1), axis=1))

@@ -6,10 +6,15 @@ x is what the method's encoder gives (the factors z = phi(s, a), or raw features
 R/T. Where there are many agents, every one has proxy rewards of its own, R is the mean over the agents of their returns,
 and what is fitted to it is the mean over the agents of r_hat: the same equations, credit over time and among agents.
 
+Many agents' r_hat has another factor of sqrt(nT): R/T is the mean of nT rewards, and what comes to few of them now and then
+is so much larger than their mean. Adam moves an output by the same step whatever its unit is, and the decoder of many is
+seldom fitted: without the factor it would take dozens of updates of the policy to reach the size of a rare reward.
+
 Since features and targets are normalised by statistics in the state, scaling the return, or any factor, changes nothing
 but the scale of r_hat. `normalise = false` is the published form: raw features, raw targets.
 """
 
+import math
 from typing import Annotated, NamedTuple
 
 import jax
@@ -56,10 +61,12 @@ class CreditSettings(Checked):
     """diaster: updates of its decoder before each chunk of those of an off-policy algorithm."""
     ridge: Annotated[float, Field(gt=0)] = 1.0
     """lambda of the ridge regression: so many episodes' worth of belief in no difference between steps."""
+    encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
+    """Widths of the hidden layers of VIB's encoder."""
     bottleneck: Annotated[int, Field(ge=1)] = 8
     """Size of the code in the middle of VIB."""
     divergence: Annotated[float, Field(ge=0)] = 5e-3
-    """Weight of the code's divergence beside the squared error."""
+    """Weight of the code's divergence beside the squared error of the mean (of the sum: T^2 times as much)."""
 
 
 class Episodes(NamedTuple):
@@ -95,11 +102,13 @@ def init(
     key: PRNGKeyArray, features: int, method: Method, settings: CreditSettings, steps: int, agents: int
 ) -> Decomposition:
     """An untrained decoder of the method's kind, for episodes of `steps` steps of `agents` agents."""
+    gain = 1.0 if agents == 1 else math.sqrt(steps * agents)
     match method.decoder:
         case Decoder.STEP:
-            decoder = StepDecoder(features, settings.hidden, key=key)
+            decoder = StepDecoder(features, settings.hidden, gain, key=key)
         case Decoder.BOTTLENECK:
-            decoder = Bottleneck(features, settings.hidden, settings.bottleneck, settings.divergence, key=key)
+            sizes = settings.encoder, settings.bottleneck, settings.hidden
+            decoder = Bottleneck(features, *sizes, settings.divergence, gain, key=key)
         case Decoder.AREL:
             decoder = AREL(features, steps, key=key)
         case Decoder.STAS:

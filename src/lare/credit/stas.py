@@ -5,10 +5,11 @@ mean approximates the Shapley value of an agent:
 
     r_hat_{i,t} = w . mean_k attention(h_t, mask_k)_i,    mask_k ~ Bernoulli(1/2)^{n x n}, 1 on the diagonal
 
-Learning draws coalitions, agent numbers and dropout anew at each update. At use the published code goes on drawing; here
-the coalitions are the same at every call, and so are the rewards that it gives.
+Learning draws coalitions, agent numbers and dropout anew for each part of a batch. At use the published code goes on
+drawing; here the reward is the mean over `USED` draws, the same at every call.
 """
 
+import math
 from functools import partial
 
 import equinox as eqx
@@ -21,6 +22,9 @@ from lare.credit.decoders import Decoded
 from lare.networks import MLP, Linear
 
 SIZE, HEADS, LAYERS, COALITIONS, DROPOUT = 128, 4, 3, 5, 0.5
+
+USED = 8
+"""Draws of coalitions and agent numbers whose mean is what the policy is paid."""
 
 
 def dropout(x: Float[Array, "..."], key: PRNGKeyArray | None) -> Float[Array, "..."]:
@@ -122,10 +126,22 @@ class STAS(eqx.Module):
         rows, agents = features.shape[:2]
         x = self.embed(features).reshape(-1, len(self.step), agents, SIZE)
         x = jnp.swapaxes(x, 1, 2) + self.step
-        drawn_key, order_key, drop, *keys = jax.random.split(jax.random.key(0) if key is None else key, 3 + LAYERS)
+        drawn_key, drop, *keys = [None] * (2 + LAYERS) if key is None else jax.random.split(key, 2 + LAYERS)
         for layer, layer_key in zip(self.layers, keys, strict=True):
-            x = layer(x, None if key is None else layer_key)
-        order = jnp.arange(agents) if key is None else jax.random.permutation(order_key, agents)
-        drop = None if key is None else drop
-        x = self.coalitions(jnp.swapaxes(x, 1, 2) + self.number[order], drawn_key, drop)
-        return Decoded(self.last(x)[..., 0].reshape(rows, agents), jnp.zeros(rows))
+            x = layer(x, layer_key)
+        x = jnp.swapaxes(x, 1, 2)
+        if drawn_key is not None:
+            r_hat = self.among_agents(x, drawn_key, drop)
+        else:
+            draws = jax.lax.map(lambda one: self.among_agents(x, one, None), jax.random.split(jax.random.key(0), USED))
+            r_hat = jnp.mean(draws, axis=0)
+        return Decoded(r_hat.reshape(rows, agents), jnp.zeros(rows))
+
+    def among_agents(
+        self, x: Float[Array, "episodes steps agents size"], key: PRNGKeyArray, drop: PRNGKeyArray | None
+    ) -> Float[Array, "episodes steps agents"]:
+        """The agents' shares by one draw of coalitions, and of the numbers that they are told apart by."""
+        coalitions_key, order_key = jax.random.split(key)
+        order = jax.random.permutation(order_key, len(self.number))
+        gain = math.sqrt(self.number.shape[0] * self.step.shape[0])
+        return gain * self.last(self.coalitions(x + self.number[order], coalitions_key, drop))[..., 0]

@@ -71,8 +71,10 @@ def correlations(
 
 
 def factor_correlations(learner: Learner, recipe: Recipe) -> Float[np.ndarray, " factors"]:
+    known = int(jnp.min(learner.replay.transitions - jax.vmap(replay.oldest_transition)(learner.replay)))
+
     def recent(held: replay.Replay) -> replay.Draw:
-        return replay.read(held, jnp.maximum(held.transitions - 1 - jnp.arange(RECENT), replay.oldest_transition(held)))
+        return replay.read(held, held.transitions - 1 - jnp.arange(min(RECENT, known)))
 
     steps = jax.vmap(recent)(learner.replay)
     reward = np.asarray(steps.reward).ravel()

@@ -10,7 +10,8 @@ from lare.credit.methods import find_method
 from lare.errors import LareError
 from lare.latent.design import CANDIDATES
 from lare.tasks.spec import TaskSpec
-from lare.training.run import CONFIG, read_config, read_metrics
+from lare.training.checkpoint import saved_step
+from lare.training.run import CHECKPOINT, CONFIG, read_config, read_metrics
 from lare.training.settings import Plan, Settings, decide
 
 
@@ -33,7 +34,12 @@ class Job:
 
     @property
     def done(self) -> bool:
-        return self.begun and self.step() == self.plan.steps
+        """Whether every seed has come to its end, and the checkpoint with them, where one has been kept."""
+        if not self.begun:
+            return False
+        ended = {line["seed"] for line in read_metrics(self.directory) if line["step"] == self.plan.steps}
+        saved = saved_step(self.directory / CHECKPOINT)
+        return ended == set(self.plan.all_seeds) and saved in (None, self.plan.steps)
 
     @property
     def begun(self) -> bool:
@@ -54,7 +60,7 @@ def check(job: Job) -> None:
         config = read_config(job.directory)
         if config.task.digest != job.task.digest:
             raise LareError(f"{job.directory} holds a run of another task: choose another out")
-        theirs, ours = config.settings.in_force(), job.plan.in_force()
+        theirs, ours = config.settings.in_force(config.task), job.plan.in_force(job.task)
         if differing := [name for name in ours if theirs.get(name) != ours[name]]:
             name = differing[0]
             raise LareError(

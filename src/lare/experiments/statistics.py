@@ -52,9 +52,9 @@ class Estimate:
 
 
 def rounded(number: float, spread: float) -> str:
-    """A number to three digits of its spread, or to four of its own where it has none; never more than three places."""
+    """A number to three digits of its spread, or to four of its own where it has none; never more than six places."""
     digits, size = (2, spread) if spread > 0 else (3, abs(number))
-    places = min(max(digits - math.floor(math.log10(size)), 0), 3) if size > 0 else 3
+    places = min(max(digits - math.floor(math.log10(size)), 0), 6) if size > 0 else 3
     return f"{number:.{places}f}"
 
 
@@ -152,7 +152,7 @@ def compare(runs: Mapping[str, Sequence[Run]], key: str = RETURN) -> Comparison:
 
 def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """The runs by method; with the algorithm where several are compared, and with whatever else tells runs of a method apart."""
-    plans = [run.config.settings.in_force() for run in runs]
+    plans = [run.config.settings.in_force(run.config.task) for run in runs]
     several = len({plan["algorithm"] for plan in plans}) > 1
     found: dict[str, list[Run]] = {}
     for run, plan in zip(runs, plans, strict=True):

@@ -125,6 +125,15 @@ def load(directory: Path, template: Some, by_row: Sequence[str]) -> tuple[Some, 
     return learner, host, {name: array for name, array in state.items() if not name.startswith(".")}
 
 
+def saved_step(directory: Path) -> int | None:
+    """The step of the last checkpoint; None where there is none that can be read."""
+    try:
+        with np.load(directory / STATE, allow_pickle=False) as saved:
+            return json.loads(str(saved["host"]))["step"]
+    except (OSError, ValueError, KeyError, EOFError):
+        return None
+
+
 def fill(template: Some, state: Mapping[str, np.ndarray], by_row: Sequence[str]) -> Some:
     known = named_leaves(template, by_row)
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)

@@ -52,18 +52,19 @@ def improve(
     learner: Learner, key: PRNGKeyArray, done: Int[Scalar, ""], recipe: Recipe
 ) -> tuple[Learner, dict[str, Float[Array, ""]]]:
     """A chunk of updates, one for each of its steps; the mean of each metric over them."""
-    draw_key, noise_key = jax.random.split(key)
+    draw_key, fit_key, noise_key = jax.random.split(key, 3)
     fitted = {}
     if recipe.method.fit is not None and recipe.method.fit.apart:
-        learner, fitted = common.fit_often(learner, jax.random.fold_in(key, 1), recipe.credit.fits, recipe)
+        learner, fitted = common.fit_often(learner, fit_key, recipe.credit.fits, recipe)
     held, settings, updates = learner.replay, settings_of(recipe), recipe.turn
 
     def one(carry: tuple[Any, Decomposition | None], turn: tuple[Int[Scalar, ""], Draws, PRNGKeyArray]):
         algorithm, credit = carry
         number, draws, key = turn
+        fit_key, key = jax.random.split(key)
         measured = {}
         if credit is not None and draws.credit is not None:
-            credit, measured = common.fit(credit, held, draws.credit, jax.random.fold_in(key, 1), recipe)
+            credit, measured = common.fit(credit, held, draws.credit, fit_key, recipe)
         batch = replay.read(held, draws.batch)
         reward = rewards(batch, learner._replace(credit=credit), recipe)
         batch = Transitions(batch.observation, batch.action, reward, batch.next_observation, batch.continues)

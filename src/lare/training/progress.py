@@ -104,9 +104,9 @@ class TensorBoard:
         except ImportError:
             raise LareError("TensorBoard events need an extra: pip install 'lare-rl[tensorboard]'") from None
         # What an earlier process wrote behind the checkpoint comes again, and is purged.
+        purge = step + 1 if step else None
         self.writers = {
-            seed: SummaryWriter(str(directory / f"seed-{seed}"), purge_step=step or None, flush_secs=10)
-            for seed in seeds
+            seed: SummaryWriter(str(directory / f"seed-{seed}"), purge_step=purge, flush_secs=10) for seed in seeds
         }
 
     def started(self, name: str, step: int, steps: int) -> None: ...

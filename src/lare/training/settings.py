@@ -36,6 +36,7 @@ class AgentSettings(Checked):
         weight_decay=1e-5,
         drawn_steps=10,
         steps=6400,
+        encoder=(256,),
         bottleneck=4,
         divergence=1e-3,
     )
@@ -152,13 +153,13 @@ class Plan(Settings):
         """The figures of the algorithm."""
         return getattr(self, self.algorithm)
 
-    def in_force(self) -> dict[str, Any]:
+    def in_force(self, task: TaskSpec) -> dict[str, Any]:
         """All that matters here, by dotted names as on the command line: not the figures of other algorithms."""
         kind = ALGORITHMS[self.algorithm].kind
         idle = {*ALGORITHMS, "rollout", "agents", "credit"} - {self.algorithm}
         idle -= {"agents"} if kind is Kind.MANY_AGENTS else {"credit"}
         idle -= {"rollout"} if kind is Kind.ON_POLICY else set()
-        return dict(dotted(self.model_dump(exclude=idle)))
+        return dict(dotted(self.model_dump(exclude=idle))) | {"judges": self.judges or task.judges}
 
     @property
     def episodes(self) -> int:

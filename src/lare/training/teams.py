@@ -10,7 +10,6 @@ for where there are several teams.
 Functions are written for one seed; `compiled` gives them their leading seed axis.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -188,7 +187,8 @@ def fit(
     held, settings, way = learner.replay, recipe.agents.credit, recipe.method.fit
     count = max(1, settings.steps // STEPS)
     drawn = STEPS if way is Fit.ALL_STEPS else min(settings.drawn_steps, STEPS)
-    parts = count // math.gcd(count, max(1, PART // (drawn * recipe.task.agents)))
+    fitting = max(1, PART // (drawn * recipe.task.agents))
+    parts = min(parts for parts in range(1, count + 1) if count % parts == 0 and count // parts <= fitting)
     length, ones = jnp.full(count, STEPS), jnp.ones(count)
 
     def one(credit: tuple[Decomposition, ...], key: PRNGKeyArray):
@@ -199,8 +199,8 @@ def fit(
             steps = draw_steps(steps_key, length, drawn)
             rows = jnp.take_along_axis(rows, steps[..., None, None], axis=1)
         episode = jnp.tile(jnp.repeat(jnp.arange(count // parts), drawn), parts)
-        fitted, losses = [], []
-        for old, team, size in zip(credit, recipe.task.teams, recipe.features, strict=True):
+        fitted, losses, keys = [], [], jax.random.split(key, len(credit))
+        for old, team, size, key in zip(credit, recipe.task.teams, recipe.features, keys, strict=True):
             batch = Episodes(of_team(rows, team, size), episode, length, mean_rewards(reward, team), ones)
             batch = jax.tree.map(lambda whole: whole.reshape(parts, -1, *whole.shape[1:]), batch)
             new, measured = decomposition.update_in_parts(old, batch, key, way, settings)

@@ -104,7 +104,7 @@ def test_figures_claims_and_verdicts(made_up, tmp_path):
     text = reproduce("errors", BUDGETS["laptop"], Share(), tmp_path / "runs", tmp_path / "out").read_text()
     places = {label: list(METHODS).index(name) / 10 for label, name in (("RD", "rd"), ("LaRe-RRDu", "lare-rrdu"))}
     assert "50,000 environment steps, seeds 0 to 2, draw 0 of the language model." in text
-    assert f"| RD | {places['RD']:.3f} |" in text
+    assert f"| RD | {places['RD']:.4f} |" in text
     assert "| 0.7 ± 0.5 |" in text
     assert places["RD"] < places["LaRe-RRDu"]
     assert "| LaRe-RRDu errs less than RD | 0 of 9 | 0 of 9 | 1.000 | the other way round |" in text
@@ -123,11 +123,29 @@ def test_draws_are_what_is_compared_where_there_are_several(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("for_it", "against", "said"),
-    [(0.025, 1.0, "yes"), (0.05, 1.0, "open"), (0.5, 0.5, "open"), (1.0, 0.02, "the other way round")],
+    ("for_it", "against", "everywhere", "at_least", "said"),
+    [
+        (0.025, 1.0, True, False, "yes"),
+        (0.025, 1.0, False, False, "not on every task"),
+        (0.05, 1.0, True, False, "open"),
+        (0.5, 0.5, True, False, "open"),
+        (0.5, 0.5, True, True, "not refuted"),
+        (1.0, 0.02, False, False, "the other way round"),
+        (1.0, 0.02, False, True, "the other way round"),
+    ],
 )
-def test_verdicts(for_it, against, said):
-    assert verdict(for_it, against) == said
+def test_verdicts(for_it, against, everywhere, at_least, said):
+    assert verdict(for_it, against, everywhere, at_least) == said
+
+
+@pytest.mark.parametrize("budget", BUDGETS.values(), ids=BUDGETS)
+def test_no_two_contenders_share_a_run_by_chance(budget):
+    """A directory is one run, whoever asks for it."""
+    plans = {}
+    for exhibit in TABLE:
+        for of_task in jobs_of(exhibit, budget, Path("runs")).values():
+            for job in (job for some in of_task.values() for job in some):
+                assert plans.setdefault(job.directory, job.plan) == job.plan
 
 
 def test_what_is_shared_or_done_is_not_trained_again(made_up, monkeypatch, tmp_path):

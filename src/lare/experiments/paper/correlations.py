@@ -132,8 +132,9 @@ def of_agents(name: str, episodes: int) -> Steps:
     task = find_particle_task(name)
 
     def step(state: State, key: PRNGKeyArray) -> tuple[State, tuple[Array, ...]]:
-        choice = jax.random.randint(key, (task.agents,), 0, ACTIONS)
-        after = task.step(state, choice, key)
+        choice_key, step_key = jax.random.split(key)
+        choice = jax.random.randint(choice_key, (task.agents,), 0, ACTIONS)
+        after = task.step(state, choice, step_key)
         row = (task.observe(state), jax.nn.one_hot(choice, ACTIONS), task.observe(after), task.reward(after))
         return after, row
 

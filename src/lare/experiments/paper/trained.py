@@ -1,6 +1,7 @@
 """Exhibits that are made of runs: which runs, and the page of what came out of them."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +34,9 @@ LEVEL = 0.025
 JUDGED = (
     "So many pairs of runs, one of each, in which it is so (a run is a seed; where both have several draws, a draw, mean over its "
     f"seeds). p: the chance of as many or more by luck, over all tasks, exact (Mann and Whitney). Decided at {LEVEL}, for it or "
-    "against it, each claim by itself: of twenty where there is no difference, one would be. Three seeds on one task decide "
-    "nothing: p is 0.05 at least."
+    "against it, each claim by itself: of twenty where there is no difference, one would be. It is so only if it wins half of the "
+    "pairs on every task. What is said to be at least as good is not refuted as long as nothing is decided against it. Three seeds "
+    "on one task decide nothing: p is 0.05 at least."
 )
 
 OF_ONE_AGENT = (
@@ -70,7 +72,8 @@ def jobs_of_contender(one: Contender, budget: Budget, name: str, root: Path) -> 
     usual = {"method": one.method, "algorithm": one.algorithm, "steps": steps, "seeds": budget.seeds}
     latent = find_method(one.method).latent
     for draw in range(min(budget.draws, one.draws) if latent else 1):
-        yield job_of(root, task, Settings(**{**one.settings, **budget.settings, **usual, "draw": draw}))
+        job = job_of(root, task, Settings(**{**one.settings, **budget.settings, **usual, "draw": draw}))
+        yield replace(job, directory=job.directory.with_name(job.directory.name + one.ending))
 
 
 def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
@@ -93,7 +96,7 @@ def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
         protocol(every),
         *(part for name in jobs for part in of_one_task(exhibit, name, runs[name], found[name])),
         "## What the paper says, and what came out",
-        table(["the paper", *found, "p", "here"], (claimed(*pair, exhibit, found) for pair in pairs(exhibit.claims))),
+        table(["the paper", *found, "p", "here"], (claimed(*one, exhibit, found) for one in pairs(exhibit.claims))),
         JUDGED,
         "## What differs from the paper",
         items(differences(exhibit, budget, len(runs), one_agent)),
@@ -186,23 +189,26 @@ def picture(found: Comparison, key: str) -> str:
     return figures.bands(lines, "environment steps", f"{meaning(key)}, IQM", steps=True)
 
 
-def pairs(claims: Iterable[Claim]) -> Iterator[tuple[str, str]]:
-    return ((claim.better, other) for claim in claims for other in claim.others)
+def pairs(claims: Iterable[Claim]) -> Iterator[tuple[Claim, str]]:
+    return ((claim, other) for claim in claims for other in claim.others)
 
 
-def claimed(better: str, worse: str, exhibit: Exhibit, found: Mapping[str, Comparison]) -> list[str]:
+def claimed(claim: Claim, other: str, exhibit: Exhibit, found: Mapping[str, Comparison]) -> list[str]:
     """A row: what is claimed, in how many pairs of runs it is so on each task, and what that says of all of them."""
-    pairs = [units(one.groups[better], one.groups[worse]) for one in found.values()]
+    pairs = [units(one.groups[claim.better], one.groups[other]) for one in found.values()]
     if exhibit.key == ERROR:
         pairs = [(-ours, -theirs) for ours, theirs in pairs]
-    counts = [f"{pairs_won(ours, theirs):g} of {len(ours) * len(theirs)}" for ours, theirs in pairs]
+    won = [pairs_won(ours, theirs) for ours, theirs in pairs]
+    of = [len(ours) * len(theirs) for ours, theirs in pairs]
     chance = chance_of_as_many(pairs)
-    decided = verdict(chance, chance_of_as_many([(theirs, ours) for ours, theirs in pairs]))
+    contrary = chance_of_as_many([(theirs, ours) for ours, theirs in pairs])
+    everywhere = all(2 * count >= all_of_them for count, all_of_them in zip(won, of, strict=True))
+    says = "errs less than" if exhibit.key == ERROR else "is at least as good as" if claim.at_least else "is above"
     return [
-        f"{better} {'errs less than' if exhibit.key == ERROR else 'is above'} {worse}",
-        *counts,
+        f"{claim.better} {says} {other}",
+        *(f"{count:g} of {all_of_them}" for count, all_of_them in zip(won, of, strict=True)),
         f"{chance:.3f}",
-        decided,
+        verdict(chance, contrary, everywhere, claim.at_least),
     ]
 
 
@@ -213,8 +219,10 @@ def units(one: Group, other: Group) -> tuple[np.ndarray, np.ndarray]:
     return ours, theirs
 
 
-def verdict(chance: float, contrary: float) -> str:
-    """Of a claim, by the chances of as many pairs for it and against it."""
+def verdict(chance: float, contrary: float, everywhere: bool, at_least: bool) -> str:
+    """Of a claim, by the chances of as many pairs for it and against it, and whether it wins half of them on every task."""
+    if contrary <= LEVEL:
+        return "the other way round"
     if chance <= LEVEL:
-        return "yes"
-    return "the other way round" if contrary <= LEVEL else "open"
+        return "yes" if everywhere else "not on every task"
+    return "not refuted" if at_least else "open"
