@@ -16,7 +16,8 @@ x_k = S^-1 (z_k - their mean), Proposition 1 says that with probability 1 - delt
     |w - w_hat|_A <= l_k = sqrt(d / 4 T log((1 + k L^2 / lambda) / (delta / 10))) + sqrt(lambda d)
 
 (its T-fold noise in a return is 1/T of that in a mean; L is the largest |x_k|, and sum_k |x_k|^2, which is no more, stands
-for k L^2), and so |r - r_hat| <= l_k |x|_{A^-1} where rewards are linear in the factors.
+for k L^2), and so |r - r_hat| <= l_k |x|_{A^-1} where rewards are linear in the factors, w x + b with |w| <= sqrt(d): nearly
+equal factors whose large weights cancel break it.
 """
 
 import itertools

@@ -171,7 +171,7 @@ def one_agent_details(run: Run) -> Iterable[str]:
                 ""
                 if credit.uncertainty is None
                 else f" The band holds the true reward with a probability of {1 - DELTA / 10:.0%} where rewards are linear "
-                "in the factors (Proposition 1 of the paper)."
+                "in the factors, with weights that are not large (Proposition 1 of the paper)."
             )
         )
     if run.function is not None:
