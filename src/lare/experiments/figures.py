@@ -86,14 +86,23 @@ Points = Float[np.ndarray, " points"]
 
 
 def bands(
-    by_name: Mapping[str, tuple[Points, Points, Points, Points]], across: str, up: str, steps: bool = False
+    by_name: Mapping[str, tuple[Points, Points, Points, Points]],
+    across: str,
+    up: str,
+    steps: bool = False,
+    decades: bool = False,
 ) -> str:
-    """Curves (x, y), each with an interval (low, high) at every point. Where x counts no `steps`, y is a share: stairs."""
+    """Curves (x, y), each with an interval (low, high) at every point. Where x counts no `steps`, y is a share: stairs.
+
+    With `decades`, y goes by its logarithm.
+    """
     figure, (axes,) = new_figure()
     for colour, (name, (x, y, low, high)) in zip(COLOURS * len(by_name), by_name.items(), strict=False):
         axes.plot(x, y, color=colour, label=name, drawstyle="default" if steps else "steps-post")
         axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if steps else "post")
     axes.set(xlabel=across, ylabel=up)
+    if decades:
+        axes.set_yscale("log")
     if steps:
         axes.xaxis.set_major_formatter(in_thousands)
     legend_above(axes)
