@@ -21,7 +21,7 @@ KINDS = {
     "step": partial(StepDecoder, FEATURES, (8,), 2.0),
     "bottleneck": partial(Bottleneck, FEATURES, (16,), 2, (8,), 0.1, 2.0),
     "arel": partial(AREL, FEATURES, STEPS),
-    "stas": partial(STAS, FEATURES, STEPS, AGENTS),
+    "stas": partial(STAS, FEATURES, STEPS, AGENTS, 2.0),
 }
 
 

@@ -112,7 +112,7 @@ def init(
         case Decoder.AREL:
             decoder = AREL(features, steps, key=key)
         case Decoder.STAS:
-            decoder = STAS(features, steps, agents, key=key)
+            decoder = STAS(features, steps, agents, gain, key=key)
         case Decoder.DIASTER:
             decoder = Diaster(features, settings.hidden, key=key)
         case Decoder.LINEAR:
@@ -197,14 +197,11 @@ def loss_and_gradient(
         return losses_of(r_hat) + penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
 
     def losses_of(r_hat: Float[Array, " rows"]) -> Float[Array, ""]:
-        if fit is Fit.ALL_STEPS:
-            mean = losses.episode_means(r_hat, episodes.episode, episodes.length)
+        seen = episodes.length if fit is Fit.ALL_STEPS else jnp.minimum(episodes.length, len(r_hat) // len(target))
+        mean = losses.episode_means(r_hat, episodes.episode, seen)
+        if fit in (Fit.ALL_STEPS, Fit.DRAWN_STEPS):
             return losses.squared_error(mean, target, weight)
-        drawn = r_hat.reshape(len(target), -1)
-        mean = losses.episode_means(r_hat, episodes.episode, jnp.minimum(episodes.length, drawn.shape[1]))
-        if fit is Fit.DRAWN_STEPS:
-            return losses.squared_error(mean, target, weight)
-        variance = losses.subsampling_variance(drawn, episodes.length)
+        variance = losses.subsampling_variance(r_hat.reshape(len(target), -1), episodes.length)
         return losses.unbiased_squared_error(mean, target, weight, variance)
 
     return jax.value_and_grad(loss_of)(state.decoder)

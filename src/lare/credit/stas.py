@@ -9,7 +9,6 @@ Learning draws coalitions, agent numbers and dropout anew for each part of a bat
 drawing; here the reward is the mean over `USED` draws, the same at every call.
 """
 
-import math
 from functools import partial
 
 import equinox as eqx
@@ -112,8 +111,10 @@ class STAS(eqx.Module):
     layers: tuple[TimeLayer, ...]
     coalitions: Coalitions
     last: Linear
+    gain: float = eqx.field(static=True)
 
-    def __init__(self, features: int, steps: int, agents: int, *, key: PRNGKeyArray):
+    def __init__(self, features: int, steps: int, agents: int, gain: float, *, key: PRNGKeyArray):
+        self.gain = gain
         embed_key, step_key, number_key, layers_key, coalitions_key, last_key = jax.random.split(key, 6)
         self.embed = Linear(features, SIZE, key=embed_key)
         self.step = jax.random.normal(step_key, (steps, SIZE))
@@ -143,5 +144,4 @@ class STAS(eqx.Module):
         """The agents' shares by one draw of coalitions, and of the numbers that they are told apart by."""
         coalitions_key, order_key = jax.random.split(key)
         order = jax.random.permutation(order_key, len(self.number))
-        gain = math.sqrt(self.number.shape[0] * self.step.shape[0])
-        return gain * self.last(self.coalitions(x + self.number[order], coalitions_key, drop))[..., 0]
+        return self.gain * self.last(self.coalitions(x + self.number[order], coalitions_key, drop))[..., 0]
