@@ -66,6 +66,32 @@ def test_an_unknown_choice_lists_those_there_are(command):
     assert "'None'" not in err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            "CN-6 --credit.no-normalise",
+            "credit.normalise makes no difference to ippo on CN-6; it has agents.credit.normalise",
+        ),
+        ("CN-6 --scale-rewards", "scale_rewards makes no difference to ippo on CN-6"),
+        ("CN-6 --capacity 10", "capacity makes no difference to ippo on CN-6; it has agents.capacity"),
+        (
+            "Reacher-v4 --sac.learning-rate 1",
+            "sac.learning_rate makes no difference to td3 on Reacher-v4; it has td3.learning_rate",
+        ),
+        ("Reacher-v4 --algorithm ppo --chunk 10", "chunk makes no difference to ppo on Reacher-v4"),
+        (
+            "Reacher-v4 --draw 1 --function phi.py",
+            "--draw and --candidates choose a recorded function, and --function gives one: leave either out",
+        ),
+        ("Reacher-v4 --seed 2147483647 --seeds 2", "seed = 2147483647 and 1 that follow it: the largest is 2147483647"),
+    ],
+)
+def test_settings_that_make_no_difference_are_refused(arguments, message, command, tmp_path):
+    assert command("train", *arguments.split()) == (2, "", f"lare: {message}\n")
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_version_names_the_commit(command):
     assert command("--version") == (0, f"{source()}\n", "")
 

@@ -14,8 +14,11 @@ class LareError(Exception):
     """A mistake that its reader can mend.
 
     The message is one line: what was wrong, where, and what would be right. The command line prints it without a
-    traceback and exits with status 2.
+    traceback.
     """
+
+    status = 2
+    """What the command line exits with."""
 
 
 class Checked(BaseModel):

@@ -1,4 +1,4 @@
-"""Which code this is: figures are worth little without it."""
+"""Which code this is: results are worth little without it."""
 
 import functools
 import subprocess

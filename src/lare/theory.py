@@ -109,7 +109,7 @@ def estimate(state: Estimator) -> Float[Array, " size"]:
 def radius(
     episodes: Float[Array, "*batch"], horizon: int, size: int, ridge: float, delta: float
 ) -> Float[Array, "*batch"]:
-    """l_k of Proposition 1: sqrt(T D / 4 log((1 + k T^2 / lambda) / (delta / 10))) + sqrt(lambda D)."""
+    """l_k of Proposition 1: sqrt(T D / 4 * log((1 + k T^2 / lambda) / (delta / 10))) + sqrt(lambda D)."""
     grown = jnp.log((1 + episodes * horizon**2 / ridge) / (delta / 10))
     return jnp.sqrt(horizon * size * grown / 4) + jnp.sqrt(ridge * size)
 

@@ -43,7 +43,7 @@ def train(fit, settings, scale=1.0, feature_scale=1.0, updates=600):
 
 
 @pytest.mark.parametrize("normalise", [True, False], ids=["normalised", "published"])
-@pytest.mark.parametrize("fit", list(Fit))
+@pytest.mark.parametrize("fit", [Fit.ALL_STEPS, Fit.DRAWN_STEPS, Fit.DRAWN_STEPS_UNBIASED])
 def test_must_learn_step_rewards_from_returns(fit, normalise):
     settings = CreditSettings(hidden=(32, 32), normalise=normalise, learning_rate=3e-3)
     r_hat, reward, _ = train(fit, settings)

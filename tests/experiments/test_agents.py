@@ -48,10 +48,10 @@ def test_random_actions_are_not_the_policys(runs):
 
 
 def test_true_returns_by_team(runs):
-    found = evaluate_run(runs[0].directory, 6)
+    found = evaluate_run(runs[0], 6)
     assert list(found) == ["CompetitivePP-6-predator", "CompetitivePP-6-prey"]
     assert all(values.shape == (2, 6) for values in found.values())
-    assert list(evaluate_run(runs[2].directory, 3)) == ["TriangleArea"]
+    assert list(evaluate_run(runs[2], 3)) == ["TriangleArea"]
 
 
 def test_cross_play_is_every_team_against_every_other(runs):
@@ -104,7 +104,7 @@ def test_evaluate_on_the_command_line(runs, command, tmp_path):
 
 
 def test_a_film_of_a_run(runs, tmp_path):
-    record_video(runs[0].directory, tmp_path / "film.gif")
+    record_video(runs[0], tmp_path / "film.gif")
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF8")
 
 

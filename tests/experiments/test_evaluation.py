@@ -1,8 +1,13 @@
 import numpy as np
 import pytest
 
+import lare
 from lare.errors import LareError
+from lare.experiments import evaluation
 from lare.experiments.evaluation import check_video, evaluate_run, write_video
+from lare.tasks.episodic import EpisodicReward
+from lare.training.environments import make_episodic
+from toys import toy_spec
 
 
 def test_a_gif_is_written(tmp_path):
@@ -28,8 +33,21 @@ def test_a_video_that_could_not_be_written_is_not_begun(tmp_path, name, message)
         check_video(tmp_path / name)
 
 
-def test_no_run_and_no_episodes(tmp_path):
-    with pytest.raises(LareError, match=r"is not a run: there is no config\.json in it"):
-        evaluate_run(tmp_path)
+def test_more_episodes_than_there_are_environments_begin_each_from_a_start_of_its_own(small, tmp_path, monkeypatch):
+    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    whole = evaluate_run(run, 5)["Chase"]
+    assert whole.shape == (2, 5)
+    assert len(np.unique(whole)) == 10
+    opened, closed = [], []
+    monkeypatch.setattr(evaluation, "AT_A_TIME", 2)
+    monkeypatch.setattr(evaluation, "make_episodic", lambda task: opened.append(make_episodic(task)) or opened[-1])
+    monkeypatch.setattr(EpisodicReward, "close", lambda environment: closed.append(environment))
+    np.testing.assert_allclose(evaluate_run(run, 5)["Chase"], whole, rtol=1e-5)
+    assert len(opened) == 4
+    assert set(map(id, opened)) <= set(map(id, closed))
+
+
+def test_no_episodes(small, tmp_path):
+    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
     with pytest.raises(LareError, match="episodes = 0: at least one is needed"):
-        evaluate_run(tmp_path, 0)
+        evaluate_run(run, 0)

@@ -113,6 +113,32 @@ def test_runs_of_one_method_are_told_apart_by_their_settings(made):
     assert list(by_label(runs))[1:] == ["rd, td3, credit.learning_rate 0.0001", "dense, td3", "dense, ddpg"]
 
 
+def with_function(run, *digests):
+    return Run(run.directory, run.config.model_copy(update={"function_sha256": digests}), ())
+
+
+def test_runs_of_two_functions_are_told_apart_by_them(made):
+    """Whatever their seeds are; and not where two draws of the language model make up one row."""
+    first, second = made("a", [1.0], method="lare-rd"), made("b", [2.0], method="lare-rd", seed=1)
+    dense, one, other = made("c", [3.0]), "0123456789abcdef", "fedcba9876543210"
+    runs = [with_function(first, one), with_function(second, other), dense]
+    assert list(by_label(runs)) == ["lare-rd, phi 01234567", "lare-rd, phi fedcba98", "dense"]
+    assert list(by_label([with_function(first, one), with_function(second, one)])) == ["lare-rd"]
+    drawn = made("d", [2.0], method="lare-rd", draw=1)
+    found = by_label([with_function(first, one), with_function(drawn, other)])
+    assert {label: len(runs) for label, runs in found.items()} == {"lare-rd": 2}
+
+
+def test_two_tasks_of_one_name_are_not_compared(made):
+    first, second = made("a", [1.0]), made("b", [2.0], method="rd")
+    second = Run(second.directory, second.config.model_copy(update={"task_sha256": "another"}), ())
+    with pytest.raises(LareError) as error:
+        statistics.compare(by_label([first, second]))
+    assert str(error.value) == (
+        f"{second.directory} and {first.directory} are runs of two tasks that are both called Chase: compare them apart"
+    )
+
+
 def test_something_else_than_the_return_is_compared(made):
     run = made("a", [1.0, 3.0])
     lines = [line | {"credit/error": 2 * line["seed"]} for line in run.metrics()]

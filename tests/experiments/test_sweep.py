@@ -78,9 +78,6 @@ def test_what_is_done_is_left_alone_and_what_was_begun_goes_on(file, in_this_pro
     stop = At(100, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(Interrupted):
         lare.train(first.task, lare.Settings(**first.plan.model_dump()), out=first.directory, listeners=[stop])
-    killed_early = second.directory
-    killed_early.mkdir(parents=True)
-    (killed_early / "latent_function.py").write_text("half of i")
     wanted, jobs = read_sweep(file)
     said = []
     assert run_sweep(wanted, jobs, said.append) == []
@@ -215,11 +212,29 @@ def test_a_sweep_that_is_stopped_or_killed_leaves_a_saved_run_and_nobody_behind(
 def test_a_process_that_fails_says_why(file, tmp_path):
     _, jobs = read_sweep(file)
     jobs[0].directory.mkdir(parents=True)  # as if another sweep had just begun it
-    error = processes.in_a_process(jobs[0], [], set())
+    error = processes.in_a_process(jobs[0], [], processes.Running())
     log = jobs[0].directory.with_name("dense-td3.log")
     assert error == (
         f"{jobs[0].directory} exists, and a run never overwrites another: choose another --out, or go on with --resume ({log})"
     )
+
+
+def test_a_process_that_is_killed_is_named_by_the_signal(file, monkeypatch):
+    """Not by the last line of its log, which is about how well it was going."""
+    _, jobs = read_sweep(file)
+    log = jobs[0].directory.with_name("dense-td3.log")
+    log.parent.mkdir(parents=True)
+    log.write_text("step 100 of 200: all is well\n")
+    monkeypatch.setattr(processes.sys, "executable", "/bin/false")
+    running = processes.Running()
+    assert processes.in_a_process(jobs[0], [], running) == f"exit status 1 ({log})"
+    killed = log.with_name("killed.sh")
+    killed.write_text("#!/bin/sh\nkill -9 $$\n")
+    killed.chmod(0o755)
+    monkeypatch.setattr(processes.sys, "executable", str(killed))
+    assert processes.in_a_process(jobs[0], [], running) == f"it was ended by SIGKILL ({log})"
+    running.stop()
+    assert processes.in_a_process(jobs[0], [], running) == "it was not begun: the others were being stopped"
 
 
 @pytest.mark.parametrize(
@@ -231,6 +246,15 @@ def test_a_process_that_fails_says_why(file, tmp_path):
         (("seeds = 2", "seed = -1"), "seed = -1: input should be greater than or equal to 0"),
         (("steps = 200", "steps = 201"), "steps = 201 is not a multiple of chunk = 50: take 200"),
         (('["Reacher-v4"]', '["Reacher-v5"]'), "no task 'Reacher-v5'"),
+        (("chunk = 50", 'method = "rd"'), "settings = {'steps': 200, "),
+        (
+            ("[settings]", '[functions]\nReacher = ["phi.py"]\n[settings]'),
+            "functions of Reacher, which is none of the tasks Reacher-v4",
+        ),
+        (
+            ('["Reacher-v4"]', '["Reacher-v4", "Reacher-v4"]'),
+            "Reacher-v4/dense-td3 is asked for twice; two task files need two names",
+        ),
         (("[settings]", "[settings"), "Expected"),
     ],
 )
@@ -239,6 +263,40 @@ def test_a_file_that_lies(change, message, file):
     with pytest.raises(LareError) as error:
         read_sweep(file)
     assert str(error.value).startswith(f"{file}: {message}")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("draws = [0, 3]", "draws = [7]"), "no recording of factors has draw 7; the draws are 0, 1, 2, 3, 4"),
+        (("chunk = 50", "candidates = 3"), "no recorded reply fits this request for task 'Reacher-v4' (reply 1): "),
+        (("chunk = 50", "capacity = 40"), "capacity = 40 is too small: an episode of Reacher-v4 takes up to 51"),
+        (
+            ("[settings]", '[functions]\nReacher-v4 = ["phi.py"]\n[settings]'),
+            "the function file {}/phi.py is not there",
+        ),
+    ],
+)
+def test_a_run_that_could_not_be_trained_is_found_before_any_is(change, message, file):
+    file.write_text(FILE.replace(*change))
+    with pytest.raises(LareError) as error:
+        read_sweep(file)
+    assert str(error.value).startswith(message.format(file.parent))
+
+
+def test_a_function_of_ones_own(file, tmp_path, in_this_process):
+    """It takes the place of all draws, and a run with another one is not taken for it."""
+    lare.design(lare.load_task("Reacher-v4"), draw=2).save(tmp_path / "phi.py")
+    file.write_text(FILE.replace("[settings]", '[functions]\nReacher-v4 = ["phi.py"]\n\n[settings]'))
+    wanted, jobs = read_sweep(file)
+    assert [job.directory.name for job in jobs] == ["dense-td3", "lare-linear-td3"]
+    assert run_sweep(wanted, jobs, lambda _: None) == []
+    assert open_run(jobs[1].directory).function.source == lare.load_function(tmp_path / "phi.py", jobs[1].task).source
+    (tmp_path / "phi.py").unlink(), (tmp_path / "phi.json").unlink()
+    lare.design(lare.load_task("Reacher-v4"), draw=1).save(tmp_path / "phi.py")
+    with pytest.raises(LareError) as error:
+        read_sweep(file)
+    assert str(error.value) == f"{jobs[1].directory} holds a run with another latent function: choose another out"
 
 
 def test_a_directory_with_something_else_in_it(file, in_this_process):

@@ -38,20 +38,23 @@ def test_pays_1_at_an_end_beyond_the_distance(x_position, terminated, truncated,
     assert PaysForDistance(environment).step(np.zeros(1)) == (observation, paid, *rest)
 
 
-@pytest.mark.parametrize(("distance", "last"), [(-1000.0, 1.0), (500.0, 0.0)])
-def test_the_sparse_half_cheetah_pays_nothing_until_the_end(distance, last):
-    environment = make(SPARSE_HALF_CHEETAH, distance=distance)
+def test_the_sparse_half_cheetah_pays_nothing_until_the_end():
+    environment = make(SPARSE_HALF_CHEETAH)
+    assert environment.get_wrapper_attr("distance") == 500.0  # the paper's
     environment.reset(seed=0)
     results = [environment.step(np.zeros(6, np.float32)) for _ in range(1000)]
     environment.close()
-    assert [reward for _, reward, *_ in results] == [0.0] * 999 + [last]
+    assert [reward for _, reward, *_ in results] == [0.0] * 1000
     assert [truncated for *_, truncated, _ in results] == [False] * 999 + [True]
 
 
-def test_without_a_distance_it_is_the_papers_500_metres():
-    environment = make(SPARSE_HALF_CHEETAH)
-    assert environment.get_wrapper_attr("distance") == 500.0
+def test_a_time_limit_of_ones_own_is_an_end_too():
+    environment = make(SPARSE_HALF_CHEETAH, max_episode_steps=20)
+    environment.reset(seed=0)
+    environment.set_wrapper_attr("distance", -100.0)
+    rewards = [environment.step(np.zeros(6, np.float32))[1] for _ in range(20)]
     environment.close()
+    assert rewards == [0.0] * 19 + [1.0]
 
 
 def test_registering_twice_changes_nothing():

@@ -62,6 +62,44 @@ def test_replaying_actions_leads_back():
     assert not second.replay(first.actions[:3], first.observation)
 
 
+def test_an_environment_that_writes_into_one_array_is_stored_as_it_was_then():
+    class Counts(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-99, 99, (1,), np.float32)
+        action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+        def __init__(self):
+            self.state = np.zeros(1, np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            self.state[:] = 0
+            return self.state, {}
+
+        def step(self, action):
+            self.state += 1
+            return self.state, 0.0, False, False, {}
+
+    whole, resumed = (Lane(0, EpisodicReward(Counts())) for _ in range(2))
+    for one in (whole, resumed):
+        one.begin()
+    for _ in range(3):
+        whole.step(np.zeros(1, np.float32))
+    assert resumed.replay(whole.actions, whole.observation)
+    for one in (whole, resumed):
+        before, _, _, after, _, _ = one.step(np.zeros(1, np.float32))
+        assert (before, after) == (3, 4)
+
+
+def test_a_policy_that_is_nan_is_not_blamed_on_the_environment():
+    message = "training diverged: the policy of seed 1 is not finite any more; the last checkpoint is whole"
+    lanes, spoilt = [lane(0), lane(1)], np.float32([[[0], [np.nan]]])
+    with pytest.raises(environments.Diverged) as error:
+        collect(lanes, follow, spoilt)
+    assert str(error.value) == message
+    with pytest.raises(environments.Diverged) as error:
+        evaluate([[make_episodic(toy_spec())] for _ in range(2)], lambda o: spoilt.swapaxes(0, 1), (0, 1))
+    assert str(error.value) == message
+
+
 def test_evaluations_start_alike_and_pay_the_true_return():
     def one(seeds=(0, 1)):
         return evaluate([[make_episodic(toy_spec()) for _ in range(3)] for _ in seeds], lambda o: o[..., :1] / 2, seeds)

@@ -41,7 +41,8 @@ def test_every_method_trains(method, small_many, tmp_path):
     run = lare.train(OF_CHOICE, small_many(method=method), function=given, out=tmp_path / "run", listeners=[])
     lines = check(run, ())
     assert run.config.settings.method == method
-    assert ("credit/error" in lines[-1]) == row.has_proxy
+    assert ("credit/correlation" in lines[-1]) == row.has_proxy
+    assert ("credit/error" in lines[-1]) == row.in_units
     assert bool(run.functions) == (row.encoder is Encoder.LATENT)
 
 

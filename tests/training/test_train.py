@@ -43,7 +43,8 @@ def test_every_method_trains_and_reports(method, algorithm, small, phi, reward, 
     assert all(np.isfinite(line["evaluation/return"]) for line in lines)
     learner = single_agent.load_learner(run)[1]
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((learner.algorithm, learner.credit)))
-    assert ("credit/error" in lines[-1]) == ("credit/correlation" in lines[-1]) == row.has_proxy
+    assert ("credit/correlation" in lines[-1]) == row.has_proxy
+    assert ("credit/error" in lines[-1]) == row.in_units
     assert (run.directory / "latent_function.py").exists() == (row.encoder is Encoder.LATENT)
     if algorithm == "td3":
         assert lare.write_report([run.directory]).read_text().count("<svg") >= 1
@@ -51,7 +52,7 @@ def test_every_method_trains_and_reports(method, algorithm, small, phi, reward, 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_worker_that_is_killed_or_starved_stops_the_run_and_harms_nothing(number, small, tmp_path, monkeypatch):
-    monkeypatch.setattr("lare.latent.jailed.TIME_LIMIT", 1.0)
+    monkeypatch.setattr("lare.latent.jailed.TIME_LIMIT", 4.0)
     whole = lare.train(toy_spec(), small(), function=verified(PHI, toy_spec()), out=tmp_path / "whole", listeners=[])
     function = verified(PHI, toy_spec())
     worker = function.evaluator(2, 1).program.process
@@ -284,6 +285,35 @@ def test_a_small_ring_forgets_and_goes_on(small, tmp_path):
     with pytest.raises(Interrupted):
         lare.train(toy_spec(), settings, out=tmp_path / "run", listeners=[stop])
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+
+
+def test_a_run_whose_checkpoint_was_deleted_keeps_what_it_measured(small, tmp_path):
+    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    measured = run.metrics()
+    shutil.rmtree(run.checkpoint)
+    with pytest.raises(LareError) as error:
+        lare.resume(run.directory, listeners=[])
+    assert str(error.value) == f"{run.directory} has no checkpoint any more: there is nothing to go on from"
+    assert run.metrics() == measured
+
+
+def test_training_that_diverges_says_so(small, tmp_path):
+    settings = small(method="dense", td3={"learning_rate": 1e30, "batch_size": 8, "hidden": (8,), "warmup": 24})
+    with pytest.raises(LareError, match="training diverged: the policy of seed 0 is not finite any more"):
+        lare.train(toy_spec(), settings, out=tmp_path / "run", listeners=[])
+
+
+@pytest.mark.parametrize("error", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")])
+def test_a_replay_that_the_memory_does_not_hold(error, small, tmp_path, monkeypatch):
+    def full(run):
+        raise error
+
+    monkeypatch.setattr(single_agent, "new_learner", full)
+    with pytest.raises(LareError) as told:
+        lare.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[])
+    assert str(told.value) == (
+        "the memory is full: 2 seeds with a replay of 482 observations each; fewer seeds or a smaller capacity need less"
+    )
 
 
 def test_a_replay_too_small_for_an_episode_is_refused(small, tmp_path):

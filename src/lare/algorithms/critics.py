@@ -1,4 +1,4 @@
-"""What the algorithms that learn from a replay share: figures, the transitions they read, and critics Q(s, a).
+"""What the algorithms that learn from a replay share: hyperparameters, the transitions they read, and critics Q(s, a).
 
 The algorithms know rewards, never where they come from. Actions lie in [-1, 1] in every dimension; whoever talks to the
 environment rescales them.
@@ -17,7 +17,7 @@ from lare.networks import MLP
 
 
 class OffPolicySettings(Checked):
-    """The figures that these algorithms share; none of them depends on the task."""
+    """The hyperparameters that these algorithms share; none of them depends on the task."""
 
     hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of actor and critics."""

@@ -27,7 +27,7 @@ from lare.normalise import Moments, deviation, no_moments, observe
 
 
 class PPOSettings(Checked):
-    """Figures of PPO; what `lare train` uses where nothing is said stands in `table.py`."""
+    """Hyperparameters of PPO; what `lare train` uses where nothing is said stands in `table.py`."""
 
     hidden: tuple[Annotated[int, Field(ge=1)], ...] = (64, 64)
     """Widths of the hidden layers of actor and critic."""
@@ -87,7 +87,7 @@ class Policy(eqx.Module):
     def sample(
         self, observation: Float[Array, "*batch observation"], key: PRNGKeyArray
     ) -> Float[Array, "*batch action"]:
-        """A ~ pi(. | s)."""
+        """Draw a ~ pi(. | s)."""
         draw = jax.random.gumbel if self.log_deviation is None else jax.random.normal
         size = self.network.layers[-1].bias.shape[-1]
         return self.drawn(observation, draw(key, (*observation.shape[:-1], size)))

@@ -26,7 +26,7 @@ SMALLEST_LOG, LARGEST_LOG = -20.0, 2.0
 
 
 class SACSettings(OffPolicySettings):
-    """The published figures."""
+    """The published hyperparameters."""
 
     target_every: Annotated[int, Field(ge=1)] = 2
     """Updates from one move of the target critics to the next."""
@@ -117,7 +117,8 @@ def update(
 
     `number`, from 0, is an argument, not a counter in the state, so that under `vmap` over seeds it stays one value.
     """
-    rate, (target_key, key) = settings.learning_rate, jax.random.split(key)
+    rate = settings.learning_rate
+    target_key, key = jax.random.split(key)
     alpha = jnp.exp(state.online.log_temperature)
     target = target_values(state, batch, target_key, settings)
     loss, gradient = jax.value_and_grad(squared_errors)(state.online.critics, batch, target)

@@ -1,6 +1,6 @@
 """The table of algorithms: who learns from the rewards that a method gives.
 
-A row is a name with figures of its own. Two that differ in figures alone share their equations: `ddpg` is `td3.py` with one
+A row is a name with hyperparameters of its own. Two that differ in these alone share their equations: `ddpg` is `td3.py` with one
 critic, no noise on the target action and no delay; `ippo` is `ppo.py` with all agents as one.
 """
 
@@ -33,7 +33,7 @@ class Algorithm:
     name: str
     kind: Kind
     settings: AlgorithmSettings
-    """The published figures."""
+    """The published hyperparameters."""
     summary: str
     source: str
 
@@ -78,7 +78,7 @@ TABLE = (
         Kind.MANY_AGENTS,
         IPPO,
         "ppo for every agent, with one actor and one critic for all",
-        "de Witt et al., 2020; the figures of LaRe",
+        "de Witt et al., 2020; hyperparameters of LaRe",
     ),
 )
 

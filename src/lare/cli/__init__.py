@@ -53,7 +53,7 @@ def main() -> None:
         if debug:
             traceback.print_exc()
         sys.stderr.write(f"lare: {' '.join(str(error).split())}\n")
-        sys.exit(130 if type(error).__name__ == "Interrupted" else 2)
+        sys.exit(error.status)
     except KeyboardInterrupt:
         sys.exit(130)
     except OSError as error:

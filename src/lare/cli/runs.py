@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from lare.cli.terminal import RunDirectories, RunDirectory, progress, say, show
 from lare.errors import LareError
-from lare.training.settings import Settings
+from lare.training.settings import Settings, refuse_idle
 
 DEFAULTS = Settings()
 
@@ -44,6 +44,11 @@ def train(
         raise LareError("say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR")
     else:
         spec = lare.load_task(task)
+        refuse_idle(settings, spec)
+        if function and (settings.draw, settings.candidates) != (DEFAULTS.draw, DEFAULTS.candidates):
+            raise LareError(
+                "--draw and --candidates choose a recorded function, and --function gives one: leave either out"
+            )
         functions = [load(file, role) for file, role in per_role(function, spec)] if function else None
         for one in functions or ():
             if one.changed:
@@ -63,20 +68,22 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
     from lare.experiments.evaluation import evaluate_run, record_video
-    from lare.training.run import open_run, read_config
+    from lare.experiments.statistics import mean_and_deviation, plus_minus
+    from lare.training.run import open_run
 
+    opened = open_run(run)
     if video is not None:
-        if not read_config(run).task.particles:
+        if not opened.config.task.particles:
             if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
                 os.environ.setdefault("MUJOCO_GL", "egl")  # which needs no screen; it is read when MuJoCo is imported
             progress("filming an episode; without a graphics card that may take minutes")
-        record_video(run, video)
+        record_video(opened, video)
         say(f"wrote {video}")
-    returns = evaluate_run(run, episodes)
+    returns = evaluate_run(opened, episodes)
     for team, of_team in returns.items():
-        for seed, of_seed in zip(open_run(run).seeds, of_team, strict=True):
+        for seed, of_seed in zip(opened.seeds, of_team, strict=True):
             named = f"{team}, " if len(returns) > 1 else ""
-            say(f"{named}seed {seed}: return {of_seed.mean():.1f} ± {of_seed.std():.1f} over {episodes} episodes")
+            say(f"{named}seed {seed}: return {plus_minus(*mean_and_deviation(of_seed))} over {episodes} episodes")
 
 
 def report(runs: RunDirectories, out: Path | None = None) -> None:

@@ -13,11 +13,11 @@ been learned after k episodes is exact, and costs the same for each new episode.
 The estimator comes with a confidence radius. In units of S and of the largest |R/T|, with A = lambda I + sum_k x_k x_k^T over
 x_k = S^-1 (z_k - their mean), Proposition 1 says that with probability 1 - delta/10, for all k at once,
 
-    |w - w_hat|_A <= l_k = sqrt(d / 4 T log((1 + k L^2 / lambda) / (delta / 10))) + sqrt(lambda d)
+    |w - w_hat|_A <= l_k = sqrt(d / (4 T) * log((1 + k L^2 / lambda) / (delta / 10))) + sqrt(lambda d)
 
-(its T-fold noise in a return is 1/T of that in a mean; L is the largest |x_k|, and sum_k |x_k|^2, which is no more, stands
-for k L^2), and so |r - r_hat| <= l_k |x|_{A^-1} where rewards are linear in the factors, w x + b with |w| <= sqrt(d): nearly
-equal factors whose large weights cancel break it.
+(the variance of a return's noise grows with T, and that of its mean R/T falls with 1/T; L is the largest |x_k|, and
+sum_k |x_k|^2, which is no more, stands for k L^2), and so |r - r_hat| <= l_k |x|_{A^-1} where rewards are linear in the factors,
+w x + b with |w| <= sqrt(d): nearly equal factors whose large weights cancel break it.
 """
 
 import itertools

@@ -15,6 +15,7 @@ but the scale of r_hat. `normalise = false` is the published form: raw features,
 """
 
 import math
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import jax
@@ -54,7 +55,8 @@ class CreditSettings(Checked):
     drawn_steps: Annotated[int, Field(ge=2)] = 64
     """K: steps drawn from an episode by RRD and its kin."""
     steps: Annotated[int, Field(ge=2)] = 256
-    """Steps in one update of the decoder: K steps of so many episodes, or whole episodes that make up about as many."""
+    """Steps in one update of the decoder: K steps of so many episodes, or whole episodes that make up about as many. Of many
+    agents: of so many whole episodes, whatever is drawn from them."""
     episodes: Annotated[int, Field(ge=1)] = 8
     """diaster: whole episodes in one update of its decoder."""
     fits: Annotated[int, Field(ge=1)] = 1
@@ -159,6 +161,13 @@ def normalised(state: Decomposition, settings: CreditSettings) -> bool:
     return settings.normalise and state.totals is None
 
 
+def inputs(
+    state: Decomposition, features: Float[Array, "*batch features"], settings: CreditSettings
+) -> Float[Array, "*batch features"]:
+    """Features as the decoder is given them."""
+    return standardise(state.moments, features) if normalised(state, settings) else features
+
+
 def decode(
     decoder: Network,
     state: Decomposition,
@@ -167,7 +176,7 @@ def decode(
     key: PRNGKeyArray | None = None,
 ) -> Decoded:
     """f_psi in units of the scale."""
-    return decoder(standardise(state.moments, features) if normalised(state, settings) else features, key)
+    return decoder(inputs(state, features, settings), key)
 
 
 def proxy_rewards(
@@ -182,29 +191,45 @@ def loss_and_gradient(
     state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
 ) -> tuple[Float[Array, ""], Network]:
     """The loss that `fit` names, and its gradient by the decoder's weights."""
-    target = episodes.mean_reward / magnitude(state.scale) if settings.normalise else episodes.mean_reward
-    weight = losses.episode_weight(episodes.length, episodes.counts, settings.sum_form)
+    loss = loss_of_pieces if fit is Fit.SUBTRAJECTORIES else partial(loss_of_means, fit=fit)
+    return jax.value_and_grad(loss)(state.decoder, state, episodes, key, settings=settings)
 
-    def loss_of(decoder: Network) -> Float[Array, ""]:
-        if isinstance(decoder, Diaster):
-            whole = episodes.features.reshape(len(target), -1, episodes.features.shape[-1])
-            seen = standardise(state.moments, whole) if settings.normalise else whole
-            return decoder.loss(seen, episodes.length, target, weight, key)
-        decoded = decode(decoder, state, episodes.features, settings, key)
-        r_hat = jnp.mean(decoded.r_hat.reshape(len(episodes.features), -1), axis=1)
-        belongs = (episodes.episode >= 0) & (episodes.episode < len(target))
-        penalty = jnp.sum(jnp.where(belongs, decoded.penalty, 0)) / jnp.maximum(jnp.sum(belongs), 1)
-        return losses_of(r_hat) + penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
 
-    def losses_of(r_hat: Float[Array, " rows"]) -> Float[Array, ""]:
-        seen = episodes.length if fit is Fit.ALL_STEPS else jnp.minimum(episodes.length, len(r_hat) // len(target))
-        mean = losses.episode_means(r_hat, episodes.episode, seen)
-        if fit in (Fit.ALL_STEPS, Fit.DRAWN_STEPS):
-            return losses.squared_error(mean, target, weight)
+def targets(
+    state: Decomposition, episodes: Episodes, settings: CreditSettings
+) -> tuple[Float[Array, " episodes"], Float[Array, " episodes"]]:
+    """R/T in units of the scale, and the weight of each episode."""
+    target = episodes.mean_reward / magnitude(state.scale) if normalised(state, settings) else episodes.mean_reward
+    return target, losses.episode_weight(episodes.length, episodes.counts, settings.sum_form)
+
+
+def loss_of_means(
+    decoder: Network, state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+) -> Float[Array, ""]:
+    """RD, RRD and RRD-unbiased: mean r_hat of an episode's steps against R/T; and what the decoder adds of its own."""
+    target, weight = targets(state, episodes, settings)
+    decoded = decode(decoder, state, episodes.features, settings, key)
+    r_hat = jnp.mean(decoded.r_hat.reshape(len(episodes.features), -1), axis=1)
+    steps = episodes.length if fit is Fit.ALL_STEPS else jnp.minimum(episodes.length, len(r_hat) // len(target))
+    mean = losses.episode_means(r_hat, episodes.episode, steps)
+    if fit is Fit.DRAWN_STEPS_UNBIASED:
         variance = losses.subsampling_variance(r_hat.reshape(len(target), -1), episodes.length)
-        return losses.unbiased_squared_error(mean, target, weight, variance)
+        loss = losses.unbiased_squared_error(mean, target, weight, variance)
+    else:
+        loss = losses.squared_error(mean, target, weight)
+    belongs = (episodes.episode >= 0) & (episodes.episode < len(target))
+    penalty = jnp.sum(jnp.where(belongs, decoded.penalty, 0)) / jnp.maximum(jnp.sum(belongs), 1)
+    return loss + penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
 
-    return jax.value_and_grad(loss_of)(state.decoder)
+
+def loss_of_pieces(
+    decoder: Network, state: Decomposition, episodes: Episodes, key: PRNGKeyArray, settings: CreditSettings
+) -> Float[Array, ""]:
+    """Diaster."""
+    assert isinstance(decoder, Diaster)
+    target, weight = targets(state, episodes, settings)
+    whole = episodes.features.reshape(len(target), -1, episodes.features.shape[-1])
+    return decoder.loss(inputs(state, whole, settings), episodes.length, target, weight, key)
 
 
 def update(

@@ -75,7 +75,7 @@ class Reward(StrEnum):
     PROXY = "proxy"
     """What the decoder says."""
     UNIFORM = "uniform"
-    """The mean reward of the episode, between the lowest and the highest so far."""
+    """The mean reward of the episode, between the lowest and the highest so far (of many agents: of those stored)."""
     DESIGNED = "designed"
     """What a reward function of the language model says."""
 
@@ -98,6 +98,11 @@ class Method:
     def has_proxy(self) -> bool:
         """Whether it gives every step a reward of its own making."""
         return self.reward not in (Reward.TRUE, Reward.EPISODIC)
+
+    @property
+    def in_units(self) -> bool:
+        """Whether its rewards are in the unit of the true ones: they are fitted to add up to returns."""
+        return self.reward is Reward.PROXY
 
     @property
     def latent(self) -> bool:

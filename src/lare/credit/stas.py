@@ -86,7 +86,8 @@ class Coalitions(eqx.Module):
     def __call__(
         self, x: Float[Array, "*batch agents size"], key: PRNGKeyArray, drop: PRNGKeyArray | None
     ) -> Float[Array, "*batch agents size"]:
-        agents, last = x.shape[-2], None
+        agents = x.shape[-2]
+        last: PRNGKeyArray | None = None
         parts: list[PRNGKeyArray | None] = [None] * COALITIONS
         if drop is not None:
             last, *parts = jax.random.split(drop, 1 + COALITIONS)

@@ -96,7 +96,7 @@ def watch(run: Run, key: int = 0) -> Watched:
 
 
 def factors_of(session: Session, played: Played) -> Float[np.ndarray, "steps episodes agents factors"]:
-    """Z of episodes of a single seed."""
+    """The factors z of episodes of a single seed."""
     return session.factors(jax.tree.map(lambda leaf: leaf[None], played))[0]
 
 

@@ -1,7 +1,9 @@
 """The policy of a finished (or stopped) run, evaluated and filmed, for one agent and for many."""
 
+import contextlib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,9 @@ from lare.training.single_agent import compiled, load_learner
 FRAME = {"width": 320, "height": 320}
 """Pixels of a MuJoCo film: its usual 480 by 480 take twice as long, and as much room."""
 
+AT_A_TIME = 20
+"""Environments of a seed that are open together."""
+
 
 def load_policy(run: Run) -> Policy:
     """The deterministic policies of all seeds, as of the last checkpoint."""
@@ -39,7 +44,8 @@ def policy_of(directory: str | Path, task: TaskSpec) -> Callable[[np.ndarray], n
     run = open_run(directory)
     if run.config.task.environment != task.environment or task.particles:
         raise LareError(f"{directory} is a run of {run.config.task.name}: its policy cannot play {task.name}")
-    return first_seed(run, make_episodic(task).action_space)
+    with closing(make_episodic(task)) as environment:
+        return first_seed(run, environment.action_space)
 
 
 def first_seed(run: Run, space: gymnasium.Space) -> Callable[[np.ndarray], np.ndarray]:
@@ -53,27 +59,34 @@ def first_seed(run: Run, space: gymnasium.Space) -> Callable[[np.ndarray], np.nd
     return act
 
 
-def evaluate_run(directory: str | Path, episodes: int = 10) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
+def evaluate_run(run: Run, episodes: int = 10) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
     """True returns by team; the only team of most tasks is called by the task's name.
 
     A single agent acts without noise. Agents of particle tasks draw their actions, as they do in training; a team's
     return is the sum over its agents.
 
     Raises:
-        LareError: the directory is no run, or its task's environment has changed.
+        LareError: there is nothing to evaluate, or the task's environment has changed.
     """
     if episodes < 1:
         raise LareError(f"episodes = {episodes}: at least one is needed")
-    run = open_run(directory)
     task = run.config.task
     if task.particles:
         return agents.returns(run, episodes)
     check_against_environment(task)
-    environments = [[make_episodic(task) for _ in range(episodes)] for _ in run.seeds]
-    return {task.name: evaluate(environments, load_policy(run), run.seeds).returns}
+    policy, parts = load_policy(run), []
+    with contextlib.ExitStack() as opened:
+        environments = [
+            [opened.enter_context(closing(make_episodic(task))) for _ in range(min(episodes, AT_A_TIME))]
+            for _ in run.seeds
+        ]
+        for first in range(0, episodes, AT_A_TIME):
+            some = [row[: episodes - first] for row in environments]
+            parts.append(evaluate(some, policy, run.seeds, first=first).returns)
+    return {task.name: np.concatenate(parts, axis=1)}
 
 
-def record_video(directory: str | Path, path: str | Path) -> None:
+def record_video(run: Run, path: str | Path) -> None:
     """Film one episode of the first seed's policy, as a .gif, or as an .mp4 with the extra `lare-rl[video]`.
 
     Agents of particle tasks wear their credit, as number and colour.
@@ -81,17 +94,17 @@ def record_video(directory: str | Path, path: str | Path) -> None:
     Raises:
         LareError: the environment cannot be drawn on this machine, or the file cannot be written.
     """
-    run, path = open_run(directory), Path(path)
+    path = Path(path)
     check_video(path)
     if run.config.task.particles:
         write_video(path, agents.frames(run), 1 / FRAMES_PER_SECOND)
         return
     camera = {"camera_name": "track", **FRAME} if has_tracking_camera(run) else {}
-    environment = make_episodic(run.config.task, render_mode="rgb_array", **camera)
-    fps = environment.metadata.get("render_fps", 30)
-    # Browsers play a GIF at 50 frames a second at most, and a frame may take long where there is no graphics card.
-    every = max(1, round(fps / 25)) if path.suffix == ".gif" else 1
-    write_video(path, list(drawn(run, environment, every)), every / fps)
+    with closing(make_episodic(run.config.task, render_mode="rgb_array", **camera)) as environment:
+        fps = environment.metadata.get("render_fps", 30)
+        # Browsers play a GIF at 50 frames a second at most, and a frame may take long where there is no graphics card.
+        every = max(1, round(fps / 25)) if path.suffix == ".gif" else 1
+        write_video(path, list(drawn(run, environment, every)), every / fps)
 
 
 def drawn(run: Run, environment: EpisodicReward, every: int) -> Iterator[np.ndarray]:
@@ -121,11 +134,9 @@ def picture(environment: EpisodicReward) -> np.ndarray:
 
 def has_tracking_camera(run: Run) -> bool:
     """Whether the environment is a MuJoCo model with a camera that follows it, which Gymnasium does not use by itself."""
-    environment = make_episodic(run.config.task)
-    model: Any = getattr(environment.unwrapped, "model", None)
-    names = [model.camera(number).name for number in range(model.ncam)] if hasattr(model, "ncam") else []
-    environment.close()
-    return "track" in names
+    with closing(make_episodic(run.config.task)) as environment:
+        model: Any = getattr(environment.unwrapped, "model", None)
+        return hasattr(model, "ncam") and "track" in (model.camera(number).name for number in range(model.ncam))
 
 
 def check_video(path: Path) -> None:

@@ -41,7 +41,7 @@ def svg(figure: Figure) -> str:
 
 def new_figure(rows: int = 1, height: float = 3.4) -> tuple[Figure, np.ndarray]:
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, height * rows if rows == 1 else height), layout="constrained")
+        figure = Figure(figsize=(6.4, height), layout="constrained")
         return figure, figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
 
 

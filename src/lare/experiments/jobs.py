@@ -1,6 +1,6 @@
 """Runs that are to be: each in its place, begun or not, and how it is trained."""
 
-import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,11 +8,13 @@ from typing import Any
 import lare
 from lare.credit.methods import find_method
 from lare.errors import LareError
-from lare.latent.design import CANDIDATES
+from lare.latent.design import CANDIDATES, check_recorded
+from lare.latent.function import LatentFunction, load, per_role
 from lare.tasks.spec import TaskSpec
 from lare.training.checkpoint import saved_step
-from lare.training.run import CHECKPOINT, CONFIG, read_config, read_metrics
+from lare.training.run import CHECKPOINT, CONFIG, describe, read_config, read_metrics
 from lare.training.settings import Plan, Settings, decide
+from lare.training.train import chosen_functions
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,8 @@ class Job:
     directory: Path
     task: TaskSpec
     plan: Plan
+    functions: tuple[Path, ...] = ()
+    """Latent functions of one's own, instead of recorded ones: one for each team."""
 
     @property
     def name(self) -> str:
@@ -46,16 +50,26 @@ class Job:
         return (self.directory / CONFIG).is_file()
 
 
-def job_of(root: Path, task: TaskSpec, settings: Settings) -> Job:
+def job_of(root: Path, task: TaskSpec, settings: Settings, functions: Sequence[Path] = ()) -> Job:
     """A run in its place: ROOT/TASK/METHOD-ALGORITHM, with the draw and an unusual number of candidates where they matter."""
-    plan, ending = decide(settings, task), ""
-    if find_method(plan.method).latent:
+    plan = decide(settings, task)
+    ending = ""
+    latent = find_method(plan.method).latent
+    if latent and not functions:
         ending = f"-draw{plan.draw}" + (f"-candidates{plan.candidates}" if plan.candidates != CANDIDATES else "")
-    return Job(root / task.name / f"{plan.method}-{plan.algorithm}{ending}", task, plan)
+    name = f"{plan.method}-{plan.algorithm}{ending}"
+    return Job(root / task.name / name, task, plan, tuple(functions) if latent else ())
 
 
 def check(job: Job) -> None:
-    """Raise `LareError` where something else is in a job's place."""
+    """Raise `LareError` where a job could not be trained, or something else is in its place."""
+    method = find_method(job.plan.method)
+    functions = ()
+    if job.functions:
+        functions = chosen_functions(job.task, job.plan, load_functions(job.functions, job.task))
+    elif method.latent:
+        for role in job.task.roles:
+            check_recorded(role, method.kind, job.plan.draw, job.plan.candidates)
     if job.begun:
         config = read_config(job.directory)
         if config.task.digest != job.task.digest:
@@ -66,11 +80,11 @@ def check(job: Job) -> None:
             raise LareError(
                 f"{job.directory} holds a run with {name} = {theirs.get(name)}, and {ours[name]} is asked for: choose another out"
             )
+        if functions and config.function_sha256 != tuple(function.digest for function in functions):
+            raise LareError(f"{job.directory} holds a run with another latent function: choose another out")
     elif job.directory.exists():
-        # A run that was killed before it had a config.json holds latent functions, and nothing else.
-        if any(not path.name.startswith("latent_function") for path in job.directory.iterdir()):
-            raise LareError(f"{job.directory} exists, and is not a run: choose another out")
-        shutil.rmtree(job.directory)
+        raise LareError(f"{job.directory} exists, and is not a run: choose another out")
+    describe(job.task, job.plan, ())
 
 
 def as_json(job: Job) -> dict[str, Any]:
@@ -78,6 +92,7 @@ def as_json(job: Job) -> dict[str, Any]:
         "directory": str(job.directory.absolute()),
         "task": job.task.model_dump(mode="json"),
         "settings": job.plan.model_dump(mode="json"),
+        "functions": [str(path.absolute()) for path in job.functions],
     }
 
 
@@ -87,4 +102,11 @@ def train_one(order: dict[str, Any]) -> None:
     if (directory / CONFIG).is_file():
         lare.resume(directory)
     else:
-        lare.train(TaskSpec(**order["task"]), Settings(**order["settings"]), out=directory)
+        task, paths = TaskSpec(**order["task"]), order["functions"]
+        functions = load_functions(paths, task) if paths else None
+        lare.train(task, Settings(**order["settings"]), function=functions, out=directory)
+
+
+def load_functions(paths: Sequence[str | Path], task: TaskSpec) -> list[LatentFunction]:
+    """Latent functions from their files, one for each role of the task."""
+    return [load(path, role) for path, role in per_role(paths, task)]

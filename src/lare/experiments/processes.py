@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from typing import Any
 
 from lare.errors import LareError
 from lare.experiments.jobs import Job, as_json, train_one
@@ -33,7 +34,7 @@ def in_processes(
     slots: queue.Queue[list[int]] = queue.Queue()
     for share in shares(processes, cores):
         slots.put(share)
-    running: set[subprocess.Popen] = set()
+    running = Running()
 
     def train(job: Job) -> str | None:
         share = slots.get()
@@ -49,9 +50,33 @@ def in_processes(
         yield from ((futures[future], future.result()) for future in as_completed(futures))
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in list(running):
-            process.send_signal(signal.SIGINT)
+        running.stop()
         pool.shutdown()
+
+
+class Running:
+    """The processes under way, which can be stopped together, and none is begun after that."""
+
+    def __init__(self):
+        self.processes: set[subprocess.Popen] = set()
+        self.stopped = False
+        self.lock = threading.Lock()
+
+    def start(self, command: Sequence[str], **options: Any) -> subprocess.Popen | None:
+        """A new process; None after the stop."""
+        with self.lock:
+            if self.stopped:
+                return None
+            process = subprocess.Popen(command, **options)
+            self.processes.add(process)
+            return process
+
+    def stop(self) -> None:
+        """Ask all of them to save themselves and end."""
+        with self.lock:
+            self.stopped = True
+            for process in self.processes:
+                process.send_signal(signal.SIGINT)
 
 
 def shares(processes: int, cores: int) -> list[list[int]]:
@@ -70,18 +95,20 @@ def shares(processes: int, cores: int) -> list[list[int]]:
     return [usable[place * cores : (place + 1) * cores] for place in range(processes)]
 
 
-def in_a_process(job: Job, cores: list[int], running: set[subprocess.Popen]) -> str | None:
+def in_a_process(job: Job, cores: list[int], running: Running) -> str | None:
     """Train one run in a process of its own; returns what went wrong. What the process says is in RUN.log."""
     job.directory.parent.mkdir(parents=True, exist_ok=True)
     log = job.directory.with_name(job.directory.name + ".log")
     order = json.dumps({"job": as_json(job), "cores": cores})
     with log.open("a", encoding="utf-8") as file:
+        said_before = file.tell()
         command = [sys.executable, "-m", "lare.experiments.processes"]
         # In a session of its own, so that Ctrl-C reaches it once, through us.
-        process = subprocess.Popen(
+        process = running.start(
             command, stdin=subprocess.PIPE, stdout=file, stderr=file, text=True, start_new_session=True
         )
-        running.add(process)
+        if process is None:
+            return "it was not begun: the others were being stopped"
         assert process.stdin is not None
         try:
             with contextlib.suppress(BrokenPipeError), process.stdin:  # which stays open as long as this process lives
@@ -90,10 +117,14 @@ def in_a_process(job: Job, cores: list[int], running: set[subprocess.Popen]) -> 
                 process.wait()
             process.wait()
         finally:
-            running.discard(process)
+            running.processes.discard(process)
     if process.returncode == 0:
         return None
-    lines = log.read_text(encoding="utf-8", errors="replace").splitlines() or [f"exit status {process.returncode}"]
+    if process.returncode < 0:  # there is no last word of a process that was killed, for memory as it may be
+        return f"it was ended by {signal.Signals(-process.returncode).name} ({log})"
+    with log.open("rb") as file:
+        file.seek(said_before)
+        lines = file.read().decode(errors="replace").splitlines() or [f"exit status {process.returncode}"]
     return f"{lines[-1]} ({log})"
 
 

@@ -17,7 +17,7 @@ from lare.experiments.html import function_text, note, table, write_page
 from lare.experiments.statistics import REFERENCES, RETURN
 from lare.source import source
 from lare.training.run import Run, open_run
-from lare.training.settings import Settings, decide
+from lare.training.settings import Settings, decide, dotted
 
 TOP = "True rewards, for a million steps of the best public TD3,"
 """What the upper ends of `REFERENCES` are."""
@@ -201,7 +201,7 @@ def judged(run: Run) -> str:
 def settings_table(run: Run) -> str:
     """What differs from the defaults in sight, everything else folded away."""
     usual = decide(Settings(), run.config.task)
-    chosen, defaults = (flatten(plan.model_dump()) for plan in (run.config.settings, usual))
+    chosen, defaults = (dict(dotted(plan.model_dump())) for plan in (run.config.settings, usual))
     rows = [
         (key, value if isinstance(value, str) else json.dumps(value))
         for key, value in chosen.items()
@@ -215,10 +215,3 @@ def settings_table(run: Run) -> str:
         table(("setting", "value"), rows)
         + f"<details><summary>Everything (config.json)</summary><pre>{everything}</pre></details>"
     )
-
-
-def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat

@@ -160,6 +160,19 @@ def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
         told = (name for name in plan if name not in IGNORED and any(other[name] != plan[name] for other in alike))
         parts = [plan["method"], *([plan["algorithm"]] if several else []), *(f"{name} {plan[name]}" for name in told)]
         found.setdefault(", ".join(parts), []).append(run)
+    return {name: some for label, of_label in found.items() for name, some in by_function(label, of_label).items()}
+
+
+def by_function(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Runs that are alike in all but their latent functions, by these; draws of the language model are told apart by number."""
+    places = {run.directory: (run.config.task.name, run.config.settings.draw) for run in runs}
+    functions = {(places[run.directory], run.config.function_sha256) for run in runs}
+    if len(functions) == len(set(places.values())):
+        return {label: list(runs)}
+    found: dict[str, list[Run]] = {}
+    for run in runs:
+        name = " ".join(digest[:8] for digest in run.config.function_sha256)
+        found.setdefault(f"{label}, phi {name}", []).append(run)
     return found
 
 
@@ -175,6 +188,14 @@ def grouped(runs: Mapping[str, Sequence[Run]], key: str) -> tuple[list[Group], t
             f"there is no reference for {', '.join(unknown)}, so its returns cannot be laid beside those of other tasks: "
             "compare the runs of each task by themselves"
         )
+    specs: dict[str, Run] = {}
+    for run in (run for of_label in runs.values() for run in of_label):
+        other = specs.setdefault(run.config.task.name, run)
+        if other.config.task_sha256 != run.config.task_sha256:
+            raise LareError(
+                f"{run.directory} and {other.directory} are runs of two tasks that are both called {run.config.task.name}: "
+                "compare them apart"
+            )
     curves: dict[tuple[str, str, int, int], tuple[Run, dict[int, float]]] = {}
     for label, run in ((label, run) for label, of_label in runs.items() for run in of_label):
         lines = run.metrics()

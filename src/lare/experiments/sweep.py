@@ -11,7 +11,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from lare.algorithms.table import Name
 from lare.credit.methods import find_method
@@ -46,10 +46,20 @@ class Sweep(Share):
     """Each task's own, unless given."""
     draws: Draws = (0,)
     """Of the recorded replies; methods without a latent function are trained once."""
+    functions: dict[str, tuple[Path, ...]] = Field(default_factory=dict)
+    """Latent functions of one's own by the name of their task, one for each team; recorded ones, unless given."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Whatever else `lare train` takes, as steps and seeds."""
     out: Path | None = None
     """The directory for all runs: `runs/NAME` beside a file NAME.toml, unless given."""
+
+    @field_validator("settings")
+    @classmethod
+    def nothing_twice(cls, settings: dict[str, Any]) -> dict[str, Any]:
+        for name in ("method", "algorithm", "draw"):
+            if name in settings:
+                raise ValueError(f"{name} stands above, as {name}s")
+        return settings
 
 
 def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
@@ -66,7 +76,10 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
         raise LareError(f"{path} cannot be read: {error.strerror}") from error
     except (LareError, ValueError, RecursionError) as error:
         raise LareError(f"{path}: {error}") from error
+    places: dict[Path, Job] = {}
     for job in jobs:
+        if places.setdefault(job.directory, job) is not job:
+            raise LareError(f"{path}: {job.name} is asked for twice; two task files need two names")
         check(job)
     return sweep, jobs
 
@@ -74,12 +87,17 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
 def jobs_of(sweep: Sweep, path: Path) -> Iterator[Job]:
     """Every run of a sweep, those of one task behind each other."""
     root = path.parent / (sweep.out or Path("runs") / path.stem)
-    for name, method, algorithm in product(sweep.tasks, sweep.methods, sweep.algorithms or (None,)):
-        task = load_task(path.parent / name if name.endswith(".toml") else name)
-        draws = sweep.draws if find_method(method).latent else sweep.draws[:1]
+    tasks = [load_task(path.parent / name if name.endswith(".toml") else name) for name in sweep.tasks]
+    if unknown := sorted(sweep.functions.keys() - {task.name for task in tasks}):
+        raise LareError(
+            f"functions of {unknown[0]}, which is none of the tasks {', '.join(task.name for task in tasks)}"
+        )
+    for task, method, algorithm in product(tasks, sweep.methods, sweep.algorithms or (None,)):
+        functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
+        draws = sweep.draws if find_method(method).latent and not functions else (0,)
         for draw in draws:
             settings = Settings(**{**sweep.settings, "method": method, "algorithm": algorithm, "draw": draw})
-            yield job_of(root, task, settings)
+            yield job_of(root, task, settings, functions)
 
 
 def run_sweep(share: Share, jobs: Sequence[Job], said: Callable[[str], None], ray: str | None = None) -> list[Job]:

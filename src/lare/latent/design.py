@@ -168,6 +168,14 @@ class Conversation:
         return DesignFailed(f"task {self.task.name!r}: {why}", self.recorder, self.model.name)
 
 
+def check_recorded(task: TaskSpec, kind: Kind, draw: int, candidates: int) -> None:
+    """Raise `LareError` where the shipped recordings lack what a design asks for when every candidate passes."""
+    model, request = recorded_model(task.name, kind, draw), prompts.candidate(task, kind)
+    replies = [model.reply(request, sample) for sample in range(candidates)]
+    if candidates > 1:
+        model.reply(prompts.combine(task, replies, kind), 0)
+
+
 def quoted(reply: str) -> str:
     """A reply as it is shown to the model again: not without end."""
     return reply[:LONGEST_QUOTE]

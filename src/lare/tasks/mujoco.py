@@ -3,6 +3,7 @@
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import WrapperSpec
 
 SPARSE_HALF_CHEETAH = "lare/HalfCheetahSparse-v4"
 
@@ -24,12 +25,15 @@ class PaysForDistance(gymnasium.Wrapper):
         return observation, float(arrived), terminated, truncated, info
 
 
-def sparse_half_cheetah(distance: float = 500.0, **kwargs: Any) -> gymnasium.Env:
-    # The limit lies inside, because the reward waits for the end.
-    return PaysForDistance(gymnasium.make("HalfCheetah-v4", **kwargs), distance)
-
-
 def register() -> None:
     """Make the environments known to Gymnasium; a second call changes nothing."""
     if SPARSE_HALF_CHEETAH not in gymnasium.registry:
-        gymnasium.register(SPARSE_HALF_CHEETAH, entry_point=sparse_half_cheetah, max_episode_steps=1000)
+        usual = gymnasium.registry["HalfCheetah-v4"]
+        # As a wrapper of Gymnasium's, it lies around the time limit, whichever is asked for: it waits for the end.
+        pays = WrapperSpec("PaysForDistance", f"{__name__}:PaysForDistance", {"distance": 500.0})
+        gymnasium.register(
+            SPARSE_HALF_CHEETAH,
+            entry_point=usual.entry_point,
+            max_episode_steps=usual.max_episode_steps,
+            additional_wrappers=(pays,),
+        )

@@ -8,9 +8,12 @@ A row file is only ever added; `state.npz` is written beside the old one and ren
 `state.npz` that is there speaks of row files that are whole. No pickle anywhere.
 """
 
+import contextlib
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -21,6 +24,9 @@ import numpy as np
 from lare.errors import LareError
 
 STATE = "state.npz"
+
+DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
+"""What reading a file that is not whole may raise."""
 
 
 @runtime_checkable
@@ -51,6 +57,13 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
     except OSError as error:
         new.unlink(missing_ok=True)
         raise LareError(f"{path} cannot be written ({error.strerror or error}); what was there is as it was") from error
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """The arrays of a file. NumPy would leave one that is not whole open."""
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as saved:
+        yield saved
 
 
 def named_leaves(learner: Any, by_row: Sequence[str]) -> dict[str, Any]:
@@ -84,7 +97,7 @@ def save(
     end = np.asarray(held.next_row)
     start, segments = np.zeros_like(end), []
     if (directory / STATE).exists():
-        with np.load(directory / STATE, allow_pickle=False) as saved:
+        with opened(directory / STATE) as saved:
             start, segments = saved[".replay.next_row"], json.loads(str(saved["segments"]))
     # The frontier row is saved again: it held only the newest observation when it was saved before. And where an
     # episode has just been dropped, the end has come back.
@@ -96,12 +109,13 @@ def save(
     number = segments[-1]["number"] + 1 if segments else 0
     write_atomically(directory / f"rows-{number}.npz", lambda file: np.savez(file, allow_pickle=False, **segment))
     segments.append({"number": number, "start": start.tolist(), "count": count.tolist()})
-    alive = [old for old in segments if any(np.add(old["start"], old["count"]) > end - rows)]
+    alive = [one for one in segments if any(np.add(one["start"], one["count"]) > end - rows)]
+    kept = {one["number"] for one in alive}  # not always the newest: a segment from before a drop may reach further
     state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner, by_row).items()} | dict(arrays)
     state |= {"host": np.array(json.dumps(host)), "segments": np.array(json.dumps(alive))}
     write_atomically(directory / STATE, lambda file: np.savez(file, allow_pickle=False, **state))
-    for old in segments[: len(segments) - len(alive)]:
-        (directory / f"rows-{old['number']}.npz").unlink(missing_ok=True)
+    for number in (one["number"] for one in segments if one["number"] not in kept):
+        (directory / f"rows-{number}.npz").unlink(missing_ok=True)
 
 
 def load(directory: Path, template: Some, by_row: Sequence[str]) -> tuple[Some, dict[str, Any], dict[str, np.ndarray]]:
@@ -116,11 +130,11 @@ def load(directory: Path, template: Some, by_row: Sequence[str]) -> tuple[Some, 
     if not path.is_file():
         raise LareError(f"there is no checkpoint in {directory}")
     try:
-        with np.load(path, allow_pickle=False) as saved:
+        with opened(path) as saved:
             state = {name: saved[name] for name in saved.files}
         host, segments = json.loads(str(state.pop("host"))), json.loads(str(state.pop("segments")))
         learner = with_rows(fill(template, state, by_row), by_row, directory, segments)
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except DAMAGED as error:
         raise LareError(f"the checkpoint {path} cannot be read: {error}") from error
     return learner, host, {name: array for name, array in state.items() if not name.startswith(".")}
 
@@ -128,9 +142,9 @@ def load(directory: Path, template: Some, by_row: Sequence[str]) -> tuple[Some, 
 def saved_step(directory: Path) -> int | None:
     """The step of the last checkpoint; None where there is none that can be read."""
     try:
-        with np.load(directory / STATE, allow_pickle=False) as saved:
+        with opened(directory / STATE) as saved:
             return json.loads(str(saved["host"]))["step"]
-    except (OSError, ValueError, KeyError, EOFError):
+    except DAMAGED:
         return None
 
 
@@ -151,7 +165,7 @@ def with_rows(learner: Some, by_row: Sequence[str], directory: Path, segments: l
     for field in by_row:  # one after the other, so that only one of them is in memory twice
         buffer = np.zeros(getattr(held, field).shape, getattr(held, field).dtype)
         for segment in segments:
-            with np.load(directory / f"rows-{segment['number']}.npz", allow_pickle=False) as saved:
+            with opened(directory / f"rows-{segment['number']}.npz") as saved:
                 values = saved[field]
             for seed, (start, count) in enumerate(zip(segment["start"], segment["count"], strict=True)):
                 # Of a stretch longer than the buffer only the end is left, as it was when it was written.

@@ -39,6 +39,10 @@ class EnvironmentFault(LareError):
     """An environment gave something that cannot be trained on."""
 
 
+class Diverged(LareError):
+    """What is being trained is not finite any more."""
+
+
 def generator(seed: int, stream: Stream, number: int) -> np.random.Generator:
     """Random numbers that depend on nothing but these three: there is no state to save."""
     return np.random.default_rng([seed, stream, number])
@@ -111,9 +115,18 @@ class Lane:
         for action in actions:
             after, _, terminated, truncated, _ = self.environment.step(action)
             self.actions.append(action)
-            self.observation = np.asarray(after, np.float32)
+            self.observation = np.array(after, np.float32)  # a copy, as in `checked`
             ended = terminated or truncated
         return not ended and np.array_equal(self.observation, observation)
+
+
+def check_finite(actions: Float[np.ndarray, "seeds *episodes action"], seeds: Sequence[int]) -> None:
+    """Raise `Diverged` where a policy has become NaN: the environment, which would answer in kind, is not to blame."""
+    for seed, chosen in zip(seeds, actions, strict=True):
+        if not np.isfinite(chosen).all():
+            raise Diverged(
+                f"training diverged: the policy of seed {seed} is not finite any more; the last checkpoint is whole"
+            )
 
 
 @dataclass(frozen=True)
@@ -130,6 +143,7 @@ def collect(lanes: Sequence[Lane], explore: Explorer, noise: Float[np.ndarray, "
     for disturbance in noise:
         observation = np.stack([lane.observation for lane in lanes])
         actions = explore(observation, disturbance)
+        check_finite(actions, [lane.seed for lane in lanes])
         for lane, action, row in zip(lanes, actions, rows, strict=True):
             row.append((action, *lane.step(action)))
             if row[-1][-1]:
@@ -152,12 +166,16 @@ class Evaluation:
 
 
 def evaluate(
-    environments: Sequence[Sequence[EpisodicReward]], policy: Policy, seeds: Sequence[int], measures: Sequence[str] = ()
+    environments: Sequence[Sequence[EpisodicReward]],
+    policy: Policy,
+    seeds: Sequence[int],
+    measures: Sequence[str] = (),
+    first: int = 0,
 ) -> Evaluation:
     """One episode in each environment (seeds, episodes), all in lockstep, each from a start of its own.
 
-    The starts depend on seed and place only: every evaluation of a run begins from the same ones, and none of them is
-    a start of a training episode.
+    The starts depend on seed and place only, which are counted from `first`: every evaluation of a run begins from the same
+    ones, and none of them is a start of a training episode.
     """
     shape = (len(environments), len(environments[0]))
     places = list(np.ndindex(shape))
@@ -165,7 +183,7 @@ def evaluate(
         [
             [
                 np.asarray(environment.reset(seed=episode_seed(seed, Stream.EVALUATION_EPISODES, place))[0], np.float32)
-                for place, environment in enumerate(row)
+                for place, environment in enumerate(row, start=first)
             ]
             for seed, row in zip(seeds, environments, strict=True)
         ]
@@ -174,6 +192,7 @@ def evaluate(
     found = {name: np.full(shape, np.nan) for name in measures}
     while np.isnan(returns).any():
         actions = policy(observation)
+        check_finite(actions, seeds)
         for place in places:
             if not np.isnan(returns[place]):
                 continue

@@ -1,8 +1,8 @@
 """The training state of a single agent's run: what is stored, what the decoder is fitted to, what the algorithm is paid.
 
-This is the one place where credit and algorithm meet: `credit` does not know what its rewards are for, the algorithm not
-where they come from. What differs between algorithms, when to update and how to act, is in `off_policy.py` and
-`on_policy.py`.
+For a single agent this is the one place where credit and algorithm meet (for many it is `teams.py`): `credit` does not know
+what its rewards are for, the algorithm not where they come from. What differs between algorithms, when to update and how
+to act, is in `off_policy.py` and `on_policy.py`.
 
 Functions are written for one seed; sessions give them their leading seed axis.
 """
@@ -134,8 +134,8 @@ def store(learner: Learner, steps: Step, recipe: Recipe) -> Learner:
         if recipe.method.fit is not None and recipe.method.fit.closed_form:
             ended = jnp.asarray(steps.ended)
             at_its_end = mean_reward[jnp.cumsum(ended) - 1]
-            fit, settings = recipe.method.fit, recipe.credit
-            credit = decomposition.fit_in_closed_form(credit, seen, at_its_end, ended, fit, settings)
+            way, settings = recipe.method.fit, recipe.credit
+            credit = decomposition.fit_in_closed_form(credit, seen, at_its_end, ended, way, settings)
     return learner._replace(credit=credit, scale=observe_scale(learner.scale, mean_reward, finished), replay=held)
 
 
@@ -264,10 +264,10 @@ def assess(learner: Learner, steps: int, recipe: Recipe) -> dict[str, Float[Arra
     counts = number >= replay.oldest_transition(held)
     recent = replay.read(held, jnp.where(counts, number, replay.oldest_transition(held)))
     r_hat = proxy_rewards(recent, learner, recipe)
-    return {
-        "credit/error": accuracy.mean_error(r_hat, recent.reward, counts),
-        "credit/correlation": accuracy.correlation(r_hat, recent.reward, counts),
-    }
+    measured = {"credit/correlation": accuracy.correlation(r_hat, recent.reward, counts)}
+    if recipe.method.in_units:
+        measured["credit/error"] = accuracy.mean_error(r_hat, recent.reward, counts)
+    return measured
 
 
 class Compiled(NamedTuple):

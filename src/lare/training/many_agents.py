@@ -60,10 +60,11 @@ class Session:
         self.step += self.settings.turn
 
     def factors(self, played: Played) -> Float[np.ndarray, "seeds steps episodes agents factors"]:
-        """Z of new episodes: each team's `phi` on what each of its agents observed; padded to the largest."""
+        """The factors z of new episodes: each team's `phi` on what each of its agents observed; padded to the largest."""
         found = np.zeros((*played.reward.shape, max(self.recipe.factors, default=0)), np.float32)
         rows = [np.asarray(rows) for rows in (played.observation, played.action, played.next_observation)]
-        for function, team in zip(self.run.functions, self.recipe.task.teams, strict=bool(self.run.functions)):
+        functions = self.run.functions
+        for function, team in zip(functions, self.recipe.task.teams, strict=True) if functions else ():
             before, action, after = (part[..., team.start : team.stop, :] for part in rows)
             factors = self.run.factors(
                 function, *(part.reshape(-1, part.shape[-1]) for part in (before, action, after))

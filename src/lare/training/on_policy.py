@@ -62,7 +62,8 @@ def improve(
     assert isinstance(recipe.algorithm, ppo.PPOSettings)
     assert isinstance(learner.algorithm, ppo.PPO)
     fit_key, key = jax.random.split(key)
-    algorithm, (learner, fitted) = learner.algorithm, fit_often(learner, fit_key, recipe.fit_updates, recipe)
+    algorithm = learner.algorithm
+    learner, fitted = fit_often(learner, fit_key, recipe.fit_updates, recipe)
     left = 1 - done / recipe.steps
     algorithm, improved = ppo.update(algorithm, rollout(learner, recipe), key, left, recipe.algorithm)
     _, moments = actor_of(learner)

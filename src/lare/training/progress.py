@@ -95,18 +95,24 @@ class Terminal:
             self.progress.stop()
 
 
+def summary_writer() -> Any:
+    """What writes TensorBoard events. Raises `LareError` where the extra is not there."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise LareError("TensorBoard events need an extra: pip install 'lare-rl[tensorboard]'") from None
+    return SummaryWriter
+
+
 class TensorBoard:
     """Every number of metrics.jsonl as TensorBoard events, one writer a seed."""
 
     def __init__(self, directory: Path, step: int, seeds: Sequence[int]):
-        try:
-            from tensorboardX import SummaryWriter
-        except ImportError:
-            raise LareError("TensorBoard events need an extra: pip install 'lare-rl[tensorboard]'") from None
+        writer = summary_writer()
         # What an earlier process wrote behind the checkpoint comes again, and is purged.
         purge = step + 1 if step else None
         self.writers = {
-            seed: SummaryWriter(str(directory / f"seed-{seed}"), purge_step=purge, flush_secs=10) for seed in seeds
+            seed: writer(str(directory / f"seed-{seed}"), purge_step=purge, flush_secs=10) for seed in seeds
         }
 
     def started(self, name: str, step: int, steps: int) -> None: ...

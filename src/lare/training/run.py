@@ -8,9 +8,11 @@ failed_batch.npz     what the latent function was given, if it failed
 """
 
 import contextlib
+import errno
 import json
 import os
 import platform
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -21,9 +23,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from lare.algorithms.table import ALGORITHMS, Kind
 from lare.errors import Checked, LareError
 from lare.latent.evaluator import LatentRewardError
-from lare.latent.function import LatentFunction, load
+from lare.latent.function import LatentFunction, load, per_role
 from lare.source import source
 from lare.tasks.spec import Judges, TaskSpec, is_discrete, time_limit
 from lare.training.checkpoint import STATE, write_atomically
@@ -33,7 +36,7 @@ CONFIG, METRICS, FUNCTION, CHECKPOINT = "config.json", "metrics.jsonl", "latent_
 FAILED_BATCH = "failed_batch.npz"
 
 VERSIONS = ("jax", "optax", "gymnasium", "mujoco", "numpy")
-"""Packages that figures depend on."""
+"""Packages that results depend on."""
 
 
 class Config(Checked):
@@ -59,16 +62,17 @@ class Config(Checked):
 def describe(task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) -> Config:
     """Everything that the run depends on. Raises `LareError` where the replay could not hold a single episode."""
     longest = time_limit(task)
-    if plan.algorithm != "ippo" and plan.rows < longest + 2:
+    kind = ALGORITHMS[plan.algorithm].kind
+    if kind is not Kind.MANY_AGENTS and plan.rows < longest + 2:
         room = (
             f"capacity = {plan.rows} is too small"
             if plan.rows == plan.capacity
             else f"steps = {plan.steps} are too few"
         )
         raise LareError(f"{room}: an episode of {task.name} takes up to {longest + 1}")
-    if plan.algorithm == "ppo" and plan.capacity < 2 * plan.turn + longest:
+    if kind is Kind.ON_POLICY and plan.capacity < 2 * plan.turn + longest:
         raise LareError(f"capacity = {plan.capacity} is too small: a rollout takes up to {2 * plan.turn + longest}")
-    if plan.algorithm == "ippo" and plan.agents.capacity < plan.agents.episodes:
+    if kind is Kind.MANY_AGENTS and plan.agents.capacity < plan.agents.episodes:
         raise LareError(
             f"agents.capacity = {plan.agents.capacity} is less than the {plan.agents.episodes} episodes of an update"
         )
@@ -152,7 +156,7 @@ class Run:
     def factors(
         self, function: LatentFunction, before: np.ndarray, action: np.ndarray, after: np.ndarray
     ) -> Float[np.ndarray, "batch factors"]:
-        """Z of some steps, by the observations that are judged.
+        """The factors z of some steps, by the observations that are judged.
 
         Raises:
             LareError: the function failed; what it was given is kept in the run directory.
@@ -180,22 +184,23 @@ class Run:
 def create(directory: Path, task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) -> Run:
     """A new run directory. Raises `LareError` where there is something of that name."""
     config = describe(task, plan, functions)
+    new = directory.with_name(f".{directory.name}.{os.getpid()}.new")  # renamed when it is whole
     try:
-        directory.mkdir(parents=True)
-    except FileExistsError:
-        raise LareError(
-            f"{directory} exists, and a run never overwrites another: choose another --out, or go on with --resume"
-        ) from None
+        if directory.exists() or directory.is_symlink():
+            raise FileExistsError
+        new.mkdir(parents=True)
+        for function, role in per_role(functions, task) if functions else ():
+            function.save(new / function_file(task, role))
+        (new / CONFIG).write_text(config.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        new.rename(directory)
     except OSError as error:
+        if isinstance(error, FileExistsError) or error.errno == errno.ENOTEMPTY:  # the latter: since a moment ago
+            raise LareError(
+                f"{directory} exists, and a run never overwrites another: choose another --out, or go on with --resume"
+            ) from None
         raise LareError(f"the run directory {directory} cannot be made: {error.strerror}") from error
-    try:
-        for role, function in zip(task.roles, functions, strict=bool(functions)):
-            function.save(directory / function_file(task, role))
-        # Last, and whole or not at all: what has a config.json is a run.
-        text = config.model_dump_json(indent=1) + "\n"
-        write_atomically(directory / CONFIG, lambda file: file.write(text.encode()))
-    except OSError as error:
-        raise LareError(f"{directory} cannot be written: {error.strerror}") from error
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
     return Run(directory, config, tuple(functions))
 
 
@@ -241,8 +246,10 @@ def open_run(directory: str | Path) -> Run:
         LareError: it is not a run, or its files are not what they should be.
     """
     directory = Path(directory)
-    config, functions = read_config(directory), []
-    for role, digest in zip(config.task.roles, config.function_sha256, strict=bool(config.function_sha256)):
+    config = read_config(directory)
+    functions = []
+    wanted = zip(config.task.roles, config.function_sha256, strict=True) if config.function_sha256 else ()
+    for role, digest in wanted:
         place = directory / function_file(config.task, role)
         function = load(place, role)
         if function.digest != digest:

@@ -20,7 +20,7 @@ LARGEST_SEED = 2**31 - 1
 
 
 class AgentSettings(Checked):
-    """What is particular to many agents. The figures are the paper's."""
+    """What is particular to many agents. The numbers are the paper's."""
 
     episodes: Annotated[int, Field(ge=1)] = 82
     """Episodes that are played between two updates of the policy."""
@@ -96,6 +96,12 @@ class Settings(Checked):
     def known_method(cls, method: str | None) -> str | None:
         return None if method is None else find_method(method).name
 
+    @model_validator(mode="after")
+    def seeds_that_there_are(self) -> "Settings":
+        if self.seed + self.seeds - 1 > LARGEST_SEED:
+            raise ValueError(f"seed = {self.seed} and {self.seeds - 1} that follow it: the largest is {LARGEST_SEED}")
+        return self
+
     @property
     def all_seeds(self) -> list[int]:
         return [self.seed + i for i in range(self.seeds)]
@@ -150,16 +156,24 @@ class Plan(Settings):
 
     @property
     def of_algorithm(self) -> AlgorithmSettings:
-        """The figures of the algorithm."""
+        """The hyperparameters of the algorithm."""
         return getattr(self, self.algorithm)
 
+    @property
+    def idle(self) -> set[str]:
+        """Settings that make no difference here: those of other algorithms, and of what this one does not do."""
+        others = {*ALGORITHMS} - {self.algorithm}
+        match ALGORITHMS[self.algorithm].kind:
+            case Kind.OFF_POLICY:
+                return others | {"rollout", "agents"}
+            case Kind.ON_POLICY:
+                return others | {"agents", "chunk"}
+            case Kind.MANY_AGENTS:
+                return others | {"rollout", "credit", "chunk", "capacity", "scale_rewards"}
+
     def in_force(self, task: TaskSpec) -> dict[str, Any]:
-        """All that matters here, by dotted names as on the command line: not the figures of other algorithms."""
-        kind = ALGORITHMS[self.algorithm].kind
-        idle = {*ALGORITHMS, "rollout", "agents", "credit"} - {self.algorithm}
-        idle -= {"agents"} if kind is Kind.MANY_AGENTS else {"credit"}
-        idle -= {"rollout"} if kind is Kind.ON_POLICY else set()
-        return dict(dotted(self.model_dump(exclude=idle))) | {"judges": self.judges or task.judges}
+        """All that matters here, by dotted names as on the command line."""
+        return dict(dotted(self.model_dump(exclude=self.idle))) | {"judges": self.judges or task.judges}
 
     @property
     def episodes(self) -> int:
@@ -170,6 +184,18 @@ class Plan(Settings):
     def rows(self) -> int:
         """Observations to make room for: no more than the run can fill."""
         return min(self.capacity, 2 * self.steps + 2)
+
+
+def refuse_idle(settings: Settings, task: TaskSpec) -> None:
+    """Raise `LareError` where something was set that makes no difference to this task and algorithm."""
+    plan, usual = decide(settings, task), dict(dotted(Settings().model_dump()))
+    known = plan.in_force(task)
+    for name, value in dotted(settings.model_dump(include=plan.idle)):
+        if value == usual[name]:
+            continue
+        instead = f"agents.{name}" if f"agents.{name}" in known else f"{plan.algorithm}.{name.rpartition('.')[2]}"
+        hint = f"; it has {instead}" if instead in known else ""
+        raise LareError(f"{name} makes no difference to {plan.algorithm} on {task.name}{hint}")
 
 
 def dotted(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -77,7 +77,7 @@ class Session:
         return lambda *given: np.asarray(explore(actor, *given)), self.functions.noise(random)
 
     def factors(self, collected: Collected) -> Float[np.ndarray, "seeds time factors"]:
-        """Z of new steps: `phi` on the observations that the task says it judges."""
+        """The factors z of new steps: `phi` on the observations that the task says it judges."""
         action = collected.environment_action
         if self.run.function is None:
             return np.zeros((*action.shape[:2], 0), np.float32)

@@ -1,7 +1,7 @@
 """The compiled parts of training many agents: play, store, fit the decoders, improve the policy.
 
-Algorithm 1 of the LaRe paper, lines 6 to 8, for on-policy algorithms. As in `off_policy.py`, this is where credit and
-algorithm meet. Between `play` and `store` the host runs `phi`, once on everything that was played.
+Algorithm 1 of the LaRe paper, lines 6 to 8, for on-policy algorithms. For many agents this is where credit and algorithm
+meet, as `learner.py` is for one. Between `play` and `store` the host runs `phi`, once on everything that was played.
 
 A *team* is the agents that share a return: the mean over them of the sums of their true rewards, known at the end of the
 episode only. Each team has a decoder of its own; all agents share one actor and one critic, which are told who they act
@@ -163,18 +163,20 @@ def mean_rewards(reward: Float[Array, "episodes steps agents"], team: Team) -> F
 
 def store(learner: Learner, played: Played, factors: Array, recipe: Recipe) -> Learner:
     """Put new episodes into the replay and into the running statistics."""
-    rows, reward = features(played, factors, recipe), jnp.swapaxes(played.reward, 0, 1)
+    rows = features(played, factors, recipe)
+    reward = jnp.swapaxes(played.reward, 0, 1)
     credit = []
-    for one, team, size in zip(learner.credit, recipe.task.teams, recipe.features, strict=bool(learner.credit)):
+    decoders = zip(learner.credit, recipe.task.teams, recipe.features, strict=True) if learner.credit else ()
+    for one, team, size in decoders:
         one = decomposition.observe_steps(one, of_team(rows, team, size))
         means = mean_rewards(reward, team)
         whole = jnp.ones_like(means, bool)
         one = decomposition.observe_returns(one, means, whole)
         if recipe.method.fit is not None and recipe.method.fit.closed_form:
             # An episode's steps and agents count alike: as one step, it is their mean.
-            seen = jnp.mean(of_team(rows, team, size).reshape(len(means), -1, size), axis=1)
-            fit, settings = recipe.method.fit, recipe.agents.credit
-            one = decomposition.fit_in_closed_form(one, seen, means, whole, fit, settings)
+            mean_step = jnp.mean(of_team(rows, team, size).reshape(len(means), -1, size), axis=1)
+            way, settings = recipe.method.fit, recipe.agents.credit
+            one = decomposition.fit_in_closed_form(one, mean_step, means, whole, way, settings)
         credit.append(one)
     return learner._replace(credit=tuple(credit), replay=replay.extend(learner.replay, rows, reward))
 
@@ -274,10 +276,10 @@ def assess(learner: Learner, recipe: Recipe) -> dict[str, Float[Array, ""]]:
     reward = learner.replay.reward[newest]
     r_hat = rewards(learner, learner.replay.features[newest], reward, recipe).ravel()
     everything = jnp.ones(r_hat.shape, bool)
-    return {
-        "credit/error": accuracy.mean_error(r_hat, reward.ravel(), everything),
-        "credit/correlation": accuracy.correlation(r_hat, reward.ravel(), everything),
-    }
+    measured = {"credit/correlation": accuracy.correlation(r_hat, reward.ravel(), everything)}
+    if recipe.method.in_units:
+        measured["credit/error"] = accuracy.mean_error(r_hat, reward.ravel(), everything)
+    return measured
 
 
 def returns(reward: Float[Array, "*seeds steps episodes agents"], team: Team) -> Float[Array, "*seeds episodes"]:

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from lare.credit.closed_form import LARGEST_CHOICE
 from lare.credit.methods import Fit, Method, Reward, find_method
 from lare.errors import LareError
@@ -15,13 +17,16 @@ from lare.latent.design import design
 from lare.latent.function import LatentFunction, per_role
 from lare.tasks.spec import TaskSpec, load_task
 from lare.training import many_agents, single_agent
-from lare.training.progress import Clock, Listener, TensorBoard, Terminal
+from lare.training.environments import Diverged
+from lare.training.progress import Clock, Listener, TensorBoard, Terminal, summary_writer
 from lare.training.run import Run, create, default_directory, isolation, locked, open_run
 from lare.training.settings import Plan, Settings, decide
 
 
 class Interrupted(LareError):
     """The user stopped a run. It was saved."""
+
+    status = 130
 
 
 def train(
@@ -47,11 +52,13 @@ def train(
         LareError: something that was given cannot be used, or an environment or function failed. What was written until
             then is whole, and `resume` goes on from there.
     """
+    if tensorboard:
+        summary_writer()  # before anything is made
     task = task if isinstance(task, TaskSpec) else load_task(task)
     plan = decide(settings or Settings(), task)
     functions = chosen_functions(task, plan, function)
     run = create(Path(out) if out is not None else default_directory(task, plan), task, plan, functions)
-    with locked(run):
+    with locked(run), enough_memory(run):
         return begin(run, tensorboard, listeners)
 
 
@@ -64,8 +71,9 @@ def chosen_functions(
         return ()
     if given is None:
         asked = partial(design, kind=method.kind, draw=plan.draw, candidates=plan.candidates)
-        return tuple(asked(role) for role in task.roles)
-    functions = [given] if isinstance(given, LatentFunction) else given
+        functions = [asked(role) for role in task.roles]
+    else:
+        functions = [given] if isinstance(given, LatentFunction) else given
     for function in functions:
         check_size(method, function.size * (2 if (plan.judges or task.judges) == "both" else 1))
     return tuple(function for function, _ in per_role(functions, task))
@@ -86,11 +94,17 @@ def resume(directory: str | Path, *, tensorboard: bool = False, listeners: Seque
     """Go on with a run that was stopped or killed, from its last checkpoint to its end.
 
     On the CPU the metrics are then, bit for bit, those of a run that never stopped (but for the times).
+
+    Raises:
+        LareError: it is not a run, or its checkpoint is not there any more; and as `train`.
     """
+    if tensorboard:
+        summary_writer()
     run = open_run(directory)
-    with locked(run):
+    with locked(run), enough_memory(run):
         if not run.has_checkpoint():
-            run.truncate(0)
+            if run.metrics():  # what has been measured is never taken back
+                raise LareError(f"{run.directory} has no checkpoint any more: there is nothing to go on from")
             return begin(run, tensorboard, listeners)
         restored, messages = kind_of(run).restore(run)
         run.truncate(restored.metrics_length)
@@ -118,20 +132,12 @@ def finish(
     """Run a session to its end, or until the user stops it."""
     run, settings = session.run, session.settings
     told: list[Listener] = [Terminal()] if listeners is None else list(listeners)
-    if tensorboard:
-        told.append(TensorBoard(run.directory / "tensorboard", session.step, run.seeds))
-    for listener in told:
-        for message in messages:
-            listener.said(message)
-        if run.function is not None:
-            listener.said(f"the latent function runs in {isolation(run.config.task, run.function)}")
-        if session.step < settings.warmup:
-            listener.said(f"the first {settings.warmup:,} steps are random: nothing is learned from them yet")
-        if session.step >= settings.steps:
-            listener.said("nothing is left to do: it had come to its end")
-        listener.started(f"{run.config.task.name} {settings.method}", session.step, settings.steps)
     clock = Clock(session.step)
     try:
+        if tensorboard:
+            told.append(TensorBoard(run.directory / "tensorboard", session.step, run.seeds))
+        for listener in told:
+            introduce(session, listener, messages)
         with stop_requests() as stop:
             while session.step < settings.steps:
                 session.advance()
@@ -139,7 +145,7 @@ def finish(
                     listener.stepped(session.step)
                 if session.step % settings.evaluate_every == 0 or session.step == settings.steps:
                     lines = session.report(clock.rate(session.step))
-                    check_diverged(run, lines)
+                    check_losses(lines)
                     session.metrics_length = run.append(lines)
                     session.save()
                     for listener in told:
@@ -156,14 +162,46 @@ def finish(
     return run
 
 
-def check_diverged(run: Run, lines: Sequence[dict[str, Any]]) -> None:
+def introduce(session: single_agent.Session | many_agents.Session, listener: Listener, messages: Sequence[str]) -> None:
+    """What is to be said of a session before its next step."""
+    run, settings = session.run, session.settings
+    for message in messages:
+        listener.said(message)
+    if run.function is not None:
+        listener.said(f"the latent function runs in {isolation(run.config.task, run.function)}")
+    if session.step < settings.warmup:
+        listener.said(f"the first {settings.warmup:,} steps are random: nothing is learned from them yet")
+    if session.step >= settings.steps:
+        listener.said("nothing is left to do: it had come to its end")
+    listener.started(f"{run.config.task.name} {settings.method}", session.step, settings.steps)
+
+
+def check_losses(lines: Sequence[dict[str, Any]]) -> None:
+    """Raise `Diverged` where a loss is not finite, which metrics.jsonl writes as null."""
     for line in lines:
         for name in ("critic/loss", "credit/loss"):
             if name in line and line[name] is None:
-                raise LareError(
+                raise Diverged(
                     f"training diverged: {name} of seed {line['seed']} is not finite at step {line['step']}; "
-                    f"the last checkpoint in {run.checkpoint} is whole"
+                    "the last checkpoint is whole"
                 )
+
+
+@contextlib.contextmanager
+def enough_memory(run: Run) -> Iterator[None]:
+    """Raise `LareError` where memory runs out."""
+    try:
+        yield
+    except (MemoryError, jax.errors.JaxRuntimeError) as error:
+        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+            plan = run.config.settings
+            holds = f"{plan.episodes:,} episodes" if run.config.task.particles else f"{plan.rows:,} observations"
+            option = "agents.capacity" if run.config.task.particles else "capacity"
+            raise LareError(
+                f"the memory is full: {plan.seeds} seeds with a replay of {holds} each; fewer seeds or a smaller {option} "
+                "need less"
+            ) from error
+        raise
 
 
 @contextlib.contextmanager

@@ -215,6 +215,7 @@ TABLE = (
             Claim(f"LaRe-RRDu, {name}", (f"episodic, {name}", f"RRD-unbiased, {name}"))
             for name in ("td3", "sac", "ddpg", "ppo")
         ),
+        differences=(WHOLE,),
     ),
     Exhibit(
         "reward-design",
