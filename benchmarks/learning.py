@@ -34,6 +34,8 @@ HALF_CHEETAH = {
     "lare-rrdu-both": {"method": "lare-rrdu", "judges": "both"},
     "lare-rd": {"method": "lare-rd"},
     "rd": {"method": "rd"},
+    "lare-linear": {"method": "lare-linear"},
+    "rd-linear": {"method": "rd-linear"},
     "episodic": {"method": "episodic"},
     "lare-rrdu-chunk-1": {"method": "lare-rrdu", "chunk": 1},
     "lare-rrdu-chunk-1000": {"method": "lare-rrdu", "chunk": 1000},
@@ -48,7 +50,8 @@ EXPERIMENTS: dict[str, dict[str, dict[str, Any]]] = {
 """For each task the runs, and the settings of each."""
 COMMON: dict[str, Any] = {"steps": 100_000, "seeds": 3}
 KEPT = Path(__file__).parent / "results" / "learning"
-PICTURED = ("lare-rrdu", "lare-rrdu-published", "rrdu", "rrdu-published", "dense", "episodic", "lare-rd", "rd")
+PICTURED = ("lare-rrdu", "rrdu", "dense", "episodic", "lare-rrdu-published", "rrdu-published")
+"""Those of all tasks first, so that a method has one colour."""
 
 
 def run(directory: Path, wanted: list[str]) -> None:
@@ -71,14 +74,20 @@ def keep(directory: Path) -> None:
         ended = {line["seed"] for line in lines if line["step"] == settings["steps"]}
         if len(ended) == settings["seeds"]:
             place.mkdir(parents=True, exist_ok=True)
-            for name in ("config.json", "metrics.jsonl"):
-                shutil.copyfile(metrics.parent / name, place / name)
+            for path in (config_of(metrics.parent), metrics):
+                shutil.copyfile(path, place / path.name)
+
+
+def config_of(directory: Path) -> Path:
+    """What a run depends on: ours, or that of `sbx_learning.py`."""
+    ours = directory / "config.json"
+    return ours if ours.exists() else directory / "protocol.json"
 
 
 def read(directory: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Settings and metrics."""
     lines = (directory / "metrics.jsonl").read_text().splitlines()
-    return json.loads((directory / "config.json").read_text()), [json.loads(line) for line in lines]
+    return json.loads(config_of(directory).read_text()), [json.loads(line) for line in lines]
 
 
 def row(directory: Path) -> dict[str, Any]:

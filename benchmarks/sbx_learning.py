@@ -118,7 +118,7 @@ def main(
         raise SystemExit(f"steps = {steps} must be a multiple of evaluate-every = {every}, and that one of {turn}")
     out.mkdir(parents=True)
     settings = {"steps": steps, "seeds": seeds}
-    (out / "config.json").write_text(
+    (out / "protocol.json").write_text(
         json.dumps({"algorithm": f"SBX {algorithm}", "task": task, "settings": settings, **provenance()}, indent=1)
         + "\n"
     )

@@ -1,5 +1,6 @@
 """The command line, in this process: what it prints, and that a mistake is one line and exit status 2."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -326,6 +327,11 @@ def test_from_training_to_report(command, spec_file, phi):
     assert command("report", run) == (0, f"wrote {run / 'report.html'}\n", "")
     assert "f_near" in (run / "report.html").read_text(encoding="utf-8")
     assert command("report", run, run, "--out", "both.html") == (0, "wrote both.html\n", "")
+    assert command("evaluate", run, "--video", "film.avi") == (
+        2,
+        "",
+        "lare: film.avi is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]\n",
+    )
 
     # There is nothing left to do, and nothing is done again.
     status, out, _ = command("train", "--resume", run)
@@ -339,3 +345,8 @@ def test_from_training_to_report(command, spec_file, phi):
         f"lare: {run} exists, and a run never overwrites another: choose another --out, or go on with --resume\n",
     )
     assert (run / "metrics.jsonl").read_bytes() == metrics
+
+    # What was measured can be drawn without the checkpoint.
+    shutil.rmtree(run / "checkpoint")
+    assert command("report", run, "--out", "without.html") == (0, "wrote without.html\n", "")
+    assert "Its checkpoint is not there any more" in Path("without.html").read_text(encoding="utf-8")

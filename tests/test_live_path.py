@@ -140,9 +140,14 @@ def test_what_a_model_says_does_not_steer_the_terminal(serve, command):
             ["--model", "m", "--draw", 2],
             "--draw chooses among recordings, and a live model says something new each time: leave it out",
         ),
-        (["--budget", -5], "budget = -5: at least one is needed"),
-        (["--requests", 0], "requests = 0: at least one is needed"),
-        (["--temperature", "nan"], "temperature = nan: a number from 0 on"),
+        (["--model", "m", "--budget", -5], "budget = -5: at least one is needed"),
+        (["--model", "m", "--requests", 0], "requests = 0: at least one is needed"),
+        (["--model", "m", "--temperature", "nan"], "temperature = nan: a number from 0 on"),
+        (
+            ["--temperature", 1],
+            "--budget, --requests, --price and --temperature are for a live model: say which one with --model NAME",
+        ),
+        (["--policy", "runs/x"], "--policy plays episodes for --reflect: say how many rounds"),
         (["--reflect", -1], "reflect = -1: there can be no fewer rounds than none"),
         (["--out", "."], ". is not the name of a file; choose another --out"),
         (["--out", "no/phi.py"], "no/phi.py cannot be written: there is no directory no; choose another --out"),
@@ -150,8 +155,8 @@ def test_what_a_model_says_does_not_steer_the_terminal(serve, command):
         (["--record", "r.json", "--out", "r.py"], "--out writes r.json too: choose another --record"),
         (["--record", "./r.json", "--out", "../{here}/r"], "--out writes r.json too: choose another --record"),
         (["--out", "n" * 300], f"{'n' * 300} cannot be written: File name too long"),
-        (["--price", -1, 2], "price = -1.0 2.0: two numbers from 0 on"),
-        (["--policy", "nowhere"], "nowhere is not a run: there is no config.json in it"),
+        (["--model", "m", "--price", -1, 2], "price = -1.0 2.0: two numbers from 0 on"),
+        (["--reflect", 1, "--policy", "nowhere"], "nowhere is not a run: there is no config.json in it"),
     ],
 )
 def test_options_of_a_design_that_make_no_sense(command, tmp_path, arguments, message):

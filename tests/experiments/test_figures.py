@@ -1,7 +1,11 @@
 """What pictures show of long episodes."""
 
+import re
+
+import numpy as np
 import pytest
 
+from lare.experiments import figures
 from lare.experiments.figures import window
 
 
@@ -10,3 +14,17 @@ from lare.experiments.figures import window
 )
 def test_as_many_steps_as_can_be_told_apart(steps, first, end):
     assert window(steps) == slice(first, end)
+
+
+def test_a_long_legend_makes_the_picture_higher_not_its_curves_smaller():
+    def size(labels):
+        x = np.arange(3.0)
+        drawn = figures.bands(dict.fromkeys(labels, (x, x, x, x)), "x", "y")
+        return [float(found) for found in re.search(r'viewBox="0 0 (\S+) (\S+)"', drawn).groups()]
+
+    short, long = (
+        size(["a", "b"]),
+        size([f"a method that is told apart by all of its settings, number {n}" for n in range(12)]),
+    )
+    assert long[0] == pytest.approx(short[0], rel=0.05)
+    assert long[1] > short[1] + 100

@@ -131,7 +131,7 @@ def test_runs_of_two_functions_are_told_apart_by_them(made):
 
 def test_two_tasks_of_one_name_are_not_compared(made):
     first, second = made("a", [1.0]), made("b", [2.0], method="rd")
-    second = Run(second.directory, second.config.model_copy(update={"task_sha256": "another"}), ())
+    second = Run(second.directory, second.config.model_copy(update={"task": toy_spec(judges="after")}), ())
     with pytest.raises(LareError) as error:
         statistics.compare(by_label([first, second]))
     assert str(error.value) == (
@@ -155,7 +155,7 @@ def test_something_else_than_the_return_is_compared(made):
             "each task by themselves",
         ),
         (
-            [("a", "Chase", {}), ("b", "Chase", {"chunk": 10})],
+            [("a", "Chase", {}), ("b", "Chase", {"evaluation_episodes": 3})],
             "{runs}/Chase/b and {runs}/Chase/a are both dense on Chase with seed 0: leave one out",
         ),
         (
@@ -201,6 +201,11 @@ def test_what_the_task_says_anyway_makes_no_other_method(made):
 )
 def test_three_digits_of_the_spread(mean, spread, shown):
     assert statistics.plus_minus(mean, spread) == shown
+
+
+def test_the_interval_of_three_seeds_is_their_range(made):
+    (row,) = statistics.compare(by_label([made("a", [1.0, 2.0, 6.0])])).rows
+    assert (row.iqm.low, row.iqm.high) == (1.0, 6.0)
 
 
 def test_single_seeds_have_no_intervals(made):

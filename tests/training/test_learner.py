@@ -180,8 +180,9 @@ def test_state_and_action_alone():
     assert want.shape[1] == chosen.features == 5
 
 
-def test_forgetting_the_episode_under_way_leaves_the_fit():
-    chosen = recipe("lare-linear")
+@pytest.mark.parametrize("method", ["lare-linear", "rd-linear"])
+def test_forgetting_the_episode_under_way_leaves_the_fit(method):
+    chosen = recipe(method)
     learner = stored(chosen)
     begun = common.store(learner, jax.tree.map(lambda rows: rows[:2], steps_of(2)), chosen)
     back = common.forget_episode(begun)

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -106,6 +107,12 @@ def test_a_method_that_can_do_nothing_with_so_many_factors(method, arrays, messa
     assert not (tmp_path / "run").exists()
 
 
+def test_a_function_is_given_by_its_path(small, phi, tmp_path):
+    phi.save(tmp_path / "phi.py")
+    run = lare.train(toy_spec(), small(steps=60), function=tmp_path / "phi.py", out=tmp_path / "run", listeners=[])
+    assert run.function.source == phi.source
+
+
 def test_the_number_of_candidates_is_a_setting(small, tmp_path):
     """Without self-prompting: the first recorded candidate is the function."""
     settings = small(steps=60, candidates=1)
@@ -167,7 +174,7 @@ def test_resuming_a_finished_run_changes_nothing(small, tmp_path):
 def test_resuming_before_the_first_checkpoint_starts_anew(small, tmp_path):
     whole = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
     before = figures(whole)
-    for path in whole.checkpoint.iterdir():
+    for path in (*whole.checkpoint.iterdir(), whole.directory / "metrics.jsonl"):
         path.unlink()
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == before
 
@@ -319,7 +326,10 @@ def test_a_replay_that_the_memory_does_not_hold(error, small, tmp_path, monkeypa
 def test_a_replay_too_small_for_an_episode_is_refused(small, tmp_path):
     with pytest.raises(LareError, match="capacity = 20 is too small: an episode of Chase takes up to 21"):
         lare.train(toy_spec(), small(method="dense", capacity=20), out=tmp_path / "run", listeners=[])
-    with pytest.raises(LareError, match="steps = 400 are too few: an episode of HalfCheetah-v4 takes up to 1001"):
+    with pytest.raises(
+        LareError,
+        match="steps = 400 are too few: an episode of HalfCheetah-v4 takes up to 1000",
+    ):
         lare.train("HalfCheetah-v4", small(steps=400, chunk=4), out=tmp_path / "few")
     with pytest.raises(LareError, match="capacity = 100 is too small: a rollout takes up to 140"):
         lare.train(toy_spec(), small(algorithm="ppo", method="dense", capacity=100), out=tmp_path / "run", listeners=[])

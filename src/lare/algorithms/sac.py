@@ -26,7 +26,7 @@ SMALLEST_LOG, LARGEST_LOG = -20.0, 2.0
 
 
 class SACSettings(OffPolicySettings):
-    """The published hyperparameters."""
+    """Hyperparameters, as the LaRe paper sets them."""
 
     target_every: Annotated[int, Field(ge=1)] = 2
     """Updates from one move of the target critics to the next."""

@@ -24,7 +24,7 @@ from lare.networks import MLP, descend, move_towards, start_adam
 
 
 class TD3Settings(OffPolicySettings):
-    """The hyperparameters of the TD3 paper. The targets move at each policy update."""
+    """Hyperparameters, as the LaRe paper sets them. The targets move at each policy update."""
 
     policy_noise: Annotated[float, Field(ge=0)] = 0.2
     """Standard deviation of the noise on the target action, in units of the action bound."""

@@ -18,7 +18,10 @@ from lare.cli.terminal import say
 from lare.errors import LareError
 from lare.source import source
 
-DESCRIPTION = "Train reinforcement learning on episodic rewards, through latent rewards that a language model wrote."
+DESCRIPTION = (
+    "Train reinforcement learning on episodic rewards, through latent rewards that a language model wrote. "
+    "lare --version names the code; --debug, with any command, shows where an error came from."
+)
 COMMANDS = {
     "tasks": tasks,
     "methods": methods,

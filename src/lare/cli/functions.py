@@ -14,6 +14,9 @@ from lare.errors import LareError
 from lare.latent.function import LatentFunction
 from lare.tasks.spec import TaskSpec
 
+BUDGET, REQUESTS = 400_000, 60
+"""Tokens and requests of one design, at most."""
+
 
 def prompt(task: Task, kind: Kind = "factors") -> None:
     """Print the request that a language model gets for a task.
@@ -64,8 +67,8 @@ def design(
     reflect: int = 0,
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
     pre_verification: bool = True,
-    budget: int = 400_000,
-    requests: int = 60,
+    budget: int = BUDGET,
+    requests: int = REQUESTS,
     price: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="IN OUT")] = None,
     temperature: float | None = None,
     record: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
@@ -89,7 +92,7 @@ def design(
         policy: a run whose policy plays the episodes for --reflect; random actions do, unless given.
         pre_verification: without it (the paper's ablation), the first reply is tried once, in its jail, and kept as it is.
         budget: tokens, in and out together: no request is begun that might pass them.
-        requests: requests that are never passed.
+        requests: at most so many requests.
         price: of a million tokens in and out, to have the cost reckoned.
         temperature: of the model; the server's own unless given.
         record: a file that takes every exchange, for --model FILE; it must not exist, and not be the .json of --out.
@@ -104,6 +107,8 @@ def design(
 
     live = model not in (None, RECORDED) and not str(model).endswith(".json")
     check_design(live, base_url, draw, budget, requests, price, temperature)
+    if policy is not None and not reflect:
+        raise LareError("--policy plays episodes for --reflect: say how many rounds")
     check_files(out, record)
     spec, cost = load_task(task), Budget(requests, budget)
     if model is None or model == RECORDED:
@@ -178,6 +183,11 @@ def check_design(
         raise LareError("--base-url is for a live model: say which one with --model NAME")
     if draw and live:
         raise LareError("--draw chooses among recordings, and a live model says something new each time: leave it out")
+    asked = (budget, requests, price, temperature) != (BUDGET, REQUESTS, None, None)
+    if asked and not live:
+        raise LareError(
+            "--budget, --requests, --price and --temperature are for a live model: say which one with --model NAME"
+        )
     for name, value in (("budget", budget), ("requests", requests)):
         if value < 1:
             raise LareError(f"{name} = {value}: at least one is needed")

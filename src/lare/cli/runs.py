@@ -67,12 +67,13 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
         episodes: episodes for each seed. A single agent acts without noise, agents of particle tasks as in training.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
-    from lare.experiments.evaluation import evaluate_run, record_video
+    from lare.experiments.evaluation import check_video, evaluate_run, record_video
     from lare.experiments.statistics import mean_and_deviation, plus_minus
     from lare.training.run import open_run
 
     opened = open_run(run)
     if video is not None:
+        check_video(video)
         if not opened.config.task.particles:
             if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
                 os.environ.setdefault("MUJOCO_GL", "egl")  # which needs no screen; it is read when MuJoCo is imported
@@ -114,6 +115,7 @@ def cross_play(
     """
     from lare.experiments.agents import Match
     from lare.experiments.agents import cross_play as play
+    from lare.experiments.statistics import mean_and_deviation, plus_minus
     from lare.training.run import open_run
 
     runs = open_run(first), open_run(second)
@@ -122,7 +124,7 @@ def cross_play(
     ours, theirs = (task.team(role) for role in task.teams)
 
     def cell(match: Match) -> str:
-        return f"{match.returns.mean():.1f} ± {match.returns.std(ddof=match.returns.size > 1):.1f}"
+        return plus_minus(*mean_and_deviation(match.returns.ravel()))
 
     rows = zip((first, second), (matches[:2], matches[2:]), strict=True)
     head = (f"{ours} of, against {theirs} of", str(first), str(second))

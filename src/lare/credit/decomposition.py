@@ -58,11 +58,11 @@ class CreditSettings(Checked):
     """Steps in one update of the decoder: K steps of so many episodes, or whole episodes that make up about as many. Of many
     agents: of so many whole episodes, whatever is drawn from them."""
     episodes: Annotated[int, Field(ge=1)] = 8
-    """diaster: whole episodes in one update of its decoder."""
+    """diaster (single agents): whole episodes in one update of its decoder."""
     fits: Annotated[int, Field(ge=1)] = 1
-    """diaster: updates of its decoder before each chunk of those of an off-policy algorithm."""
+    """diaster (single agents): updates of its decoder before each chunk of those of an off-policy algorithm."""
     ridge: Annotated[float, Field(gt=0)] = 1.0
-    """lambda of the ridge regression: so many episodes' worth of belief in no difference between steps."""
+    """Strength of the ridge penalty (lambda), in episodes."""
     encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of VIB's encoder."""
     bottleneck: Annotated[int, Field(ge=1)] = 8

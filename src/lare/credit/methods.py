@@ -145,6 +145,15 @@ TABLE = (
     Method("rrd", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS, "randomized return decomposition", RRD),
     Method("rrdu", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS_UNBIASED, "RRD without the bias of the drawing", RRD),
     Method(
+        "rd-linear",
+        Reward.PROXY,
+        Encoder.RAW,
+        Fit.RIDGE,
+        "ridge regression on raw features, with a confidence radius",
+        "Efroni et al., AAAI 2021",
+        Decoder.LINEAR,
+    ),
+    Method(
         "vib-rd", Reward.PROXY, Encoder.RAW, Fit.ALL_STEPS, "RD behind a bottleneck of its own", VIB, Decoder.BOTTLENECK
     ),
     Method(

@@ -7,7 +7,16 @@ from pathlib import Path
 from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.html import note, table, write_page
-from lare.experiments.statistics import REFERENCES, REPETITIONS, Band, Comparison, by_label, compare, plus_minus
+from lare.experiments.statistics import (
+    OF_THREE,
+    REFERENCES,
+    REPETITIONS,
+    Band,
+    Comparison,
+    by_label,
+    compare,
+    plus_minus,
+)
 from lare.training.run import CONFIG, Run, read_measured
 
 HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "better than first [95%]")
@@ -63,7 +72,7 @@ def write_comparison(runs: Sequence[Run], out: Path) -> Comparison:
         LareError: they cannot be compared, or the file not be written.
     """
     comparison = compare(by_label(runs))
-    title = f"{', '.join(comparison.tasks)}: {', '.join(row.label for row in comparison.rows)}"
+    title = f"{', '.join(comparison.tasks)}: {len(comparison.rows)} contenders"
     write_page(out, title, "\n".join(body(title, comparison)))
     return comparison
 
@@ -75,7 +84,8 @@ def body(title: str, comparison: Comparison) -> Iterable[str]:
         what_scores_are(comparison)
         + f" IQM: interquartile mean. Intervals: stratified bootstrap over the seeds, {REPETITIONS} "
         "repetitions; over the draws of the language model where it says draws. sd: standard deviation over the seeds. Better than "
-        "first: the probability that a run scores more than one of the first method. A single seed has no interval."
+        "first: the probability that a run scores more than one of the first method. A single seed has no interval, nor has a "
+        "probability of 0 or 1. " + (OF_THREE if min(row.seeds for row in comparison.rows) == 3 else "")
     )
     score = "score" if comparison.normalised else "true return"
     yield from figure("Learning", comparison.curves, "environment steps", f"IQM of the {score}", steps=True)

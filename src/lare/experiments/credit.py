@@ -10,7 +10,7 @@ from jaxtyping import Float
 from lare.credit import closed_form
 from lare.credit.methods import Fit
 from lare.training import replay
-from lare.training.learner import RECENT, Learner, Recipe, proxy_rewards
+from lare.training.learner import RECENT, Learner, Recipe, features, proxy_rewards
 from lare.training.run import Run
 from lare.training.seeds import of_seed
 from lare.training.single_agent import load_learner
@@ -57,7 +57,8 @@ def credit_of(run: Run) -> Credit | None:
     uncertainty = None
     if one.credit is not None and one.credit.totals is not None and recipe.method.fit is Fit.RIDGE:
         totals, length = one.credit.totals, len(steps.reward)
-        uncertainty = np.asarray(closed_form.uncertainty(totals, steps.factors, length, recipe.credit.ridge, DELTA))
+        seen = features(steps, recipe.method)
+        uncertainty = np.asarray(closed_form.uncertainty(totals, seen, length, recipe.credit.ridge, DELTA))
     reward, proxy, factors = (np.asarray(part) for part in (steps.reward, proxy, steps.factors))
     return Credit(reward, proxy, uncertainty, factors, factor_correlations(learner, recipe))
 

@@ -1,7 +1,9 @@
 """Figures as SVG text, each from plain arrays, drawn to be read on a phone and on paper."""
 
 import io
+import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import cycle, product
 from typing import Any
 
 import matplotlib
@@ -14,6 +16,9 @@ from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
 """Okabe and Ito's colours, which the colour-blind can tell apart."""
+
+LINES = tuple(product(("-", "--", ":", "-."), COLOURS))
+"""Of many curves: every colour with one style, then with the next."""
 
 STYLE: Any = {
     "svg.fonttype": "none",
@@ -58,9 +63,9 @@ def curves(
     `marks` are values to measure by, each a dotted line with its name; the steps that random actions took are shaded.
     """
     figure, (axes,) = new_figure()
-    for colour, (name, (steps, values)) in zip(COLOURS * len(by_name), by_name.items(), strict=False):
+    for (line, colour), (name, (steps, values)) in zip(cycle(LINES), by_name.items(), strict=False):
         mean = values.mean(axis=0)
-        axes.plot(steps, mean, color=colour, label=name)
+        axes.plot(steps, mean, color=colour, linestyle=line, label=name)
         if len(values) > 1:
             spread = values.std(axis=0, ddof=1)
             axes.fill_between(steps, mean - spread, mean + spread, color=colour, alpha=0.18, linewidth=0)
@@ -97,8 +102,8 @@ def bands(
     With `decades`, y goes by its logarithm.
     """
     figure, (axes,) = new_figure()
-    for colour, (name, (x, y, low, high)) in zip(COLOURS * len(by_name), by_name.items(), strict=False):
-        axes.plot(x, y, color=colour, label=name, drawstyle="default" if steps else "steps-post")
+    for (line, colour), (name, (x, y, low, high)) in zip(cycle(LINES), by_name.items(), strict=False):
+        axes.plot(x, y, color=colour, linestyle=line, label=name, drawstyle="default" if steps else "steps-post")
         axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if steps else "post")
     axes.set(xlabel=across, ylabel=up)
     if decades:
@@ -189,10 +194,19 @@ def scatters(by_title: Mapping[str, Float[np.ndarray, "rows 2"]], values: Float[
 
 
 def legend_above(axes: Axes) -> None:
+    """Names in two columns, in one where they are long: a legend that is wider than the picture squeezes the curves."""
+    handles, labels = axes.get_legend_handles_labels()
+    labels = [textwrap.fill(label, 66) for label in labels]
+    columns = 2 if max(map(len, labels)) <= 30 else 1
+    lines = sum(label.count("\n") + 1 for label in labels) / columns
+    if isinstance(figure := axes.figure, Figure):
+        figure.set_figheight(figure.get_figheight() + 0.22 * max(0, lines - 2))
     axes.legend(
+        handles,
+        labels,
         loc="lower left",
         bbox_to_anchor=(0, 1),
-        ncols=2,
+        ncols=columns,
         borderaxespad=0.2,
         handlelength=1.4,
         fontsize=10,

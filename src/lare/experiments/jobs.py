@@ -9,7 +9,6 @@ import lare
 from lare.credit.methods import find_method
 from lare.errors import LareError
 from lare.latent.design import CANDIDATES, check_recorded
-from lare.latent.function import LatentFunction, load, per_role
 from lare.tasks.spec import TaskSpec
 from lare.training.checkpoint import saved_step
 from lare.training.run import CHECKPOINT, CONFIG, describe, read_config, read_metrics
@@ -66,7 +65,7 @@ def check(job: Job) -> None:
     method = find_method(job.plan.method)
     functions = ()
     if job.functions:
-        functions = chosen_functions(job.task, job.plan, load_functions(job.functions, job.task))
+        functions = chosen_functions(job.task, job.plan, job.functions)
     elif method.latent:
         for role in job.task.roles:
             check_recorded(role, method.kind, job.plan.draw, job.plan.candidates)
@@ -102,11 +101,5 @@ def train_one(order: dict[str, Any]) -> None:
     if (directory / CONFIG).is_file():
         lare.resume(directory)
     else:
-        task, paths = TaskSpec(**order["task"]), order["functions"]
-        functions = load_functions(paths, task) if paths else None
-        lare.train(task, Settings(**order["settings"]), function=functions, out=directory)
-
-
-def load_functions(paths: Sequence[str | Path], task: TaskSpec) -> list[LatentFunction]:
-    """Latent functions from their files, one for each role of the task."""
-    return [load(path, role) for path, role in per_role(paths, task)]
+        settings = Settings(**order["settings"])
+        lare.train(TaskSpec(**order["task"]), settings, function=order["functions"] or None, out=directory)

@@ -152,7 +152,10 @@ def details(name: str, run: Run) -> Iterable[str]:
     method = find_method(run.config.settings.method)
     yield f"<h2>{escape(name)} on {escape(run.config.task.name)}</h2>"
     yield f"<p>{escape(method.summary[0].upper() + method.summary[1:])}. Source: {escape(method.source)}.</p>"
-    yield from agents_details(run) if run.config.task.particles else one_agent_details(run)
+    if run.has_checkpoint():
+        yield from agents_details(run) if run.config.task.particles else one_agent_details(run)
+    else:
+        yield note("Its checkpoint is not there any more, and with it what credit and factors would be drawn from.")
     yield "<h3>Settings</h3>"
     yield settings_table(run)
 
@@ -171,7 +174,7 @@ def one_agent_details(run: Run) -> Iterable[str]:
                 ""
                 if credit.uncertainty is None
                 else f" The band holds the true reward with a probability of {1 - DELTA / 10:.0%} where rewards are linear "
-                "in the factors, with weights that are not large (Proposition 1 of the paper)."
+                "in what the decoder sees, with weights that are not large (Proposition 1 of the paper)."
             )
         )
     if run.function is not None:

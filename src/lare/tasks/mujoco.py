@@ -4,11 +4,12 @@ from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import WrapperSpec
+from gymnasium.utils import RecordConstructorArgs
 
 SPARSE_HALF_CHEETAH = "lare/HalfCheetahSparse-v4"
 
 
-class PaysForDistance(gymnasium.Wrapper):
+class PaysForDistance(gymnasium.Wrapper, RecordConstructorArgs):
     """Pays 1 at the end of an episode that has travelled further than `distance` metres, and else nothing.
 
     The fully sparse task of the LaRe paper, appendix F.6: I(final travel distance > 500). The published code asks for a
@@ -16,7 +17,8 @@ class PaysForDistance(gymnasium.Wrapper):
     """
 
     def __init__(self, env: gymnasium.Env, distance: float = 500.0):
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, distance=distance)
+        gymnasium.Wrapper.__init__(self, env)
         self.distance = distance
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

@@ -64,12 +64,11 @@ def describe(task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) ->
     longest = time_limit(task)
     kind = ALGORITHMS[plan.algorithm].kind
     if kind is not Kind.MANY_AGENTS and plan.rows < longest + 2:
-        room = (
-            f"capacity = {plan.rows} is too small"
-            if plan.rows == plan.capacity
-            else f"steps = {plan.steps} are too few"
-        )
-        raise LareError(f"{room}: an episode of {task.name} takes up to {longest + 1}")
+        if plan.rows < plan.capacity:
+            raise LareError(
+                f"steps = {plan.steps} are too few: an episode of {task.name} takes up to {longest}, and a run at least half of one"
+            )
+        raise LareError(f"capacity = {plan.rows} is too small: an episode of {task.name} takes up to {longest + 1}")
     if kind is Kind.ON_POLICY and plan.capacity < 2 * plan.turn + longest:
         raise LareError(f"capacity = {plan.capacity} is too small: a rollout takes up to {2 * plan.turn + longest}")
     if kind is Kind.MANY_AGENTS and plan.agents.capacity < plan.agents.episodes:
@@ -219,7 +218,10 @@ def read_config(directory: Path) -> Config:
     if not path.is_file():
         raise LareError(f"{directory} is not a run: there is no {CONFIG} in it")
     try:
-        return Config(**json.loads(path.read_text(encoding="utf-8")))
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(values, dict):
+            raise LareError("it is JSON, but not an object")
+        return Config(**values)
     except (LareError, OSError, ValueError, TypeError) as error:
         raise LareError(f"{path}: {error}") from error
 

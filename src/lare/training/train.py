@@ -14,13 +14,16 @@ from lare.credit.closed_form import LARGEST_CHOICE
 from lare.credit.methods import Fit, Method, Reward, find_method
 from lare.errors import LareError
 from lare.latent.design import design
-from lare.latent.function import LatentFunction, per_role
+from lare.latent.function import LatentFunction, load, per_role
 from lare.tasks.spec import TaskSpec, load_task
 from lare.training import many_agents, single_agent
 from lare.training.environments import Diverged
 from lare.training.progress import Clock, Listener, TensorBoard, Terminal, summary_writer
 from lare.training.run import Run, create, default_directory, isolation, locked, open_run
 from lare.training.settings import Plan, Settings, decide
+
+Given = LatentFunction | str | Path
+"""A latent function, or the path of its file."""
 
 
 class Interrupted(LareError):
@@ -33,7 +36,7 @@ def train(
     task: str | Path | TaskSpec,
     settings: Settings | None = None,
     *,
-    function: LatentFunction | Sequence[LatentFunction] | None = None,
+    function: Given | Sequence[Given] | None = None,
     out: str | Path | None = None,
     tensorboard: bool = False,
     listeners: Sequence[Listener] | None = None,
@@ -43,8 +46,8 @@ def train(
     Args:
         task: a shipped name, the path of a TOML file, or a spec.
         settings: method, algorithm, steps, seeds and all the rest.
-        function: `phi`, for the methods that need one; one for each team where several learn. Without it, it is designed
-            from the shipped recordings.
+        function: `phi`, or the path of its file, for the methods that need one; one for each team where several learn. Without
+            it, it is designed from the shipped recordings.
         out: the run directory, which must not exist; `runs/...` unless given.
         listeners: who is told of the progress; the terminal, unless given.
 
@@ -62,9 +65,7 @@ def train(
         return begin(run, tensorboard, listeners)
 
 
-def chosen_functions(
-    task: TaskSpec, plan: Plan, given: LatentFunction | Sequence[LatentFunction] | None
-) -> tuple[LatentFunction, ...]:
+def chosen_functions(task: TaskSpec, plan: Plan, given: Given | Sequence[Given] | None) -> tuple[LatentFunction, ...]:
     """One for each role of the task, designed where none was given; none for a method that needs none."""
     method = find_method(plan.method)
     if not method.latent:
@@ -73,10 +74,11 @@ def chosen_functions(
         asked = partial(design, kind=method.kind, draw=plan.draw, candidates=plan.candidates)
         functions = [asked(role) for role in task.roles]
     else:
-        functions = [given] if isinstance(given, LatentFunction) else given
+        each = per_role([given] if isinstance(given, Given) else given, task)
+        functions = [one if isinstance(one, LatentFunction) else load(one, role) for one, role in each]
     for function in functions:
         check_size(method, function.size * (2 if (plan.judges or task.judges) == "both" else 1))
-    return tuple(function for function, _ in per_role(functions, task))
+    return tuple(functions)
 
 
 def check_size(method: Method, factors: int) -> None:

@@ -13,6 +13,7 @@ from lare.experiments.paper.budgets import Budget
 from lare.experiments.paper.exhibits import ERROR, TRAVELLED, Claim, Contender, Exhibit
 from lare.experiments.paper.pages import Page, items, table
 from lare.experiments.statistics import (
+    OF_THREE,
     REPETITIONS,
     RETURN,
     Comparison,
@@ -34,9 +35,9 @@ LEVEL = 0.025
 JUDGED = (
     "So many pairs of runs, one of each, in which it is so (a run is a seed; where both have several draws, a draw, mean over its "
     f"seeds). p: the chance of as many or more by luck, over all tasks, exact (Mann and Whitney). Decided at {LEVEL}, for it or "
-    "against it, each claim by itself: of twenty where there is no difference, one would be. It is so only if it wins half of the "
-    "pairs on every task. What is said to be at least as good is not refuted as long as nothing is decided against it. Three seeds "
-    "on one task decide nothing: p is 0.05 at least."
+    "against it, each claim by itself: where there is no difference, one of twenty is decided all the same. It is so only if it "
+    "wins half of the pairs on every task. What is said to be at least as good is not refuted as long as nothing is decided "
+    "against it. Three seeds on one task decide nothing: p is 0.05 at least."
 )
 
 OF_ONE_AGENT = (
@@ -162,10 +163,11 @@ def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], 
             cells += [spread(runs[row.label], of_credit, step) for of_credit in (ERROR, CORRELATION)]
         rows.append(cells)
     yield table(head, rows)
-    few = " (of fewer than four it is the mean)" if min(row.seeds for row in found.rows) < 4 else ""
+    fewest = min(row.seeds for row in found.rows)
+    few = " (of fewer than four it is the mean)" if fewest < 4 else ""
     yield (
         f"At step {step:,}. IQM: interquartile mean over the seeds{few}, its interval by {REPETITIONS:,} stratified bootstraps; "
-        "sd: standard deviation over the seeds."
+        "sd: standard deviation over the seeds." + (f" {OF_THREE}" if fewest == 3 else "")
     )
 
 
