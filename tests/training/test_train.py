@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -292,6 +293,13 @@ def test_a_small_ring_forgets_and_goes_on(small, tmp_path):
     with pytest.raises(Interrupted):
         lare.train(toy_spec(), settings, out=tmp_path / "run", listeners=[stop])
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+
+
+@pytest.mark.parametrize("out", [".", "..", "/"])
+def test_a_directory_that_is_always_there(out, small, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(LareError, match=rf"^{re.escape(out)} exists, and a run never overwrites another"):
+        lare.train(toy_spec(), small(method="dense", steps=60), out=out, listeners=[])
 
 
 def test_a_run_whose_checkpoint_was_deleted_keeps_what_it_measured(small, tmp_path):

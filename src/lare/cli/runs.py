@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from lare.cli.terminal import RunDirectories, RunDirectory, progress, say, show
 from lare.errors import LareError
-from lare.training.settings import Settings, refuse_idle
+from lare.training.settings import Settings, decide, refuse_idle
 
 DEFAULTS = Settings()
 
@@ -44,7 +44,8 @@ def train(
         raise LareError("say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR")
     else:
         spec = lare.load_task(task)
-        refuse_idle(settings, spec)
+        plan = decide(settings, spec)
+        refuse_idle(plan, spec)
         if function and (settings.draw, settings.candidates) != (DEFAULTS.draw, DEFAULTS.candidates):
             raise LareError(
                 "--draw and --candidates choose a recorded function, and --function gives one: leave either out"
@@ -55,7 +56,7 @@ def train(
                 progress(
                     f"the function by {one.model.removesuffix(CHANGED)} is not the one that was saved: its hash is another"
                 )
-        run = lare.train(spec, settings, function=functions, out=out, tensorboard=tensorboard)
+        run = lare.train(spec, plan, function=functions, out=out, tensorboard=tensorboard)
     say(f"finished {run.directory}; to see it: lare report {run.directory}")
 
 

@@ -4,6 +4,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 
+def metrics(
+    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], counts: Bool[Array, " steps"], in_units: bool
+) -> dict[str, Float[Array, ""]]:
+    """By the keys of metrics.jsonl; the error only of proxy rewards that are in the unit of the true ones."""
+    found = {"credit/correlation": correlation(r_hat, reward, counts)}
+    return found | ({"credit/error": mean_error(r_hat, reward, counts)} if in_units else {})
+
+
 def mean_error(
     r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], counts: Bool[Array, " steps"]
 ) -> Float[Array, ""]:

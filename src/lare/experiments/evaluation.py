@@ -1,9 +1,8 @@
 """The policy of a finished (or stopped) run, evaluated and filmed, for one agent and for many."""
 
-import contextlib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +74,7 @@ def evaluate_run(run: Run, episodes: int = 10) -> dict[str, Float[np.ndarray, "s
         return agents.returns(run, episodes)
     check_against_environment(task)
     policy, parts = load_policy(run), []
-    with contextlib.ExitStack() as opened:
+    with ExitStack() as opened:
         environments = [
             [opened.enter_context(closing(make_episodic(task))) for _ in range(min(episodes, AT_A_TIME))]
             for _ in run.seeds

@@ -11,7 +11,7 @@ from lare.errors import LareError
 from lare.latent.design import CANDIDATES, check_recorded
 from lare.tasks.spec import TaskSpec
 from lare.training.checkpoint import saved_step
-from lare.training.run import CHECKPOINT, CONFIG, describe, read_config, read_metrics
+from lare.training.run import CHECKPOINT, CONFIG, check_room, read_config, read_metrics
 from lare.training.settings import Plan, Settings, decide
 from lare.training.train import chosen_functions
 
@@ -63,12 +63,7 @@ def job_of(root: Path, task: TaskSpec, settings: Settings, functions: Sequence[P
 def check(job: Job) -> None:
     """Raise `LareError` where a job could not be trained, or something else is in its place."""
     method = find_method(job.plan.method)
-    functions = ()
-    if job.functions:
-        functions = chosen_functions(job.task, job.plan, job.functions)
-    elif method.latent:
-        for role in job.task.roles:
-            check_recorded(role, method.kind, job.plan.draw, job.plan.candidates)
+    functions = chosen_functions(job.task, job.plan, job.functions) if job.functions else ()
     if job.begun:
         config = read_config(job.directory)
         if config.task.digest != job.task.digest:
@@ -83,7 +78,10 @@ def check(job: Job) -> None:
             raise LareError(f"{job.directory} holds a run with another latent function: choose another out")
     elif job.directory.exists():
         raise LareError(f"{job.directory} exists, and is not a run: choose another out")
-    describe(job.task, job.plan, ())
+    else:
+        check_room(job.task, job.plan)
+        for role in job.task.roles if method.latent and not functions else ():
+            check_recorded(role, method.kind, job.plan.draw, job.plan.candidates)
 
 
 def as_json(job: Job) -> dict[str, Any]:

@@ -71,6 +71,10 @@ class Running:
             self.processes.add(process)
             return process
 
+    def ended(self, process: subprocess.Popen) -> None:
+        with self.lock:
+            self.processes.discard(process)
+
     def stop(self) -> None:
         """Ask all of them to save themselves and end."""
         with self.lock:
@@ -117,7 +121,7 @@ def in_a_process(job: Job, cores: list[int], running: Running) -> str | None:
                 process.wait()
             process.wait()
         finally:
-            running.processes.discard(process)
+            running.ended(process)
     if process.returncode == 0:
         return None
     if process.returncode < 0:  # there is no last word of a process that was killed, for memory as it may be

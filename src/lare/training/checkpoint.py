@@ -110,12 +110,12 @@ def save(
     write_atomically(directory / f"rows-{number}.npz", lambda file: np.savez(file, allow_pickle=False, **segment))
     segments.append({"number": number, "start": start.tolist(), "count": count.tolist()})
     alive = [one for one in segments if any(np.add(one["start"], one["count"]) > end - rows)]
-    kept = {one["number"] for one in alive}  # not always the newest: a segment from before a drop may reach further
     state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner, by_row).items()} | dict(arrays)
     state |= {"host": np.array(json.dumps(host)), "segments": np.array(json.dumps(alive))}
     write_atomically(directory / STATE, lambda file: np.savez(file, allow_pickle=False, **state))
-    for number in (one["number"] for one in segments if one["number"] not in kept):
-        (directory / f"rows-{number}.npz").unlink(missing_ok=True)
+    for one in segments:
+        if one not in alive:  # which are not always the newest: a segment from before a drop may reach further
+            (directory / f"rows-{one['number']}.npz").unlink(missing_ok=True)
 
 
 def load(directory: Path, template: Some, by_row: Sequence[str]) -> tuple[Some, dict[str, Any], dict[str, np.ndarray]]:

@@ -264,10 +264,7 @@ def assess(learner: Learner, steps: int, recipe: Recipe) -> dict[str, Float[Arra
     counts = number >= replay.oldest_transition(held)
     recent = replay.read(held, jnp.where(counts, number, replay.oldest_transition(held)))
     r_hat = proxy_rewards(recent, learner, recipe)
-    measured = {"credit/correlation": accuracy.correlation(r_hat, recent.reward, counts)}
-    if recipe.method.in_units:
-        measured["credit/error"] = accuracy.mean_error(r_hat, recent.reward, counts)
-    return measured
+    return accuracy.metrics(r_hat, recent.reward, counts, recipe.method.in_units)
 
 
 class Compiled(NamedTuple):

@@ -60,7 +60,24 @@ class Config(Checked):
 
 
 def describe(task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) -> Config:
-    """Everything that the run depends on. Raises `LareError` where the replay could not hold a single episode."""
+    """Everything that the run depends on. Raises `LareError` as `check_room`."""
+    check_room(task, plan)
+    return Config(
+        lare=source(),
+        settings=plan,
+        task=task,
+        task_sha256=task.digest,
+        longest_episode=time_limit(task),
+        discrete=is_discrete(task),
+        function_sha256=tuple(function.digest for function in functions),
+        isolation=isolation(task, functions[0]) if functions else None,
+        versions={name: version(name) for name in VERSIONS} | {"python": platform.python_version()},
+        machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}",
+    )
+
+
+def check_room(task: TaskSpec, plan: Plan) -> None:
+    """Raise `LareError` where the replay could not hold a single episode, or a rollout."""
     longest = time_limit(task)
     kind = ALGORITHMS[plan.algorithm].kind
     if kind is not Kind.MANY_AGENTS and plan.rows < longest + 2:
@@ -75,18 +92,6 @@ def describe(task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) ->
         raise LareError(
             f"agents.capacity = {plan.agents.capacity} is less than the {plan.agents.episodes} episodes of an update"
         )
-    return Config(
-        lare=source(),
-        settings=plan,
-        task=task,
-        task_sha256=task.digest,
-        longest_episode=longest,
-        discrete=is_discrete(task),
-        function_sha256=tuple(function.digest for function in functions),
-        isolation=isolation(task, functions[0]) if functions else None,
-        versions={name: version(name) for name in VERSIONS} | {"python": platform.python_version()},
-        machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}",
-    )
 
 
 def isolation(task: TaskSpec, function: LatentFunction) -> str:
@@ -183,20 +188,22 @@ class Run:
 def create(directory: Path, task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) -> Run:
     """A new run directory. Raises `LareError` where there is something of that name."""
     config = describe(task, plan, functions)
+    taken = LareError(
+        f"{directory} exists, and a run never overwrites another: choose another --out, or go on with --resume"
+    )
+    if directory.exists() or directory.is_symlink():
+        raise taken
     new = directory.with_name(f".{directory.name}.{os.getpid()}.new")  # renamed when it is whole
     try:
-        if directory.exists() or directory.is_symlink():
-            raise FileExistsError
         new.mkdir(parents=True)
         for function, role in per_role(functions, task) if functions else ():
             function.save(new / function_file(task, role))
-        (new / CONFIG).write_text(config.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        text = config.model_dump_json(indent=1) + "\n"
+        write_atomically(new / CONFIG, lambda file: file.write(text.encode()))
         new.rename(directory)
     except OSError as error:
-        if isinstance(error, FileExistsError) or error.errno == errno.ENOTEMPTY:  # the latter: since a moment ago
-            raise LareError(
-                f"{directory} exists, and a run never overwrites another: choose another --out, or go on with --resume"
-            ) from None
+        if isinstance(error, FileExistsError) or error.errno == errno.ENOTEMPTY:  # since a moment ago
+            raise taken from None
         raise LareError(f"the run directory {directory} cannot be made: {error.strerror}") from error
     finally:
         shutil.rmtree(new, ignore_errors=True)

@@ -186,11 +186,10 @@ class Plan(Settings):
         return min(self.capacity, 2 * self.steps + 2)
 
 
-def refuse_idle(settings: Settings, task: TaskSpec) -> None:
+def refuse_idle(plan: Plan, task: TaskSpec) -> None:
     """Raise `LareError` where something was set that makes no difference to this task and algorithm."""
-    plan, usual = decide(settings, task), dict(dotted(Settings().model_dump()))
-    known = plan.in_force(task)
-    for name, value in dotted(settings.model_dump(include=plan.idle)):
+    usual, known = dict(dotted(Settings().model_dump())), plan.in_force(task)
+    for name, value in dotted(plan.model_dump(include=plan.idle)):
         if value == usual[name]:
             continue
         instead = f"agents.{name}" if f"agents.{name}" in known else f"{plan.algorithm}.{name.rpartition('.')[2]}"

@@ -276,10 +276,7 @@ def assess(learner: Learner, recipe: Recipe) -> dict[str, Float[Array, ""]]:
     reward = learner.replay.reward[newest]
     r_hat = rewards(learner, learner.replay.features[newest], reward, recipe).ravel()
     everything = jnp.ones(r_hat.shape, bool)
-    measured = {"credit/correlation": accuracy.correlation(r_hat, reward.ravel(), everything)}
-    if recipe.method.in_units:
-        measured["credit/error"] = accuracy.mean_error(r_hat, reward.ravel(), everything)
-    return measured
+    return accuracy.metrics(r_hat, reward.ravel(), everything, recipe.method.in_units)
 
 
 def returns(reward: Float[Array, "*seeds steps episodes agents"], team: Team) -> Float[Array, "*seeds episodes"]:
