@@ -35,7 +35,7 @@ for option, value in CACHE.items():
     os.environ.setdefault(option.upper(), str(value))
     jax.config.update(option, value)
 
-collect_ignore = ["toys.py", "servers.py", "recipes.py"]
+collect_ignore = ["toys.py", "servers.py", "recipes.py", "programs.py"]
 """No tests in there, and looking for doctests would import it, and register its environments, a second time."""
 
 __all__ = ["PHI", "Chase", "toy_spec"]

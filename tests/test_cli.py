@@ -311,6 +311,16 @@ def test_help_names_every_command(command):
     assert all(name in out for name in cli.COMMANDS)
 
 
+def test_help_breaks_no_line_where_the_source_does(command):
+    """The first of these lines would be that of a command's docstring, the second that of a setting's."""
+    status, out, _ = command("train", "--help")
+    assert status == 0
+    assert "--algorithm" in out
+    lines = [line.strip(" |│") for line in out.splitlines()]
+    assert "one --function for each, in the order of the task. (repeatable)" not in lines
+    assert "actions, td3 for all others. (default: None)" not in lines
+
+
 def test_from_training_to_report(command, spec_file, phi):
     run = Path("runs/Chase-lare-rrdu-td3-s0")
     status, out, _ = command("train", spec_file(), *TINY, "--function", phi)

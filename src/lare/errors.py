@@ -24,7 +24,12 @@ class LareError(Exception):
 class Checked(BaseModel):
     """Values that came from outside. Frozen; what does not fit is a `LareError` of one line."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        for field in cls.model_fields.values():  # docstrings, as `--help` shows them: lines are broken there
+            field.description = " ".join((field.description or "").split()) or None
 
     def __init__(self, /, **values: Any):
         try:

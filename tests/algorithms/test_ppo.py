@@ -106,7 +106,7 @@ def test_rewards_of_any_scale_and_offset_train_alike(discrete):
     """Undiscounted episodes of one length: an offset is the same for all, a scale leaves the advantages as they are."""
     ended = np.zeros((6, 4), np.float32)
     ended[-1] = 1
-    settings = PPOSettings(hidden=(16,), minibatch=24, epochs=2, gamma=1.0, trace=1.0)
+    settings = PPOSettings(hidden=(16,), minibatch=24, epochs=2, gamma=1.0, gae_lambda=1.0)
     rollout = rollout_of(ended=ended, discrete=discrete)._replace(continues=jnp.asarray(1 - ended))
     state = state_of(discrete, settings)
     quiet = state._replace(online=state.online._replace(critic=jax.tree.map(jnp.zeros_like, state.online.critic)))

@@ -35,8 +35,8 @@ class PPOSettings(Checked):
     """Adam's step size, for actor and critic."""
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
     """Discount of a step."""
-    trace: Annotated[float, Field(ge=0, le=1)] = 0.95
-    """Lambda of the generalised advantage."""
+    gae_lambda: Annotated[float, Field(ge=0, le=1)] = 0.95
+    """Of the generalised advantage estimates: 0 trusts the critic, 1 the rewards."""
     epochs: Annotated[int, Field(ge=1)] = 10
     """How often an update goes over its rollout."""
     minibatch: Annotated[int, Field(ge=1)] = 64
@@ -177,7 +177,7 @@ def advantages(
 ) -> Float[Array, "time lanes"]:
     """Generalised advantage estimates (Schulman et al., 2016, Eq. 16), each lane backwards through time."""
     delta = rollout.reward + settings.gamma * rollout.continues * next_value - value
-    carried = settings.gamma * settings.trace * (1 - rollout.ended)
+    carried = settings.gamma * settings.gae_lambda * (1 - rollout.ended)
 
     def back(later: Float[Array, " lanes"], step: tuple[Float[Array, " lanes"], Float[Array, " lanes"]]):
         advantage = step[0] + step[1] * later

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import inspect
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -11,6 +12,8 @@ import tyro
 from lare.errors import LareError, did_you_mean
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+CONTINUED = re.compile(r"\n {8,}")
+"""Where the text of an argument goes on; tyro would break the line there."""
 
 
 def parse(
@@ -39,6 +42,9 @@ def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     def keep(*values: object, **named: object) -> Callable[[], None]:
         return functools.partial(command, *values, **named)
 
+    keep.__doc__ = CONTINUED.sub(" ", inspect.cleandoc(command.__doc__ or ""))
+    keep.__dict__["__signature__"] = inspect.signature(command)
+    del keep.__wrapped__  # tyro would read the docstring there
     return keep
 
 

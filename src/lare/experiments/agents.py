@@ -85,14 +85,17 @@ def watch(run: Run, key: int = 0) -> Watched:
     recipe, learner = session.recipe, of_seed(session.learner)
     play = jax.jit(partial(teams.play, count=1, recipe=recipe))
     played = play(learner.algorithm.online.actor, jax.random.key(key))
-    proxy = None
-    if recipe.method.has_proxy:
-        factors = factors_of(session, played)
-        rows = teams.features(played, jnp.asarray(factors), recipe)
-        reward = jnp.swapaxes(played.reward, 0, 1)
-        r_hat = jax.jit(partial(teams.rewards, recipe=recipe))(learner, rows, reward)
-        proxy = np.asarray(r_hat)[0]
+    proxy = proxy_rewards(session, learner, played)[0] if recipe.method.has_proxy else None
     return Watched(np.asarray(played.position)[:, 0], np.asarray(played.reward)[:, 0], proxy)
+
+
+def proxy_rewards(
+    session: Session, learner: teams.Learner, played: Played
+) -> Float[np.ndarray, "episodes steps agents"]:
+    """What a single seed's decoders say of episodes."""
+    rows = teams.features(played, jnp.asarray(factors_of(session, played)), session.recipe)
+    reward = jnp.swapaxes(played.reward, 0, 1)
+    return np.asarray(jax.jit(partial(teams.rewards, recipe=session.recipe))(learner, rows, reward))
 
 
 def factors_of(session: Session, played: Played) -> Float[np.ndarray, "steps episodes agents factors"]:

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from lare.latent.guards import only_numbers
 from lare.latent.language import DOTTED, METHODS
-from lare.latent.program import CALLED_TYPES, only_numbers, resolve
+from lare.latent.program import resolve
+from lare.latent.rewrite import CALLED_TYPES
 
 
 class Looked(Exception):

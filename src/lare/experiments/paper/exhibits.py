@@ -85,13 +85,13 @@ ONE_DRAW = (
 
 USUAL = AgentSettings()
 FEW_EPISODES = {"agents": USUAL.model_copy(update={"credit": USUAL.credit.model_copy(update={"steps": 800})})}
-"""32 episodes in an update of the decoder, not 256: with attention it is 13 to 27 times as expensive as without."""
+"""32 episodes in an update of the decoder, not 256: with attention it is some 15 to 30 times as expensive as without."""
 AREL = Contender("AREL", "arel", settings=FEW_EPISODES)
 STAS = Contender("STAS", "stas", settings=FEW_EPISODES)
 LARE_FEW = Contender("LaRe-RD, 32 episodes", "lare-rd", settings=FEW_EPISODES, ending="-few")
 ATTENTION = (
-    "AREL and STAS are fitted on 32 episodes at a time instead of 256: all 256 take 77 and 156 minutes a seed. So is the LaRe-RD "
-    "that they are compared with."
+    "AREL and STAS are fitted on 32 episodes at a time instead of 256: all 256 take about one and a half and three hours a "
+    "seed. So is the LaRe-RD that they are compared with."
 )
 AGENTS = (DENSE, EPISODIC, RD, RRD, AREL, STAS, LARE_RD, LARE_FEW, SHARED)
 OF_AGENTS = (

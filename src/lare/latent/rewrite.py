@@ -1,0 +1,144 @@
+"""From the syntax tree of what was written to that of what is run: one function, in which nothing is named but what it is given.
+
+Dotted names become plain ones that no source can spell (`np.sum` in one piece), so that no module is in sight; operators become
+calls (`$add`), so that they can be guarded; imports, annotations and docstrings go; generators become lists; loops,
+comprehensions and calls burn fuel. Lines stay where they are.
+"""
+
+import ast
+import copy
+
+from lare.latent.language import DTYPES, NAME
+from lare.latent.syntax import dotted, is_docstring
+
+CALLED_TYPES = frozenset(f"numpy.{name}" for name in DTYPES)
+"""Types that are called as functions too: `np.float32(x)`."""
+
+GUARDED = {
+    ast.Add: "add",
+    ast.Sub: "subtract",
+    ast.Mult: "multiply",
+    ast.Div: "divide",
+    ast.FloorDiv: "floor_divide",
+    ast.Mod: "remainder",
+    ast.Pow: "power",
+    ast.MatMult: "matmul",
+    ast.BitAnd: "and",
+    ast.BitOr: "or",
+    ast.BitXor: "xor",
+}
+
+
+def called(name: str, *arguments: ast.expr) -> ast.Call:
+    return ast.Call(ast.Name(name, ast.Load()), list(arguments), [])
+
+
+def named(name: str, value: ast.expr) -> ast.NamedExpr:
+    return ast.NamedExpr(ast.Name(name, ast.Store()), value)
+
+
+def sliced(index: ast.expr) -> ast.expr:
+    """An index as a value: `1:2` is one only between brackets."""
+    if isinstance(index, ast.Slice):
+        ends = [end or ast.Constant(None) for end in (index.lower, index.upper, index.step)]
+        return ast.copy_location(called("$slice", *ends), index)
+    if isinstance(index, ast.Tuple):
+        return ast.copy_location(ast.Tuple([sliced(one) for one in index.elts], ast.Load()), index)
+    return index
+
+
+class Rewrite(ast.NodeTransformer):
+    """The walk over a tree that has passed the gate."""
+
+    def program(self, tree: ast.Module) -> ast.Module:
+        body = [one for node in tree.body if (one := self.visit(node)) is not None]
+        body.append(ast.Return(ast.Name(NAME, ast.Load())))
+        whole = ast.parse("def program(): pass")
+        function = whole.body[0]
+        assert isinstance(function, ast.FunctionDef)
+        function.name, function.body = "$program", body
+        return whole
+
+    def visit_Import(self, node: ast.Import) -> ast.stmt:
+        return ast.copy_location(ast.Pass(), node)
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> ast.stmt:
+        return ast.copy_location(ast.Pass(), node)
+
+    def visit_Expr(self, node: ast.Expr) -> ast.stmt:
+        return ast.copy_location(ast.Pass(), node) if is_docstring(node) else self.generic_visit(node)  # type: ignore[return-value]
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.stmt:
+        node.returns = None
+        self.generic_visit(node)
+        node.body.insert(0, ast.copy_location(ast.Expr(called("$burn")), node))
+        return node
+
+    def visit_arg(self, node: ast.arg) -> ast.arg:
+        node.annotation = None
+        return node
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.stmt:
+        if node.value is None:
+            return ast.copy_location(ast.Pass(), node)
+        return ast.copy_location(ast.Assign([self.visit(node.target)], self.visit(node.value)), node)
+
+    def visit_For(self, node: ast.For) -> ast.stmt:
+        self.generic_visit(node)
+        node.body.insert(0, ast.copy_location(ast.Expr(called("$burn")), node))
+        return node
+
+    def visit_comprehension(self, node: ast.comprehension) -> ast.comprehension:
+        self.generic_visit(node)
+        node.ifs.insert(0, ast.copy_location(called("$burn"), node.target))
+        return node
+
+    def visit_Lambda(self, node: ast.Lambda) -> ast.expr:
+        self.generic_visit(node)
+        node.body = ast.copy_location(ast.BoolOp(ast.And(), [called("$burn"), node.body]), node)
+        return node
+
+    def visit_GeneratorExp(self, node: ast.GeneratorExp) -> ast.expr:
+        self.generic_visit(node)
+        return ast.copy_location(ast.ListComp(node.elt, node.generators), node)
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
+        self.generic_visit(node)
+        return ast.copy_location(called(f"${GUARDED[type(node.op)]}", node.left, node.right), node)
+
+    def visit_AugAssign(self, node: ast.AugAssign) -> ast.stmt:
+        self.generic_visit(node)
+        old = copy.copy(node.target)
+        old.ctx = ast.Load()
+        if isinstance(old, ast.Subscript) and isinstance(node.target, ast.Subscript):
+            # What is indexed, and by what, is computed once, when the old value is read.
+            old.value, old.slice = named("$target", old.value), named("$index", sliced(old.slice))
+            node.target.value, node.target.slice = ast.Name("$target", ast.Load()), ast.Name("$index", ast.Load())
+        new = called(f"$i{GUARDED[type(node.op)]}", old, node.value)
+        return ast.copy_location(ast.Assign([node.target], new), node)
+
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        name, method = dotted(node.func), node.func.attr if isinstance(node.func, ast.Attribute) else ""
+        self.generic_visit(node)
+        if name in CALLED_TYPES:
+            node.func = ast.Name(f"{name}()", ast.Load())
+        elif name is None and method in ("keys", "items", "values"):
+            return ast.copy_location(called("$list", node), node)  # views of keys make sets, whose order is chance
+        elif name is None and method == "extend":
+            assert isinstance(node.func, ast.Attribute)
+            return ast.copy_location(called("$extend", node.func.value, *node.args), node)
+        for keyword in node.keywords:
+            if keyword.arg == "out":
+                keyword.value = ast.copy_location(called("$array", keyword.value), node)
+        return node
+
+    def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
+        name = dotted(node)
+        if name is not None:
+            return ast.copy_location(ast.Name(name, ast.Load()), node)
+        if node.attr == "dtype":
+            return ast.copy_location(called("$dtype", self.visit(node.value)), node)
+        return self.generic_visit(node)  # type: ignore[return-value]
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        return ast.copy_location(ast.Name("$range", ast.Load()), node) if node.id == "range" else node
