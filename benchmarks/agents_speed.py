@@ -3,18 +3,23 @@
     python benchmarks/agents_speed.py
 
 The contenders take turns; a turn is ten updates of one session, by the same `Session.advance` that `lare train` calls, so that
-it holds each thing as often as a whole run does. A run of 1000 updates takes a hundred turns, and its evaluations.
+it holds each thing as often as a whole run does. A run of 1000 updates takes a hundred turns, and its evaluations. The picture of
+cost by agents is docs/pictures/agents-cost.svg.
 """
 
 import tempfile
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import tyro
 from measure import interleave, show, summary, write
 
 import lare
+from lare.experiments import figures
+from lare.tasks.particles.table import find_particle_task
 from lare.training.many_agents import Session, start
 from lare.training.run import create
 from lare.training.settings import decide
@@ -25,6 +30,8 @@ TASKS = ("TriangleArea", "CN-6", "CN-15", "CN-30")
 METHODS = ("dense", "rd", "rrd", "lare-rd", "stas", "arel")
 """On CN-6."""
 SEED = 0
+MINUTES = "minutes of 1000 updates"
+PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "agents-cost.svg"
 
 
 def session(directory: Path, task_name: str, method: str, seeds: int = 1) -> Session:
@@ -39,13 +46,28 @@ def turn(of: Session) -> None:
     jax.block_until_ready(of.learner)
 
 
+def drawn(by_task: Mapping[str, Mapping[str, Any]]) -> str:
+    """Cost by the number of agents: the median of the rounds, with the least and the most."""
+    agents = [find_particle_task(task).agents for task in by_task]
+    least, median, most = (
+        [row[f"{which} {MINUTES}"] for row in by_task.values()] for which in ("least", "median", "most")
+    )
+    figure, (axes,) = figures.new_figure()
+    axes.plot(agents, median, color=figures.COLOURS[0], marker="o")
+    axes.fill_between(agents, least, most, color=figures.COLOURS[0], alpha=0.18, linewidth=0)
+    for task, x, y in zip(by_task, agents, median, strict=True):
+        axes.annotate(task, (x, y), (6, -12), textcoords="offset points")
+    axes.set(xlabel="agents", ylabel="minutes for 2.05 million steps", xlim=(0, 33), ylim=(0, None))
+    return figures.svg(figure)
+
+
 def main(rounds: int = 3) -> None:
     """Measure.
 
     Args:
         rounds: how often each has its turn.
     """
-    figures = {}
+    found = {}
     with tempfile.TemporaryDirectory() as place:
         wanted = {
             "lare-rd by task": {task: (task, "lare-rd", 1) for task in TASKS},
@@ -56,12 +78,13 @@ def main(rounds: int = 3) -> None:
             sessions = {name: session(Path(place) / f"{title} {name}", *row) for name, row in rows.items()}
             seconds = interleave({name: partial(turn, one) for name, one in sessions.items()}, rounds)
             first = next(iter(rows))
-            figures[title] = summary(seconds, 1, first)
-            show(title, figures[title], first)
-            for name, row in figures[title].items():
-                row["minutes of 1000 updates"] = row["median ms"] / 600
-                print(f"{name:28s} {row['minutes of 1000 updates']:10.1f} minutes for 1000 updates")
-    write("agents_speed", {"rounds": rounds, "seed": SEED, "ten updates and one fit": figures})
+            found[title] = summary(seconds, 1, first)
+            show(title, found[title], first)
+            for name, row in found[title].items():
+                row |= {f"{which} {MINUTES}": row[f"{which} ms"] / 600 for which in ("median", "least", "most")}
+                print(f"{name:28s} {row[f'median {MINUTES}']:10.1f} minutes for 1000 updates")
+    PICTURE.write_text(drawn(found["lare-rd by task"]) + "\n", encoding="utf-8")
+    write("agents_speed", {"rounds": rounds, "seed": SEED, "ten updates and one fit": found})
 
 
 if __name__ == "__main__":
