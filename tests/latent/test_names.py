@@ -1,5 +1,9 @@
 """What a source says of its factors: nothing is executed for it."""
 
+import gc
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
 from lare.latent.names import factor_meanings, factor_names, names_of
@@ -70,3 +74,23 @@ def test_meanings_of_the_toy():
 def test_a_numbered_comment_may_stand_above_the_first_of_several_lines():
     body = "# 1. how near\nd = action\nx = -d\n# 2. effort\ny = action\nz = x\n# not numbered\ne = x\nw = e\nreturn [x, y, z, w]"
     assert factor_meanings(phi(body)) == {"d": "how near", "x": "how near", "y": "effort", "e": "not numbered"}
+
+
+def test_sources_are_read_in_threads():
+    """As those of several candidates are. JAX has such a hook in the garbage collector too."""
+    source = phi("\n".join(["action = action + (1 + (2 + (3 + (4 + action))))"] * 20) + "\nreturn [action]")
+    usual = gc.get_threshold()
+    threads = ThreadPoolExecutor(8)
+
+    def another_goes_on(phase, info):
+        time.sleep(0)
+
+    gc.callbacks.append(another_goes_on)
+    gc.set_threshold(5)
+    try:
+        names = list(threads.map(lambda _: factor_names(source), range(200)))
+    finally:
+        gc.set_threshold(*usual)
+        gc.callbacks.remove(another_goes_on)
+        threads.shutdown()
+    assert names == [["action"]] * 200

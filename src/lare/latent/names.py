@@ -3,11 +3,16 @@
 import ast
 import itertools
 import re
+import threading
 import warnings
 
 from lare.latent.language import NAME
 
 NUMBERING = re.compile(r"^(factor\s*)?\d+\s*[.:)]\s*", re.IGNORECASE)
+
+ONE_AT_A_TIME = threading.Lock()
+"""Candidates are examined in threads, and before Python 3.11.8 and 3.12.2 two parsers may lose count of how deep they are: a
+SystemError, where the garbage collector lets another thread go on (python/cpython#106905)."""
 
 
 def names_of(source: str, size: int) -> list[str]:
@@ -18,7 +23,7 @@ def names_of(source: str, size: int) -> list[str]:
 
 def parsed(source: str) -> ast.Module:
     """The tree of a source that has passed. What Python would warn of is not for here."""
-    with warnings.catch_warnings():
+    with ONE_AT_A_TIME, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return ast.parse(source)
 
