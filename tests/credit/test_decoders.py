@@ -13,7 +13,7 @@ from lare.credit.attention import LayerNorm, attend, causal
 from lare.credit.decoders import Bottleneck, StepDecoder
 from lare.credit.decomposition import CreditSettings, Episodes
 from lare.credit.methods import TABLE, Decoder, Fit
-from lare.credit.stas import STAS, USED
+from lare.credit.stas import STAS, USED, Coalitions, dropout
 
 EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
 KEY = jax.random.key(1)
@@ -111,16 +111,45 @@ def test_arel_cares_not_which_agent_is_which():
     np.testing.assert_allclose(given, made("arel")(features()[:, ::-1], None).r_hat, rtol=1e-4, atol=1e-5)
 
 
-def test_attention_against_plain_sums():
+def attended(query, key, value, mask):
+    """Attention in plain sums: (queries, heads, size), (tokens, heads, size) twice, (queries, tokens)."""
+    found = np.zeros_like(query)
+    for token, head in np.ndindex(query.shape[:2]):
+        seen = mask[token]
+        scores = key[seen, head] @ query[token, head] / np.sqrt(query.shape[-1])
+        found[token, head] = np.exp(scores) / np.exp(scores).sum() @ value[seen, head]
+    return found.reshape(len(query), -1)
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (3, 2)])
+@pytest.mark.parametrize("queries", [4, 7])
+def test_attention_against_plain_sums(batch, queries):
     rng = np.random.default_rng(0)
-    query, key, value = (rng.normal(size=(4, 2, 3)).astype(np.float32) for _ in range(3))
-    got = attend(jnp.asarray(query), jnp.asarray(key), jnp.asarray(value), causal(4))
-    for token in range(4):
-        for head in range(2):
-            scores = key[: token + 1, head] @ query[token, head] / np.sqrt(3)
-            weights = np.exp(scores) / np.exp(scores).sum()
-            want = weights @ value[: token + 1, head]
-            np.testing.assert_allclose(got[token, 3 * head : 3 * head + 3], want, rtol=1e-4, atol=1e-6)
+    query, key, value = (rng.normal(size=(*batch, tokens, 2, 3)).astype(np.float32) for tokens in (queries, 4, 4))
+    mask = np.asarray(causal(4)) if queries == 4 else (rng.random((queries, 4)) < 0.5) | (np.arange(4) == 0)
+    got = attend(jnp.asarray(query), jnp.asarray(key), jnp.asarray(value), jnp.asarray(mask))
+    for place in np.ndindex(batch):
+        np.testing.assert_allclose(got[place], attended(query[place], key[place], value[place], mask), 1e-4, 1e-5)
+
+
+def test_coalitions_against_plain_sums():
+    """The mean over coalitions of attention with queries of each agent's own."""
+    layer, key = Coalitions(AGENTS, key=KEY), jax.random.key(1)
+    x = np.random.default_rng(0).normal(size=(AGENTS, 128)).astype(np.float32)
+    query = np.stack([x[i] @ layer.query.weight[i] + layer.query.bias[i] for i in range(AGENTS)])
+    projected = query, *(x @ linear.weight + linear.bias for linear in (layer.key, layer.value))
+    parts = [np.asarray(part).reshape(AGENTS, 4, 32) for part in projected]
+    masks = np.asarray(jax.random.bernoulli(key, 0.5, (5, AGENTS, AGENTS))) | np.eye(AGENTS, dtype=bool)
+    want = np.mean([attended(*parts, mask) @ layer.merge.weight + layer.merge.bias for mask in masks], axis=0)
+    np.testing.assert_allclose(layer(jnp.asarray(x), key, None), want, rtol=1e-4, atol=1e-5)
+
+
+def test_dropout_tosses_a_coin_for_each_entry():
+    kept = np.asarray(dropout(jnp.ones((50, 20, 13)), KEY))
+    assert set(np.unique(kept)) == {0, 2}
+    assert np.abs(kept.mean(axis=0) - 1).max() < 0.75  # over 50: 5 standard deviations
+    assert np.abs(np.corrcoef(kept.reshape(-1, 13).T) - np.eye(13)).max() < 0.2
+    np.testing.assert_array_equal(dropout(jnp.ones(3), None), 1)
 
 
 def test_stas_at_use_is_a_mean_over_draws():

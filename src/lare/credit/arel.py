@@ -48,9 +48,9 @@ class Block(eqx.Module):
     def __call__(
         self, x: Float[Array, "*batch tokens size"], mask: Bool[Array, "tokens tokens"] | None
     ) -> Float[Array, "*batch tokens size"]:
-        projected = (x @ self.projections).reshape(*x.shape[:-1], 3, HEADS, x.shape[-1])
-        found = attend(projected[..., 0, :, :], projected[..., 1, :, :], projected[..., 2, :, :], mask)
-        y = self.norms[0](x + self.merge(found))
+        projected = jnp.split(x @ self.projections, 3, axis=-1)
+        query, key, value = (part.reshape(*x.shape[:-1], HEADS, x.shape[-1]) for part in projected)
+        y = self.norms[0](x + self.merge(attend(query, key, value, mask)))
         return self.norms[1](y + self.feed_forward(y))
 
 
