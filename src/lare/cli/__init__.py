@@ -9,7 +9,8 @@ import os
 import sys
 import traceback
 
-from lare.cli.functions import design, new_task, prompt, verify
+from lare.cli.design import design
+from lare.cli.functions import new_task, prompt, verify
 from lare.cli.lists import algorithms, methods, tasks
 from lare.cli.parse import parse
 from lare.cli.runs import cross_play, evaluate, report, train
