@@ -85,13 +85,13 @@ ONE_DRAW = (
 
 USUAL = AgentSettings()
 FEW_EPISODES = {"agents": USUAL.model_copy(update={"credit": USUAL.credit.model_copy(update={"steps": 800})})}
-"""32 episodes in an update of the decoder, not 256: with attention it is some 15 to 30 times as expensive as without."""
+"""32 episodes in an update of the decoder, not 256: with attention a fit costs some 25 to 50 times as much as without."""
 AREL = Contender("AREL", "arel", settings=FEW_EPISODES)
 STAS = Contender("STAS", "stas", settings=FEW_EPISODES)
 LARE_FEW = Contender("LaRe-RD, 32 episodes", "lare-rd", settings=FEW_EPISODES, ending="-few")
 ATTENTION = (
-    "AREL and STAS are fitted on 32 episodes at a time instead of 256: all 256 take about one and a half and three hours a "
-    "seed. So is the LaRe-RD that they are compared with."
+    "AREL and STAS are fitted on 32 episodes at a time instead of 256: with all 256 a run of CN-6 takes 50 and 85 minutes, with "
+    "other methods 4 to 6. So is the LaRe-RD that they are compared with."
 )
 AGENTS = (DENSE, EPISODIC, RD, RRD, AREL, STAS, LARE_RD, LARE_FEW, SHARED)
 OF_AGENTS = (
