@@ -65,7 +65,8 @@ def design(
     from lare.llm.model import RECORDED, recorded_model
     from lare.tasks.spec import load_task
 
-    live = model not in (None, RECORDED) and not str(model).endswith(".json")
+    shipped = model in (None, RECORDED)
+    live = not shipped and not str(model).endswith(".json")
     check_design(live, base_url, draw, budget, requests, price, temperature)
     if policy is not None and not reflect:
         raise LareError("--policy plays episodes for --reflect: say how many rounds")
@@ -74,7 +75,7 @@ def design(
     if live:
         asked = LiveModel(str(model), base_url, temperature, cost, said=progress)
     else:
-        asked = recorded_model(spec.name, kind, draw, None if model in (None, RECORDED) else Path(str(model)))
+        asked = recorded_model(spec.name, kind, draw, None if shipped else Path(str(model)))
     try:
         function = design_function(
             spec,

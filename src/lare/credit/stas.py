@@ -94,7 +94,7 @@ class Coalitions(eqx.Module):
         joined = jax.random.bernoulli(key, 0.5, (COALITIONS, agents, agents)) | jnp.eye(agents, dtype=bool)
         # Each agent asks once for every coalition.
         found = attend(
-            jnp.concatenate([query] * COALITIONS, axis=-3),
+            jnp.tile(query, (COALITIONS, 1, 1)),
             heads(self.key(x)),
             heads(self.value(x)),
             joined.reshape(-1, agents),
