@@ -74,6 +74,8 @@ def test_an_unknown_choice_lists_those_there_are(command):
             "CN-6 --credit.no-normalise",
             "credit.normalise makes no difference to ippo on CN-6; it has agents.credit.normalise",
         ),
+        ("CN-6 --agents.credit.fits 3", "agents.credit.fits makes no difference to ippo on CN-6"),
+        ("Reacher-v4 --method dense --judges both", "judges makes no difference to dense"),
         ("CN-6 --scale-rewards", "scale_rewards makes no difference to ippo on CN-6"),
         ("CN-6 --capacity 10", "capacity makes no difference to ippo on CN-6; it has agents.capacity"),
         (

@@ -130,7 +130,8 @@ class At:
     def stopped(self): ...
 
     def said(self, message):
-        self.messages.append(message)
+        if " makes no difference to " not in message:  # settings of `small` serve every algorithm
+            self.messages.append(message)
 
     def stepped(self, step):
         if step == self.step:

@@ -1,10 +1,10 @@
 """What the user is told when something that they gave cannot be used."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 LONGEST_VALUE = 100
 """Characters of a value that a message quotes."""
@@ -31,11 +31,28 @@ class Checked(BaseModel):
         for field in cls.model_fields.values():  # docstrings, as `--help` shows them: lines are broken there
             field.description = " ".join((field.description or "").split()) or None
 
+    @model_validator(mode="before")
+    @classmethod
+    def with_the_defaults_of_their_places(cls, values: Any) -> Any:
+        """A table within a table changes the default of its place, which need not be that of its class."""
+        if not isinstance(values, Mapping):
+            return values
+        defaults = {name: cls.model_fields[name].default for name in values if name in cls.model_fields}
+        return {name: completed(defaults.get(name), value) for name, value in values.items()}
+
     def __init__(self, /, **values: Any):
         try:
             super().__init__(**values)
         except ValidationError as error:
             raise LareError(first_problem(error, tuple(type(self).model_fields))) from None
+
+
+def completed(default: Any, given: Any) -> Any:
+    """What was given and, where that is a table for settings, whatever of the default it leaves open."""
+    if not (isinstance(default, Checked) and isinstance(given, Mapping)):
+        return given
+    usual = {name: getattr(default, name) for name in type(default).model_fields}
+    return usual | {name: completed(usual.get(name), value) for name, value in given.items()}
 
 
 def shortened(value: Any) -> str:

@@ -121,6 +121,50 @@ def test_rewards_of_any_scale_and_offset_train_alike(discrete):
             np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
 
 
+def test_an_update_against_plain_numpy():
+    """One gradient step on a whole rollout, its gradient taken by differences in float64: loss, cut and Adam."""
+    settings = PPOSettings(
+        hidden=(4,), minibatch=24, epochs=1, entropy=0.3, value_weight=0.7, gradient_norm=0.1, anneal=True
+    )
+    state, rollout = state_of(settings=settings), rollout_of()
+    rows = jax.tree.map(np.asarray, ppo.prepare(state, rollout, settings)[0])
+
+    def network(leaves, x):
+        *hidden, last = zip(leaves[::2], leaves[1::2], strict=True)
+        for weight, bias in hidden:
+            x = np.tanh(x @ weight + bias)
+        return x @ last[0] + last[1]
+
+    def loss(leaves):
+        out = network(leaves[:4], rows.observation)
+        log = out - np.log(np.exp(out).sum(axis=1, keepdims=True))
+        gain = (np.exp((rows.action * log).sum(axis=1) - rows.log_probability) * rows.advantage).mean()
+        entropy = -(np.exp(log) * log).sum(axis=1).mean()
+        missed = 0.5 * (network(leaves[4:], rows.observation)[:, 0] - rows.target) ** 2
+        return -gain + 0.7 * missed.mean() - 0.3 * entropy
+
+    old = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(state.online)]
+    gradient = [np.zeros_like(leaf) for leaf in old]
+    for slope, leaf in zip(gradient, old, strict=True):
+        for place in np.ndindex(leaf.shape):
+            kept, ends = leaf[place], []
+            for change in (1e-5, -1e-5):
+                leaf[place] = kept + change
+                ends.append(loss(old))
+            leaf[place], slope[place] = kept, (ends[0] - ends[1]) / 2e-5
+    norm = np.sqrt(sum((slope**2).sum() for slope in gradient))
+    assert norm > 0.1
+    after, _ = ppo.update(state, rollout, jax.random.key(1), jnp.array(0.5), settings)
+    mean, square = (jax.tree.leaves(getattr(after.optimizer[0], name)) for name in ("mu", "nu"))
+    new = jax.tree.leaves(after.online)
+    for slope, leaf, m, v, moved in zip(gradient, old, mean, square, new, strict=True):
+        cut = slope * 0.1 / norm
+        np.testing.assert_allclose(m, 0.1 * cut, rtol=1e-2, atol=1e-6)
+        np.testing.assert_allclose(v, 0.001 * cut**2, rtol=2e-2, atol=1e-9)
+        step = 0.5 * settings.learning_rate * (m / 0.1) / (np.sqrt(v / 0.001) + 1e-8)
+        np.testing.assert_allclose(moved, leaf - step, rtol=1e-4, atol=1e-6)
+
+
 def test_annealing_ends_at_rest():
     settings = PPOSettings(hidden=(16,), minibatch=8, epochs=1, anneal=True)
     state = state_of(settings=settings)

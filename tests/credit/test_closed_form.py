@@ -101,12 +101,39 @@ def test_an_episode_that_is_forgotten_leaves_nothing():
 
 
 def test_the_radius_by_hand():
-    rows, at_its_end, ended, _, y = episodes()
+    rows, at_its_end, ended, z, y = episodes()
     totals = taken(rows, at_its_end, ended)
-    # d = 3, and the squares of x_k, in units of their deviation, add up to d times the episodes.
-    grown = np.log((1 + 3 * len(LENGTHS) / 2.0) / (0.1 / 10))
-    want = np.abs(y).max() * (np.sqrt(3 * grown / (4 * 10)) + np.sqrt(2.0 * 3))
-    assert float(radius(totals, 10, 2.0, 0.1)) == pytest.approx(want, rel=1e-3)
+    # d = 3, and the squares of x_k, 1 and those of 3 factors in units of their deviation, add up to 4 times the episodes.
+    count = len(LENGTHS)
+    grown = np.log((1 + 4 * count / 2.0) / (0.1 / 10))
+    left = y - np.asarray(ridge_regression(totals, 2.0)(jnp.asarray(z, jnp.float32), None).r_hat)
+    sigma = np.sqrt((left**2).sum() / (count - 4))
+    want = sigma * np.sqrt(4 * grown) + np.abs(y).max() * np.sqrt(2.0 * 3)
+    assert float(radius(totals, 2.0, 0.1)) == pytest.approx(want, rel=1e-3)
+
+
+def test_the_radius_of_few_episodes_knows_nothing_of_noise():
+    """As many weights as episodes leave no residuals."""
+    rows, at_its_end, ended, *_ = episodes()
+    steps = sum(LENGTHS[:4])
+    totals = taken(rows[:steps], at_its_end[:steps], ended[:steps])
+    grown = np.log((1 + 4 * 4 / 2.0) / (0.1 / 10))
+    want = float(totals.farthest) * (np.sqrt(4 * grown) + np.sqrt(2.0 * 3))
+    assert float(radius(totals, 2.0, 0.1)) == pytest.approx(want, rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_uncertainty_holds_of_rare_rewards_at_the_mean(seed):
+    """A reward of 1 in 50 steps, which has nothing to do with the factors: what is not known is how often it comes."""
+    rng, episodes_of_50 = np.random.default_rng(seed), 60
+    rows = rng.normal(size=(50 * episodes_of_50, 3))
+    ended = np.arange(1, len(rows) + 1) % 50 == 0
+    means = (rng.random((episodes_of_50, 50)) < 0.02).mean(axis=1)
+    totals = taken(rows, np.repeat(means, 50), ended)
+    at_the_mean = totals.mean[None, :-1]
+    away = abs(float(ridge_regression(totals, 1.0)(at_the_mean, None).r_hat[0]) - 0.02)
+    width = float(uncertainty(totals, at_the_mean, 1.0, 0.5)[0])
+    assert away <= width < 0.05
 
 
 def test_uncertainty_holds_and_shrinks():
@@ -117,7 +144,7 @@ def test_uncertainty_holds_and_shrinks():
         totals = taken(rows, at_its_end, ended)
         found = ridge_regression(totals, 1.0)
         x = jnp.asarray(rows[:50], jnp.float32)
-        width = uncertainty(totals, x, length=6, ridge=1.0, delta=0.1)
+        width = uncertainty(totals, x, ridge=1.0, delta=0.1)
         r_hat = found(x, None).r_hat
         assert (np.abs(r_hat - (rows[:50] @ WEIGHT + 0.7)) <= np.asarray(width)).all()
         widths.append(float(width.mean()))

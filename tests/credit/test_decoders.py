@@ -1,5 +1,6 @@
 """What every decoder keeps: shapes, causality, what it draws and when; and the equations of its own."""
 
+import math
 from functools import partial
 
 import jax
@@ -8,12 +9,12 @@ import numpy as np
 import pytest
 
 from lare.credit import decomposition
-from lare.credit.arel import AREL
+from lare.credit.arel import AREL, Block
 from lare.credit.attention import LayerNorm, attend, causal
 from lare.credit.decoders import Bottleneck, StepDecoder
 from lare.credit.decomposition import CreditSettings, Episodes
 from lare.credit.methods import TABLE, Decoder, Fit
-from lare.credit.stas import STAS, USED, Coalitions, dropout
+from lare.credit.stas import STAS, USED, Coalitions, TimeLayer, dropout
 
 EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
 KEY = jax.random.key(1)
@@ -130,6 +131,35 @@ def test_attention_against_plain_sums(batch, queries):
     got = attend(jnp.asarray(query), jnp.asarray(key), jnp.asarray(value), jnp.asarray(mask))
     for place in np.ndindex(batch):
         np.testing.assert_allclose(got[place], attended(query[place], key[place], value[place], mask), 1e-4, 1e-5)
+
+
+def affine(layer, x):
+    return x @ np.asarray(layer.weight) + np.asarray(layer.bias)
+
+
+def standardised(rows, epsilon):
+    return (rows - rows.mean(axis=1, keepdims=True)) / np.sqrt(rows.var(axis=1, keepdims=True) + epsilon)
+
+
+def test_a_layer_over_time_of_stas_against_plain_sums():
+    """Its input is not added again after the feed-forward part, and the attention is added twice."""
+    layer = TimeLayer(key=KEY)
+    x = np.random.default_rng(0).normal(size=(STEPS, 128)).astype(np.float32)
+    parts = [affine(part, x).reshape(STEPS, 4, 32) for part in (layer.query, layer.key, layer.value)]
+    a = affine(layer.merge, attended(*parts, np.tri(STEPS, dtype=bool)))
+    hidden = affine(layer.feed_forward.layers[0], standardised(x + a, 1e-12))
+    hidden *= 0.5 * (1 + np.vectorize(math.erf)(hidden / np.sqrt(2)))
+    want = standardised(affine(layer.feed_forward.layers[1], hidden) + 2 * a, 1e-12)
+    np.testing.assert_allclose(layer(jnp.asarray(x), None), want, rtol=1e-3, atol=1e-4)
+
+
+def test_a_block_of_arel_against_plain_sums():
+    block = Block(FEATURES, key=KEY)
+    x = np.random.default_rng(0).normal(size=(STEPS, FEATURES)).astype(np.float32)
+    parts = [part.reshape(STEPS, 3, FEATURES) for part in np.split(x @ np.asarray(block.projections), 3, axis=1)]
+    y = standardised(x + affine(block.merge, attended(*parts, np.tri(STEPS, dtype=bool))), 1e-5)
+    fed = affine(block.feed_forward.layers[1], np.maximum(affine(block.feed_forward.layers[0], y), 0))
+    np.testing.assert_allclose(block(jnp.asarray(x), causal(STEPS)), standardised(y + fed, 1e-5), rtol=1e-3, atol=1e-4)
 
 
 def test_coalitions_against_plain_sums():

@@ -1,12 +1,22 @@
 """What runs of many agents look like from outside."""
 
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lare
+from lare.algorithms import ppo
+from lare.algorithms.ppo import PPOSettings
 from lare.errors import LareError
 from lare.experiments import agents
 from lare.experiments.evaluation import evaluate_run, record_video
+from lare.training import teams
+from lare.training.many_agents import load_learner
+from lare.training.seeds import of_seed
 
 
 @pytest.fixture(scope="module")
@@ -64,11 +74,31 @@ def test_cross_play_is_every_team_against_every_other(runs):
     assert not np.array_equal(matches[0].returns, matches[1].returns)
 
 
-def test_a_team_against_its_own_other_team_is_the_run_itself(runs):
-    """On the diagonal each pair of one seed is what that seed's policies do together."""
-    own = agents.cross_play((runs[0], runs[0]), episodes=4)
-    for match in own[1:]:
-        np.testing.assert_array_equal(match.returns, own[0].returns)
+def test_a_pair_is_the_first_team_of_one_seed_and_the_others_of_another(runs):
+    recipe = load_learner(runs[0])[0]
+    actors = [load_learner(run)[1].algorithm.online.actor for run in runs[:2]]
+
+    def led_by(first, others):
+        mixed = agents.Mixed(of_seed(first, 0), of_seed(others, 1), 6)
+        played = jax.jit(partial(teams.play, count=4, recipe=recipe))(mixed, jax.random.key(0))
+        return float(played.reward[..., :6].sum(axis=(0, 2)).mean())
+
+    matches = agents.cross_play((runs[0], runs[1]), episodes=4)
+    found = [float(match.returns[0, 1]) for match in matches]
+    np.testing.assert_allclose(found, [led_by(one, other) for one in actors for other in actors], rtol=1e-4)
+    assert len(set(found)) == 4
+
+
+def test_who_leads_whom():
+    """One policy always goes left and the other always up."""
+
+    def always(action):
+        actor = ppo.init(jax.random.key(0), 32, 5, True, PPOSettings(hidden=(4,))).online.actor
+        bias = actor.network.layers[-1].bias
+        return eqx.tree_at(lambda actor: actor.network.layers[-1].bias, actor, bias.at[action].set(100.0))
+
+    taken = agents.Mixed(always(1), always(4), 6).sample(jnp.zeros((3, 8, 32)), jax.random.key(0))
+    np.testing.assert_array_equal(np.argmax(taken, axis=-1), np.tile([1] * 6 + [4] * 2, (3, 1)))
 
 
 def test_cross_play_needs_two_teams_of_one_task(runs):
@@ -115,7 +145,8 @@ def test_the_report(runs, tmp_path, monkeypatch):
     for heading in (
         "The factors of CompetitivePP-6-predator",
         "The latent function of CompetitivePP-6-prey",
-        "True return of the team of prey",
+        "True return, team of prey",
+        "Correlation of proxy and true reward, team of predator",
         "Who got which credit when",
     ):
         assert heading in page

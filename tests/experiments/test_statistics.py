@@ -1,13 +1,14 @@
 """Statistics of made-up runs, whose answers are known."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lare.errors import LareError
 from lare.experiments import statistics
-from lare.experiments.compare import cells, find_runs, what_scores_are, write_comparison
+from lare.experiments.compare import cells, find_runs, warning, what_scores_are, write_comparison
 from lare.experiments.statistics import by_label
 from lare.training.run import Run, describe
 from lare.training.settings import Settings, decide
@@ -32,7 +33,7 @@ def made(tmp_path):
         (directory / "config.json").write_text(config.model_dump_json())
         lines = [
             {"step": step, "seed": seed, "evaluation/return": value * share}
-            for step, share in zip(steps, (0.5, 1.0), strict=True)
+            for step, share in zip(steps, (0.5, 1.0), strict=bool(steps))
             for seed, value in zip(plan.all_seeds, returns, strict=True)
         ]
         (directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -59,14 +60,14 @@ def test_figures_by_hand(made):
     np.testing.assert_allclose(profile.value, [np.mean(np.array(values) > x) for x in profile.x])
 
 
-def test_the_chance_of_as_many_pairs_by_luck():
+def test_the_mann_whitney_p_pairs_by_luck():
     """By the tables of Mann and Whitney: of 3 against 3, all nine pairs 1 in 20, eight or more 2 in 20."""
     low, high = np.array([1.0, 2, 3]), np.array([4.0, 5, 6])
-    assert statistics.chance_of_as_many([(high, low)]) == pytest.approx(1 / 20)
-    assert statistics.chance_of_as_many([(np.array([3.0, 5, 6]), np.array([1.0, 2, 4]))]) == pytest.approx(2 / 20)
-    assert statistics.chance_of_as_many([(low, high)]) == pytest.approx(1)
-    assert statistics.chance_of_as_many([(high, low), (high, low)]) == pytest.approx(1 / 400)
-    assert statistics.chance_of_as_many([(low, low)]) > 0.5
+    assert statistics.mann_whitney_p([(high, low)]) == pytest.approx(1 / 20)
+    assert statistics.mann_whitney_p([(np.array([3.0, 5, 6]), np.array([1.0, 2, 4]))]) == pytest.approx(2 / 20)
+    assert statistics.mann_whitney_p([(low, high)]) == pytest.approx(1)
+    assert statistics.mann_whitney_p([(high, low), (high, low)]) == pytest.approx(1 / 400)
+    assert statistics.mann_whitney_p([(low, low)]) > 0.5
 
 
 def test_intervals_hold_what_they_promise():
@@ -102,6 +103,17 @@ def test_several_tasks_are_laid_between_fixed_ends(made, tmp_path):
     page = (tmp_path / "page.html").read_text()
     assert "Reacher-v4: 0 is -44, 1 is -2.7; Walker2d-v4: 0 is 3.4, 1 is 4600." in page
     assert page.count("<svg") == 2
+
+
+def test_tasks_that_judge_differently_are_laid_side_by_side():
+    """Reacher-v4 judges the observation before a step, the others the one after it: that makes no other method of one."""
+    kept = Path(__file__).parents[2] / "benchmarks" / "results" / "reproduce" / "laptop"
+    runs = find_runs(
+        [kept / task / f"{name}-td3" for task in ("Reacher-v4", "Walker2d-v4") for name in ("dense", "rrdu")]
+    )
+    runs += find_runs([kept / task / "lare-rrdu-td3-draw0" for task in ("Reacher-v4", "Walker2d-v4")])
+    found = statistics.compare(by_label(runs))
+    assert (found.tasks, list(found.groups)) == (("Reacher-v4", "Walker2d-v4"), ["dense", "rrdu", "lare-rrdu"])
 
 
 def test_runs_of_one_method_are_told_apart_by_their_settings(made):
@@ -166,6 +178,10 @@ def test_something_else_than_the_return_is_compared(made):
             [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": (60, 70)})],
             "the runs have no step in common at which all of them were evaluated",
         ),
+        (
+            [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": ()})],
+            "{runs}/Chase/b has no evaluation yet: leave it out",
+        ),
     ],
 )
 def test_what_cannot_be_compared(runs, message, made, tmp_path):
@@ -188,6 +204,36 @@ def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):
 def test_what_the_task_says_anyway_makes_no_other_method(made):
     runs = [made("a", [1.0], method="lare-rd"), made("b", [2.0], method="lare-rd", judges=toy_spec().judges)]
     assert list(by_label(runs)) == ["lare-rd"]
+    runs = [made("c", [1.0]), made("d", [2.0], judges="after", credit={"hidden": (8,)}, draw=3)]
+    assert list(by_label(runs)) == ["dense"]
+    assert list(by_label([made("e", [1.0], method="lare-rd", judges="after"), runs[0]])) == ["lare-rd", "dense"]
+
+
+RANGE = "the bootstrap's interval can only be their range, which holds the true mean in"
+
+
+@pytest.mark.parametrize(
+    ("tasks", "runs", "said"),
+    [
+        (["Walker2d-v4"], [[1.0, 2.0, 3.0]], f"Of three seeds {RANGE} three of four cases, not in 95 of 100."),
+        (["Walker2d-v4"], [[1.0, 2.0]], f"Of two seeds {RANGE} one of two cases, not in 95 of 100."),
+        (["Walker2d-v4"], [[1.0] * 4] * 2, f"Of two draws {RANGE} one of two cases, not in 95 of 100."),
+        (["Walker2d-v4"], [[1.0] * 4] * 4, ""),
+        (["Walker2d-v4"], [[1.0]], ""),
+        (
+            ["Walker2d-v4", "Reacher-v4"],
+            [[1.0, 2.0, 3.0]],
+            "Intervals of two or three seeds, or draws, are too narrow: they hold the true mean in less than 95 of 100 cases.",
+        ),
+    ],
+)
+def test_what_few_seeds_or_draws_cannot_say(tasks, runs, said, made):
+    opened = [
+        made(f"draw{draw}", returns, task, method="lare-rd", draw=draw)
+        for task in tasks
+        for draw, returns in enumerate(runs)
+    ]
+    assert warning(statistics.compare(by_label(opened))) == said
 
 
 @pytest.mark.parametrize(

@@ -256,6 +256,11 @@ def test_a_process_that_is_killed_is_named_by_the_signal(file, monkeypatch):
             "Reacher-v4/dense-td3 is asked for twice; two task files need two names",
         ),
         (("[settings]", "[settings"), "Expected"),
+        (
+            ("[settings]", "[settings]\nsac = { gamma = 0.9 }"),
+            "sac.gamma makes no difference to td3 on Reacher-v4; it has td3.gamma",
+        ),
+        (("[settings]", "[settings]\ncredit = { sum_form = true }"), "credit.sum_form makes no difference to dense"),
     ],
 )
 def test_a_file_that_lies(change, message, file):
@@ -319,8 +324,15 @@ def test_a_directory_with_something_else_in_it(file, in_this_process):
 def test_a_run_of_other_figures_of_another_algorithm_is_the_same_run(file, in_this_process):
     wanted, jobs = read_sweep(file)
     run_sweep(wanted, jobs[:1], lambda _: None)
-    file.write_text(FILE + "sac = { gamma = 0.9 }\n")
+    file.write_text('algorithms = ["td3", "sac"]' + FILE + "sac = { gamma = 0.9 }\n")
     assert read_sweep(file)[1][0].done
+
+
+def test_a_run_of_other_figures_of_another_method_is_the_same_run(file, in_this_process):
+    wanted, jobs = read_sweep(file)
+    run_sweep(wanted, jobs[:1], lambda _: None)
+    file.write_text(FILE + "credit = { ridge = 2.0 }\n")
+    assert [job.done for job in read_sweep(file)[1]] == [True, False, False]
 
 
 def test_metrics_that_make_no_sense(file, in_this_process):

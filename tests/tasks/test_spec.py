@@ -116,6 +116,31 @@ def test_like_over_two_generations(spec_file, tmp_path):
             "set max_episode_steps in the spec",
         ),
         (
+            {"teams": ["Reacher-v4"]},
+            "task '{file}': the teams of toys/Chase-v0 must be left out",
+        ),
+        (
+            {"environment": "particles/CompetitivePP-6"},
+            "task '{file}': the teams of particles/CompetitivePP-6 must be the specs of particles/CompetitivePP-6-predator, "
+            "particles/CompetitivePP-6-prey, in this order",
+        ),
+        (
+            {
+                "environment": "particles/CompetitivePP-6",
+                "teams": ["CompetitivePP-6-prey", "CompetitivePP-6-predator"],
+            },
+            "task '{file}': the teams of particles/CompetitivePP-6 must be the specs of particles/CompetitivePP-6-predator, "
+            "particles/CompetitivePP-6-prey, in this order",
+        ),
+        (
+            {"environment": "particles/CN-6", "max_episode_steps": 50},
+            "task '{file}': max_episode_steps makes no difference to a particle task: leave it out",
+        ),
+        (
+            {"environment": "particles/CN-6", "measures": ["info"]},
+            "task '{file}': measures makes no difference to a particle task: leave it out",
+        ),
+        (
             {"environment": "misfits/Broken-v0"},
             "environment 'misfits/Broken-v0' cannot be made: the licence has run out",
         ),
@@ -184,6 +209,12 @@ def test_teams_have_specs_of_their_own():
     single = read_task("CN-6")
     assert (single.roles, single.particles, single.whole) == ((single,), "CN-6", None)
     assert (toy_spec().particles, toy_spec().whole) == (None, None)
+
+
+def test_a_task_of_ones_own_has_the_same_teams(tmp_path):
+    (tmp_path / "mine.toml").write_text('like = "CompetitivePP-6"\nname = "Mine"\n')
+    task = read_task(tmp_path / "mine.toml")
+    assert [task.team(role) for role in task.roles] == ["predator", "prey"]
 
 
 @pytest.mark.parametrize("circle", [["a"], ["a", "b"], ["a", "b", "c"]])

@@ -1,4 +1,4 @@
-"""Whole runs of many agents: every task, every method, resumed, and what must be learned."""
+"""Whole runs of many agents: every task, every method, resumed."""
 
 import signal
 

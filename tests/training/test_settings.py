@@ -2,9 +2,12 @@
 
 import pytest
 
+from lare.algorithms.table import IPPO
+from lare.credit.decomposition import CreditSettings
+from lare.credit.methods import TABLE
 from lare.errors import LareError
 from lare.tasks.spec import read_task
-from lare.training.settings import Settings, decide
+from lare.training.settings import AgentSettings, Settings, decide, set_in_vain
 from toys import toy_spec
 
 
@@ -30,6 +33,57 @@ def test_what_is_given_stands():
     assert {name: getattr(plan, name) for name in given.model_fields_set} == given.model_dump(exclude_unset=True)
 
 
+NESTED = [(Settings, name) for name in ("td3", "ddpg", "sac", "ppo", "ippo", "rollout", "credit", "agents")]
+
+
+@pytest.mark.parametrize(("model", "name"), [*NESTED, (AgentSettings, "credit")])
+def test_a_table_changes_the_default_of_its_place(model, name):
+    """Which need not be the default of its class: DDPG is TD3 of other figures, IPPO is PPO."""
+    usual = getattr(model(), name)
+    for field, value in usual.model_dump().items():
+        if field not in ("anneal", "hidden"):
+            assert getattr(model(**{name: {field: value}}), name) == usual
+    assert getattr(model(**{name: {}}), name) == usual
+
+
+def test_tables_within_tables():
+    found = Settings(agents={"credit": {"steps": 800}}, ippo={"gae_lambda": 1.0}, method="dense")
+    assert found.agents.credit == AgentSettings().credit.model_copy(update={"steps": 800})
+    assert found.ippo == IPPO.model_copy(update={"gae_lambda": 1.0})
+    with pytest.raises(LareError, match="there is no key 'step'"):
+        Settings(agents={"credit": {"step": 800}})
+
+
+@pytest.mark.parametrize(
+    ("task", "settings", "names"),
+    [
+        ("CN-6", {"credit": {"normalise": False}, "chunk": 10}, ["chunk", "credit.normalise"]),
+        ("CN-6", {"agents": {"credit": {"fits": 3}}}, ["agents.credit.fits"]),
+        ("CN-6", {"agents": {"credit": {"steps": 800}}}, []),
+        ("Reacher-v4", {"method": "dense", "judges": "after", "draw": 1}, ["judges", "draw"]),
+        ("Reacher-v4", {"method": "rd", "credit": {"drawn_steps": 10}}, ["credit.drawn_steps"]),
+        ("Reacher-v4", {"method": "rrd", "credit": {"drawn_steps": 10}}, []),
+        ("Reacher-v4", {"method": "lare-linear", "credit": {"sum_form": True, "ridge": 2.0}}, ["credit.sum_form"]),
+        ("Reacher-v4", {"method": "vib-rd", "credit": {"bottleneck": 3}}, []),
+        (
+            "Reacher-v4",
+            {"method": "diaster", "algorithm": "ppo", "credit": {"fits": 3, "episodes": 4}},
+            ["credit.fits"],
+        ),
+        ("Reacher-v4", {"method": "ircr", "algorithm": "ppo", "rollout": {"fit_updates": 3}}, ["rollout.fit_updates"]),
+    ],
+)
+def test_what_is_set_in_vain(task, settings, names):
+    spec = read_task(task)
+    plan = decide(Settings(**settings), spec)
+    assert list(set_in_vain(plan, spec)) == names
+    assert not set(names) & set(plan.in_force(spec))
+
+
+def test_every_setting_of_the_decoder_matters_to_some_method():
+    assert frozenset().union(*(method.settings for method in TABLE)) == set(CreditSettings.model_fields)
+
+
 @pytest.mark.parametrize(
     ("task", "settings", "message"),
     [
@@ -41,6 +95,11 @@ def test_what_is_given_stands():
             "Reacher-v4",
             {"method": "llm-reward", "judges": "both"},
             "llm-reward is one reward a step: it judges the observation before or after, not both",
+        ),
+        (
+            "Reacher-v4",
+            {"method": "ircr", "scale_rewards": True},
+            "scale_rewards divides by the size of returns, and the rewards of ircr are not in their unit",
         ),
         (
             "CN-6",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lare.algorithms.ppo import PPOSettings
+from lare.credit.closed_form import Linear
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import METHODS, Encoder
 from lare.tasks.particles.table import find_particle_task
@@ -28,7 +29,7 @@ def recipe(method, task="TriangleArea", **changes):
         "agents": AgentSettings(
             episodes=COUNT, fit_updates=2, capacity=6, credit=CreditSettings(hidden=(8,), steps=50, drawn_steps=5)
         ),
-        "factors": {"TriangleArea": (2,), "CompetitivePP-6": (3, 2)}[task] if latent else (),
+        "factors": {"TriangleArea": (2,), "CompetitivePP-6": (3, 2)}.get(task, ()) if latent else (),
     }
     return Recipe(**(values | changes))
 
@@ -91,6 +92,91 @@ def test_rewards():
             total = np.asarray(true)[..., team.start : team.stop].sum(axis=1).mean(axis=1)
             given = got[:, -1, team.start : team.stop]
             np.testing.assert_allclose(given, np.broadcast_to(total[:, None], given.shape), rtol=1e-4, atol=1e-6)
+
+
+@pytest.fixture
+def numbered():
+    """Two teams whose decoders say the number that stands in their only factor, the second one with a minus."""
+    chosen = recipe("lare-linear", "CompetitivePP-6", factors=(1, 1))
+    learner, played = played_by(chosen)
+    numbers = jnp.arange(played.reward.size, dtype=jnp.float32).reshape(played.reward.shape)
+    credit = tuple(
+        one._replace(decoder=Linear(jnp.array([sign]), jnp.zeros(())))
+        for one, sign in zip(learner.credit, (1.0, -1.0), strict=True)
+    )
+    own = np.asarray(numbers) * np.repeat([1.0, -1.0], [6, 2])
+    return chosen, learner._replace(credit=credit), played, numbers[..., None], own
+
+
+def test_every_agent_has_the_proxy_rewards_of_its_own_steps(numbered):
+    chosen, learner, played, numbers, own = numbered
+    rows, true = jnp.swapaxes(numbers, 0, 1), jnp.swapaxes(played.reward, 0, 1)
+    np.testing.assert_array_equal(teams.rewards(learner, rows, true, chosen), np.swapaxes(own, 0, 1))
+
+
+def test_the_policy_is_improved_on_what_each_agent_saw_did_and_was_paid(numbered, monkeypatch):
+    chosen, learner, played, numbers, own = numbered
+    rollouts = []
+
+    def update(algorithm, rollout, key, left, settings):
+        rollouts.append(rollout)
+        return algorithm, {}
+
+    monkeypatch.setattr(teams.ppo, "update", update)
+    teams.improve(learner, played, numbers, jax.random.key(0), jnp.array(1.0), chosen)
+    before, after = (np.asarray(teams.seen(rows, chosen)) for rows in (played.observation, played.next_observation))
+    for step, episode, agent in np.ndindex(STEPS, COUNT, 8):
+        lane, place = episode * 8 + agent, (step, episode, agent)
+        assert float(rollouts[0].reward[step, lane]) == own[place]
+        np.testing.assert_array_equal(rollouts[0].observation[step, lane], before[place])
+        np.testing.assert_array_equal(rollouts[0].action[step, lane], played.action[place])
+        np.testing.assert_array_equal(rollouts[0].next_observation[step, lane], after[place])
+    ended = np.zeros((STEPS, COUNT * 8))
+    ended[-1] = 1
+    np.testing.assert_array_equal(rollouts[0].ended, ended)
+    np.testing.assert_array_equal(rollouts[0].continues, 1 - ended)
+
+
+def test_every_team_is_measured_by_itself(numbered):
+    """Decoders that say the true reward, and its negative."""
+    chosen, learner, played, _, _ = numbered
+    stored = teams.store(learner, played, played.reward[..., None], chosen)
+    found = teams.assess(stored._replace(credit=learner.credit), chosen)
+    assert {name: round(float(value), 3) for name, value in found.items() if "correlation" in name} == {
+        "credit/correlation": 1,
+        "credit/correlation_predator": 1,
+        "credit/correlation_prey": -1,
+    }
+    assert float(found["credit/error"]) == float(found["credit/error_predator"]) == pytest.approx(0, abs=1e-6)
+    assert float(found["credit/error_prey"]) == pytest.approx(2 * np.abs(played.reward[..., 6:]).mean(), rel=1e-4)
+
+
+def test_uniform_rewards_lie_between_the_worst_and_the_best_episode():
+    chosen = recipe("ircr")
+    learner, played = played_by(chosen)
+    learner = teams.store(learner, played, factors_for(chosen, played), chosen)
+    true = jnp.swapaxes(played.reward, 0, 1)
+    got = np.asarray(teams.rewards(learner, jnp.zeros((COUNT, STEPS, 3, 0)), true, chosen))
+    means = np.asarray(true).mean(axis=(1, 2))
+    want = (means - means.min()) / (means.max() - means.min())
+    np.testing.assert_allclose(got, np.broadcast_to(want[:, None, None], got.shape), rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["lare-rd", "lare-rrdu"])
+def test_must_learn_who_earned_what_from_what_was_played(method):
+    """Of two factors one is the true reward of the agent; the decoder is told the mean over agents and steps."""
+    credit = CreditSettings(hidden=(16,), learning_rate=1e-2, steps=500, drawn_steps=10)
+    agents = AgentSettings(episodes=COUNT, fit_updates=400, capacity=64, credit=credit)
+    chosen = recipe(method, "PP-6", agents=agents, factors=(2,))
+    learner = teams.init(jax.random.key(0), chosen)
+    play = jax.jit(partial(teams.play, count=64, recipe=chosen))
+    played = play(learner.algorithm.online.actor, jax.random.key(1))
+    noise = np.random.default_rng(0).normal(size=played.reward.shape).astype(np.float32)
+    learner = teams.store(learner, played, jnp.stack([played.reward, noise], axis=-1), chosen)
+    fitted, _ = jax.jit(partial(teams.fit, recipe=chosen))(learner, jax.random.key(2))
+    found = teams.assess(learner._replace(credit=fitted), chosen)
+    assert float(found["credit/correlation"]) > 0.95
+    assert float(found["credit/error"]) < 0.1  # untrained, it is 0.7
 
 
 def test_shared_credit_is_the_mean_over_the_agents():

@@ -81,6 +81,17 @@ def test_a_run_says_what_is_random_and_what_is_done_already(small, tmp_path):
     assert heard.messages == ["nothing is left to do: it had come to its end"]
 
 
+def test_a_run_says_what_was_set_in_vain(small, tmp_path):
+    heard = []
+
+    class Listener(At):
+        def said(self, message):
+            heard.append(message)
+
+    lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[Listener(-1, None)])
+    assert heard[0].startswith("ddpg.hidden makes no difference to td3 on Chase; it has td3.hidden (and ")
+
+
 def test_the_isolation_stands_in_the_config(small, phi, tmp_path):
     run = lare.train(toy_spec(), small(steps=60), function=phi, out=tmp_path / "run", listeners=[])
     assert run.config.isolation == phi.evaluator(2, 1).isolation
@@ -339,6 +350,8 @@ def test_a_replay_too_small_for_an_episode_is_refused(small, tmp_path):
         match="steps = 400 are too few: an episode of HalfCheetah-v4 takes up to 1000",
     ):
         lare.train("HalfCheetah-v4", small(steps=400, chunk=4), out=tmp_path / "few")
+    with pytest.raises(LareError, match="capacity = 40 is too small: a chunk takes up to 44"):
+        lare.train(toy_spec(), small(method="dense", capacity=40), out=tmp_path / "run", listeners=[])
     with pytest.raises(LareError, match="capacity = 100 is too small: a rollout takes up to 140"):
         lare.train(toy_spec(), small(algorithm="ppo", method="dense", capacity=100), out=tmp_path / "run", listeners=[])
     assert not (tmp_path / "run").exists()

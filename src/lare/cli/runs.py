@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from lare.cli.terminal import RunDirectories, RunDirectory, progress, say, show
 from lare.errors import LareError
-from lare.training.settings import Settings, decide, refuse_idle
+from lare.training.settings import Settings, decide, set_in_vain
 
 DEFAULTS = Settings()
 
@@ -45,7 +45,8 @@ def train(
     else:
         spec = lare.load_task(task)
         plan = decide(settings, spec)
-        refuse_idle(plan, spec)
+        for in_vain in set_in_vain(plan, spec).values():
+            raise LareError(in_vain)
         if function and (settings.draw, settings.candidates) != (DEFAULTS.draw, DEFAULTS.candidates):
             raise LareError(
                 "--draw and --candidates choose a recorded function, and --function gives one: leave either out"

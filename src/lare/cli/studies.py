@@ -1,6 +1,7 @@
 """Studies of many runs."""
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -28,15 +29,20 @@ def sweep(
     from lare.experiments.tables import rows_of, write_table
 
     wanted, jobs = read_sweep(file)
-    root = jobs[0].directory.parent.parent
+
+    def tabulate() -> None:
+        rows = rows_of(job.directory for job in jobs)
+        for path in write_table(rows, jobs[0].directory.parent.parent / "results") if rows else ():
+            say(f"wrote {path}")
+
     try:
         with watching(jobs) as said:
             failed = run_sweep(wanted, jobs, said, ray)
-    finally:
-        rows = rows_of(job.directory for job in jobs)
-        if rows:
-            for path in write_table(rows, root / "results"):
-                say(f"wrote {path}")
+    except BaseException:
+        with suppress(LareError):  # what stopped the sweep is what is to be said
+            tabulate()
+        raise
+    tabulate()
     if failed:
         sys.exit(1)
 
@@ -49,11 +55,11 @@ def compare(runs: RunDirectories, out: Path = Path("compare.html")) -> None:
             compared with.
         out: the page to write.
     """
-    from lare.experiments.compare import HEAD, cells, find_runs, what_scores_are, write_comparison
+    from lare.experiments.compare import HEAD, cells, find_runs, warning, what_scores_are, write_comparison
 
     comparison = write_comparison(find_runs(runs), out)
     show(HEAD, cells(comparison))
-    say(what_scores_are(comparison))
+    say(f"{what_scores_are(comparison)} {warning(comparison)}".rstrip())
     say(f"wrote {out}")
 
 

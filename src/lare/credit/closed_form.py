@@ -10,14 +10,15 @@ With z_k the mean of the factors over the steps of episode k, and R_k/T its mean
 S holds the deviations of the z_k, so that the scale of a factor changes nothing. Nothing here descends a gradient: what has
 been learned after k episodes is exact, and costs the same for each new episode.
 
-The estimator comes with a confidence radius. In units of S and of the largest |R/T|, with A = lambda I + sum_k x_k x_k^T over
-x_k = S^-1 (z_k - their mean), Proposition 1 says that with probability 1 - delta/10, for all k at once,
+The estimator comes with a confidence radius, after Proposition 1. With x_k = (1, S^-1 (z_k - their mean)) in d + 1 entries and
+A = sum_k x_k x_k^T + lambda diag(0, 1, ..., 1),
 
-    |w - w_hat|_A <= l_k = sqrt(d / (4 T) * log((1 + k L^2 / lambda) / (delta / 10))) + sqrt(lambda d)
+    l_k = sigma sqrt((d + 1) log((1 + k L^2 / lambda) / (delta / 10))) + B sqrt(lambda d),    |r - r_hat| <= l_k |x|_{A^-1}
 
-(the variance of a return's noise grows with T, and that of its mean R/T falls with 1/T; L is the largest |x_k|, and
-sum_k |x_k|^2, which is no more, stands for k L^2), and so |r - r_hat| <= l_k |x|_{A^-1} where rewards are linear in the factors,
-w x + b with |w| <= sqrt(d): nearly equal factors whose large weights cancel break it.
+(L the largest |x_k|; sum_k |x_k|^2, which is no more, stands for k L^2; B the largest |R/T|). The proposition knows that the
+reward of a step lies between 0 and 1, so that the noise of R/T deviates by 1/(2 sqrt(T)) at most; nobody knows that here, and
+sigma is the deviation of the residuals. So the band is the proposition's by analogy: to be expected where rewards are linear in
+the factors, w x + b with |w| <= B sqrt(d), and no theorem. Nearly equal factors whose large weights cancel break it.
 """
 
 import itertools
@@ -132,22 +133,26 @@ def best_signs(totals: Totals) -> Linear:
 
 
 def uncertainty(
-    totals: Totals,
-    features: Float[Array, "rows features"],
-    length: int,
-    ridge: float,
-    delta: float,
+    totals: Totals, features: Float[Array, "rows features"], ridge: float, delta: float
 ) -> Float[Array, " rows"]:
-    """l_k |x|_{A^-1}: how far, at most, r_hat is from the true reward of each row, in the rewards' units."""
-    unit = spread(totals)
-    x = (features - totals.mean[:-1]) / unit
+    """l_k |x|_{A^-1}: how far r_hat may be from the true reward of each row, in the rewards' units."""
+    x = (features - totals.mean[:-1]) / spread(totals)
     inverse = jnp.linalg.inv(design_matrix(totals, ridge))
-    return radius(totals, length, ridge, delta) * jnp.sqrt(jnp.sum((x @ inverse) * x, axis=1))
+    length = 1 / jnp.maximum(totals.episodes, 1) + jnp.sum((x @ inverse) * x, axis=1)
+    return radius(totals, ridge, delta) * jnp.sqrt(length)
 
 
-def radius(totals: Totals, length: int, ridge: float, delta: float) -> Float[Array, ""]:
-    """l_k of Proposition 1, in the rewards' units."""
+def radius(totals: Totals, ridge: float, delta: float) -> Float[Array, ""]:
+    """l_k, in the rewards' units."""
     size = len(totals.mean) - 1
-    largest = jnp.trace(design_matrix(totals, 0.0))
-    grown = jnp.log((1 + largest / ridge) / (delta / 10))
-    return totals.farthest * (jnp.sqrt(size * grown / (4 * length)) + jnp.sqrt(ridge * size))
+    squares = totals.episodes + jnp.trace(design_matrix(totals, 0.0))
+    grown = jnp.log((1 + squares / ridge) / (delta / 10))
+    return noise(totals, ridge) * jnp.sqrt((size + 1) * grown) + totals.farthest * jnp.sqrt(ridge * size)
+
+
+def noise(totals: Totals, ridge: float) -> Float[Array, ""]:
+    """The deviation of the residuals R_k/T - r_hat(z_k); the largest |R/T| as long as there are no more episodes than weights."""
+    v = jnp.append(ridge_regression(totals, ridge).weight, -1.0)
+    free = totals.episodes - len(v)
+    left = jnp.maximum(v @ totals.products @ v, 0)
+    return jnp.where(free > 0, jnp.sqrt(left / jnp.maximum(free, 1)), totals.farthest)

@@ -110,6 +110,17 @@ class Method:
         return self.encoder is Encoder.LATENT
 
     @property
+    def descends(self) -> bool:
+        """Whether its decoder is fitted by gradient descent."""
+        return self.fit is not None and not self.fit.closed_form
+
+    @property
+    def settings(self) -> frozenset[str]:
+        """Which of the decoder's settings (`CreditSettings`) make a difference."""
+        of_descent = DESCENT | OF_DECODER[self.decoder] if self.descends else frozenset()
+        return of_descent | (OF_FIT[self.fit] if self.fit is not None else frozenset())
+
+    @property
     def kind(self) -> Literal["factors", "reward"]:
         """What a language model is asked for, where the encoder is its function."""
         return "reward" if self.reward is Reward.DESIGNED else "factors"
@@ -124,6 +135,24 @@ class Method:
         """Whether it says nothing where there are many."""
         return self.decoder is Decoder.DIASTER
 
+
+DESCENT = frozenset({"learning_rate", "weight_decay", "normalise", "sum_form"})
+OF_FIT: dict[Fit, frozenset[str]] = {
+    Fit.ALL_STEPS: frozenset({"steps"}),
+    Fit.DRAWN_STEPS: frozenset({"steps", "drawn_steps"}),
+    Fit.DRAWN_STEPS_UNBIASED: frozenset({"steps", "drawn_steps"}),
+    Fit.SUBTRAJECTORIES: frozenset({"episodes", "fits"}),
+    Fit.RIDGE: frozenset({"ridge"}),
+    Fit.SIGNS: frozenset(),
+}
+OF_DECODER: dict[Decoder, frozenset[str]] = {
+    Decoder.STEP: frozenset({"hidden"}),
+    Decoder.BOTTLENECK: frozenset({"hidden", "encoder", "bottleneck", "divergence"}),
+    Decoder.AREL: frozenset(),
+    Decoder.STAS: frozenset(),
+    Decoder.DIASTER: frozenset({"hidden"}),
+}
+"""Settings, by what reads them: whatever descends a gradient, each fit, each decoder."""
 
 LARE = "Qu et al., LaRe, AAAI 2025"
 RD = "Efroni et al., AAAI 2021; Arjona-Medina et al., RUDDER, 2019"

@@ -16,7 +16,7 @@ from lare.training.seeds import of_seed
 from lare.training.single_agent import load_learner
 
 DELTA = 0.5
-"""Of the confidence radius: a band that holds with a probability of 95%."""
+"""Of the confidence radius: a band of 95%."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Credit:
     proxy: Float[np.ndarray, " steps"]
     """By the decoder of the last checkpoint."""
     uncertainty: Float[np.ndarray, " steps"] | None
-    """By how much, at most, the proxy reward is off: with a probability of 1 - DELTA / 10, for a decoder in closed form."""
+    """How far the proxy reward may be off, by the confidence radius of a decoder in closed form."""
     factors: Float[np.ndarray, "steps factors"]
     correlations: Float[np.ndarray, " factors"]
     """Pearson's, of each factor with the true reward, over the last steps of all seeds. NaN where one never varies."""
@@ -56,9 +56,8 @@ def credit_of(run: Run) -> Credit | None:
     proxy = proxy_rewards(steps, one, recipe)
     uncertainty = None
     if one.credit is not None and one.credit.totals is not None and recipe.method.fit is Fit.RIDGE:
-        totals, length = one.credit.totals, len(steps.reward)
         seen = features(steps, recipe.method)
-        uncertainty = np.asarray(closed_form.uncertainty(totals, seen, length, recipe.credit.ridge, DELTA))
+        uncertainty = np.asarray(closed_form.uncertainty(one.credit.totals, seen, recipe.credit.ridge, DELTA))
     reward, proxy, factors = (np.asarray(part) for part in (steps.reward, proxy, steps.factors))
     return Credit(reward, proxy, uncertainty, factors, factor_correlations(learner, recipe))
 

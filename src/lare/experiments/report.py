@@ -16,8 +16,11 @@ from lare.experiments.credit import DELTA, credit_of, factor_labels
 from lare.experiments.html import function_text, note, table, write_page
 from lare.experiments.statistics import REFERENCES, RETURN
 from lare.source import source
+from lare.tasks.spec import TaskSpec
 from lare.training.run import Run, open_run
 from lare.training.settings import Settings, decide, dotted
+
+ERROR, CORRELATION = "credit/error", "credit/correlation"
 
 TOP = "True rewards, for a million steps of the best public TD3,"
 """What the upper ends of `REFERENCES` are."""
@@ -92,9 +95,9 @@ def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
             name,
             str(len(run.seeds)),
             f"{run.metrics()[-1]['step']:,}",
-            spread(run, "evaluation/return", ".1f"),
-            spread(run, "credit/error", ".3g"),
-            spread(run, "credit/correlation", ".3f"),
+            spread(run, RETURN, ".1f"),
+            spread(run, ERROR, ".3g"),
+            spread(run, CORRELATION, ".3f"),
         )
         for name, run in zip(names, runs, strict=True)
     ]
@@ -109,31 +112,17 @@ def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
 def learning(task: str, runs: dict[str, Run]) -> Iterable[str]:
     """Curves of one task, all its runs in each."""
     yield f"<h2>Learning {escape(task)}</h2>"
-    shown = ["evaluation/return", "credit/error", "credit/correlation"]
-    spec = next(iter(runs.values())).config.task
-    shown[1:1] = [f"evaluation/{name}" for name in spec.measures]
-    names = [spec.team(role) for role in spec.teams]
-    teams = {f"evaluation/return_{team}": f"true return of the team of {team}" for team in names}
-    shown[0:1] = teams or shown[0:1]
-    titles = {
-        **teams,
-        "evaluation/return": "true return",
-        "credit/error": "mean |proxy - true reward|",
-        "credit/correlation": "correlation of proxy and true reward",
-    }
-    axes = {"credit/error": "reward", "credit/correlation": "correlation"}
     marks = {"random actions": REFERENCES[task][0]} if task in REFERENCES else {}
     random = {run.config.settings.warmup for run in runs.values()}
     random_until = random.pop() if len(random) == 1 else 0
-    for key in shown:
+    for key, title, unit in curves_of(next(iter(runs.values())).config.task):
         found = {name: points for name, run in runs.items() if (points := curve(run, key)) is not None}
         if found:
-            label = titles.get(key, key.removeprefix("evaluation/"))
-            yield f"<h3>{escape(label[0].upper() + label[1:])}</h3>"
+            yield f"<h3>{escape(title[0].upper() + title[1:])}</h3>"
             yield figures.curves(
                 found,
-                axes.get(key, label),
-                from_zero=key == "credit/error",
+                unit,
+                from_zero=key.startswith(ERROR),
                 marks=marks if key == RETURN else None,
                 random_until=random_until,
             )
@@ -145,6 +134,19 @@ def learning(task: str, runs: dict[str, Run]) -> Iterable[str]:
         *([f"{TOP} reach {REFERENCES[task][1]:,g}."] if task in REFERENCES else []),
     ]
     yield note(" ".join(explained))
+
+
+def curves_of(task: TaskSpec) -> Iterable[tuple[str, str, str]]:
+    """What is drawn over time: key of metrics.jsonl, title, unit; one of each team, where there are several."""
+    teams = {f"_{team}": f", team of {team}" for team in map(task.team, task.teams)} or {"": ""}
+    for key, title, unit in (
+        (RETURN, "true return", "true return"),
+        *((f"evaluation/{name}", name, name) for name in task.measures),
+        (ERROR, "mean |proxy - true reward|", "reward"),
+        (CORRELATION, "correlation of proxy and true reward", "correlation"),
+    ):
+        for suffix, of_team in teams.items():
+            yield key + suffix, title + of_team, unit
 
 
 def details(name: str, run: Run) -> Iterable[str]:
@@ -173,8 +175,8 @@ def one_agent_details(run: Run) -> Iterable[str]:
             + (
                 ""
                 if credit.uncertainty is None
-                else f" The band holds the true reward with a probability of {1 - DELTA / 10:.0%} where rewards are linear "
-                "in what the decoder sees, with weights that are not large (Proposition 1 of the paper)."
+                else f" The band is of {1 - DELTA / 10:.0%}, after Proposition 1 of the paper: to be relied on where rewards are "
+                "linear in what the decoder sees, with weights that are not large."
             )
         )
     if run.function is not None:

@@ -33,11 +33,8 @@ RETURN = "evaluation/return"
 REPETITIONS = 2000
 """Of the bootstrap."""
 
-OF_THREE = (
-    "Of three seeds the bootstrap's interval can only be their range, which holds the true mean in three of four cases, not in "
-    "95 of 100."
-)
-"""To be said where there are so few: the least of n^n draws, all n the same, is then likelier than 2.5%."""
+FEW = {2: ("two", "one of two"), 3: ("three", "three of four")}
+"""Numbers of seeds, or of draws, of which the least of n^n bootstraps, all n the same, is likelier than 2.5%."""
 
 Scores = Float[np.ndarray, "runs tasks *steps"]
 
@@ -117,6 +114,19 @@ class Comparison:
     normalised: bool
     groups: Mapping[str, "Group"]
     """The scores themselves, by label."""
+
+
+def too_few(rows: Sequence[Row], tasks: int) -> str:
+    """What is to be said of intervals that promise too much; nothing, where there are enough seeds and draws."""
+    counts = {"seeds": {row.seeds for row in rows}, "draws": {row.draws for row in rows}}
+    found = [(FEW[count], what) for what, some in counts.items() for count in sorted(some & FEW.keys())]
+    if found and tasks > 1:
+        return "Intervals of two or three seeds, or draws, are too narrow: they hold the true mean in less than 95 of 100 cases."
+    return " ".join(
+        f"Of {count} {what} the bootstrap's interval can only be their range, which holds the true mean in {cases} cases, not in "
+        "95 of 100."
+        for (count, cases), what in found
+    )
 
 
 @dataclass(frozen=True)
@@ -213,6 +223,8 @@ def grouped(runs: Mapping[str, Sequence[Run]], key: str) -> tuple[list[Group], t
                     f"{run.directory} and {other} are both {label} on {place[1]} with seed {seed}: leave one out"
                 )
             curves[place] = run, curve(lines, seed, key)
+            if not lines:
+                raise LareError(f"{run.directory} has no evaluation yet: leave it out")
     steps = sorted(set.intersection(*(set(values) for _, values in curves.values())))
     if not steps:
         raise LareError("the runs have no step in common at which all of them were evaluated")
@@ -250,7 +262,7 @@ def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:
     return Row(group.label, len(group.seeds), len(group.draws), iqm, mean, deviation, over_draws, better)
 
 
-def chance_of_as_many(pairs: Sequence[tuple[Float[np.ndarray, " ours"], Float[np.ndarray, " theirs"]]]) -> float:
+def mann_whitney_p(pairs: Sequence[tuple[Float[np.ndarray, " ours"], Float[np.ndarray, " theirs"]]]) -> float:
     """How likely it is that so many pairs, or more, are won by luck: Mann and Whitney's test, exact, over several tasks.
 
     U = sum over tasks and over all pairs of [ours > theirs] + [ours = theirs] / 2; its distribution, were both alike, is that
@@ -259,9 +271,9 @@ def chance_of_as_many(pairs: Sequence[tuple[Float[np.ndarray, " ours"], Float[np
     chances, won = {0.0: 1.0}, 0.0
     for ours, theirs in pairs:
         values = np.concatenate([ours, theirs])
-        won += pairs_won(ours, theirs)
+        won += mann_whitney_u(ours, theirs)
         ways = [list(chosen) for chosen in itertools.combinations(range(len(values)), len(ours))]
-        dealt = [pairs_won(values[chosen], np.delete(values, chosen)) for chosen in ways]
+        dealt = [mann_whitney_u(values[chosen], np.delete(values, chosen)) for chosen in ways]
         grown: dict[float, float] = {}
         for (before, chance), one in itertools.product(chances.items(), dealt):
             grown[before + one] = grown.get(before + one, 0.0) + chance / len(ways)
@@ -269,7 +281,7 @@ def chance_of_as_many(pairs: Sequence[tuple[Float[np.ndarray, " ours"], Float[np
     return min(1.0, sum(chance for total, chance in chances.items() if total >= won))
 
 
-def pairs_won(ours: Float[np.ndarray, " ours"], theirs: Float[np.ndarray, " theirs"]) -> float:
+def mann_whitney_u(ours: Float[np.ndarray, " ours"], theirs: Float[np.ndarray, " theirs"]) -> float:
     """Of all pairs, ties half."""
     return float(np.sum(ours[:, None] > theirs) + 0.5 * np.sum(ours[:, None] == theirs))
 

@@ -20,7 +20,7 @@ from lare.experiments.cluster import on_ray
 from lare.experiments.jobs import Job, check, job_of
 from lare.experiments.processes import in_processes
 from lare.tasks.spec import load_task
-from lare.training.settings import Settings
+from lare.training.settings import Settings, set_in_vain
 from lare.training.train import Interrupted
 
 Texts = Annotated[tuple[str, ...], Field(min_length=1)]
@@ -66,7 +66,7 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
     """Read a file, and check every run that it asks for before any is begun.
 
     Raises:
-        LareError: it cannot be read, or one of its runs could not be trained.
+        LareError: it cannot be read, one of its runs could not be trained, or a setting makes no difference to any of them.
     """
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -81,6 +81,10 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
         if places.setdefault(job.directory, job) is not job:
             raise LareError(f"{path}: {job.name} is asked for twice; two task files need two names")
         check(job)
+    in_vain = [set_in_vain(job.plan, job.task) for job in jobs]
+    for name, said in in_vain[0].items():
+        if all(name in others for others in in_vain):
+            raise LareError(f"{path}: {said}")
     return sweep, jobs
 
 

@@ -57,6 +57,17 @@ class TaskSpec(Checked):
                 raise ValueError(f"{key} still says {FILL_IN!r}: say there what a language model must know")
         return self
 
+    @model_validator(mode="after")
+    def has_the_teams_of_its_environment(self) -> "TaskSpec":
+        wanted = [f"{self.environment}-{team}" for team in TEAMS.get(self.particles or "", ())]
+        if [role.environment for role in self.teams] != wanted:
+            specs = f"the specs of {', '.join(wanted)}, in this order" if wanted else "left out"
+            raise ValueError(f"the teams of {self.environment} must be {specs}")
+        for key in ("max_episode_steps", "measures") if self.particles else ():
+            if getattr(self, key):
+                raise ValueError(f"{key} makes no difference to a particle task: leave it out")
+        return self
+
     @property
     def particles(self) -> str | None:
         """Which particle task this is (`particles/table.py`), for those that many agents learn together."""
@@ -77,7 +88,7 @@ class TaskSpec(Checked):
 
     def team(self, role: "TaskSpec") -> str:
         """What a team is called within the task."""
-        return role.name.removeprefix(f"{self.name}-")
+        return role.environment.removeprefix(f"{self.environment}-")
 
     @property
     def digest(self) -> str:

@@ -155,7 +155,7 @@ class CreditDraws(NamedTuple):
 
 def draw_credit(held: Replay, key: PRNGKeyArray, updates: int, recipe: Recipe) -> CreditDraws | None:
     """Decide for some updates of the decoder what each of them reads; None for a method that has none."""
-    if recipe.method.fit is None or recipe.method.fit.closed_form:
+    if not recipe.method.descends:
         return None
     if recipe.method.fit is Fit.ALL_STEPS:
         whole = partial(draw_whole_episodes, held, recipe=recipe)

@@ -16,7 +16,7 @@ from lare.training.environments import Stream
 from lare.training.run import Run
 from lare.training.seeds import lines, seed_keys
 from lare.training.settings import Plan
-from lare.training.teams import Compiled, Learner, Played, Recipe, compiled, init, returns
+from lare.training.teams import Compiled, Learner, Played, Recipe, by_team, compiled, init, returns
 
 
 @dataclass
@@ -49,7 +49,7 @@ class Session:
         played = self.functions.play(self.learner.algorithm.online.actor, keys, self.settings.agents.episodes)
         factors = self.factors(played)
         self.learner = self.functions.store(self.learner, played, factors)
-        if self.recipe.descends and number % self.recipe.agents.fit_every == 0:
+        if self.recipe.method.descends and number % self.recipe.agents.fit_every == 0:
             credit, fitted = self.functions.fit(self.learner, self.keys(Stream.FIT, number))
             self.learner = self.learner._replace(credit=credit)
             self.latest |= fitted
@@ -73,16 +73,12 @@ class Session:
         return found
 
     def report(self, rate: float) -> list[dict[str, Any]]:
-        """Evaluate, always from the same starts; one line of metrics.jsonl for each seed.
-
-        The return is that of the first team; where there are several, each has its own beside it.
-        """
+        """Evaluate, always from the same starts; one line of metrics.jsonl for each seed."""
         keys = self.keys(Stream.EVALUATION_EPISODES, 0)
         played = self.functions.play(self.learner.algorithm.online.actor, keys, self.settings.evaluation_episodes)
-        earned = {team.name: jnp.mean(returns(played.reward, team), axis=-1) for team in self.recipe.task.teams}
-        first, *others = earned.values()
-        measured = {"evaluation/return": first}
-        measured |= {f"evaluation/return_{name}": values for name, values in earned.items() if others}
+        task = self.recipe.task
+        earned = [{"evaluation/return": jnp.mean(returns(played.reward, team), axis=-1)} for team in task.teams]
+        measured = by_team(earned, task)
         measured |= self.functions.assess(self.learner) | self.latest
         return lines(self.run.seeds, self.step, measured, rate)
 

@@ -86,8 +86,9 @@ def check_room(task: TaskSpec, plan: Plan) -> None:
                 f"steps = {plan.steps} are too few: an episode of {task.name} takes up to {longest}, and a run at least half of one"
             )
         raise LareError(f"capacity = {plan.rows} is too small: an episode of {task.name} takes up to {longest + 1}")
-    if kind is Kind.ON_POLICY and plan.capacity < 2 * plan.turn + longest:
-        raise LareError(f"capacity = {plan.capacity} is too small: a rollout takes up to {2 * plan.turn + longest}")
+    if kind is not Kind.MANY_AGENTS and plan.capacity < 2 * plan.turn + longest:
+        what = "a rollout" if kind is Kind.ON_POLICY else "a chunk"
+        raise LareError(f"capacity = {plan.capacity} is too small: {what} takes up to {2 * plan.turn + longest}")
     if kind is Kind.MANY_AGENTS and plan.agents.capacity < plan.agents.episodes:
         raise LareError(
             f"agents.capacity = {plan.agents.capacity} is less than the {plan.agents.episodes} episodes of an update"

@@ -1,6 +1,6 @@
 """Every setting of a run. Together with the task and the latent functions they say all that a run depends on."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
@@ -20,7 +20,7 @@ LARGEST_SEED = 2**31 - 1
 
 
 class AgentSettings(Checked):
-    """What is particular to many agents. The numbers are the paper's."""
+    """What is particular to many agents. The numbers are the published code's, but for VIB's divergence."""
 
     episodes: Annotated[int, Field(ge=1)] = 82
     """Episodes that are played between two updates of the policy."""
@@ -160,20 +160,36 @@ class Plan(Settings):
         return getattr(self, self.algorithm)
 
     @property
-    def idle(self) -> set[str]:
-        """Settings that make no difference here: those of other algorithms, and of what this one does not do."""
-        others = {*ALGORITHMS} - {self.algorithm}
+    def idle(self) -> tuple[str, ...]:
+        """Settings, and groups of them, that make no difference to this algorithm, by dotted names."""
+        others = tuple(name for name in ALGORITHMS if name != self.algorithm)
         match ALGORITHMS[self.algorithm].kind:
             case Kind.OFF_POLICY:
-                return others | {"rollout", "agents"}
+                return (*others, "rollout", "agents")
             case Kind.ON_POLICY:
-                return others | {"agents", "chunk"}
+                return (*others, "agents", "chunk", "credit.fits")
             case Kind.MANY_AGENTS:
-                return others | {"rollout", "credit", "chunk", "capacity", "scale_rewards"}
+                of_one = ("agents.credit.episodes", "agents.credit.fits")
+                return (*others, "rollout", "credit", "chunk", "capacity", "scale_rewards", *of_one)
+
+    @property
+    def idle_for_method(self) -> tuple[str, ...]:
+        """Settings that make no difference to this method."""
+        method = find_method(self.method)
+        credit = "agents.credit" if ALGORITHMS[self.algorithm].kind is Kind.MANY_AGENTS else "credit"
+        found = [f"{credit}.{name}" for name in CreditSettings.model_fields if name not in method.settings]
+        if not method.descends:
+            found += ["agents.fit_every", "agents.fit_updates", "rollout.fit_updates"]
+        if not method.latent:
+            found += ["judges", "draw", "candidates"]
+        return tuple(found)
 
     def in_force(self, task: TaskSpec) -> dict[str, Any]:
         """All that matters here, by dotted names as on the command line."""
-        return dict(dotted(self.model_dump(exclude=self.idle))) | {"judges": self.judges or task.judges}
+        named = dict(dotted(self.model_dump()))
+        if self.judges in (None, task.judges):
+            named["judges"] = "as the task says"
+        return {name: value for name, value in named.items() if not among(name, self.idle + self.idle_for_method)}
 
     @property
     def episodes(self) -> int:
@@ -186,15 +202,24 @@ class Plan(Settings):
         return min(self.capacity, 2 * self.steps + 2)
 
 
-def refuse_idle(plan: Plan, task: TaskSpec) -> None:
-    """Raise `LareError` where something was set that makes no difference to this task and algorithm."""
-    usual, known = dict(dotted(Settings().model_dump())), plan.in_force(task)
-    for name, value in dotted(plan.model_dump(include=plan.idle)):
+def set_in_vain(plan: Plan, task: TaskSpec) -> dict[str, str]:
+    """What was set and makes no difference to this task, algorithm and method: by its dotted name, what is to be said of it."""
+    usual, known, found = dict(dotted(Settings().model_dump())), plan.in_force(task), {}
+    for name, value in dotted(plan.model_dump()):
         if value == usual[name]:
             continue
-        instead = f"agents.{name}" if f"agents.{name}" in known else f"{plan.algorithm}.{name.rpartition('.')[2]}"
-        hint = f"; it has {instead}" if instead in known else ""
-        raise LareError(f"{name} makes no difference to {plan.algorithm} on {task.name}{hint}")
+        if among(name, plan.idle):
+            instead = f"agents.{name}" if f"agents.{name}" in known else f"{plan.algorithm}.{name.rpartition('.')[2]}"
+            hint = f"; it has {instead}" if instead in known else ""
+            found[name] = f"{name} makes no difference to {plan.algorithm} on {task.name}{hint}"
+        elif among(name, plan.idle_for_method):
+            found[name] = f"{name} makes no difference to {plan.method}"
+    return found
+
+
+def among(name: str, groups: Sequence[str]) -> bool:
+    """Whether a dotted name is one of these, or of what is in one of them."""
+    return any(f"{name}.".startswith(f"{group}.") for group in groups)
 
 
 def dotted(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -235,6 +260,10 @@ def decide(settings: Settings, task: TaskSpec) -> Plan:
     judges = plan.judges or task.judges
     if method.reward is Reward.DESIGNED and judges == "both":
         raise LareError(f"{method.name} is one reward a step: it judges the observation before or after, not both")
+    if plan.scale_rewards and method.has_proxy and not method.in_units:
+        raise LareError(
+            f"scale_rewards divides by the size of returns, and the rewards of {method.name} are not in their unit"
+        )
     if method.for_one_only and many:
         raise LareError(f"{method.name} assigns credit to a single agent, and {task.name} is a task of many")
     if method.for_many_only and not many:

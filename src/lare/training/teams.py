@@ -10,7 +10,7 @@ for where there are several teams.
 Functions are written for one seed; `compiled` gives them their leading seed axis.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -60,11 +60,6 @@ class Recipe:
                 return (self.task.observation_size,) * len(self.task.teams)
             case Encoder.TAKEN:
                 return (self.task.observation_size + ACTIONS,) * len(self.task.teams)
-
-    @property
-    def descends(self) -> bool:
-        """Whether the decoders are fitted by gradient descent."""
-        return self.method.fit is not None and not self.method.fit.closed_form
 
     @property
     def policy_input(self) -> int:
@@ -207,8 +202,8 @@ def fit(
             batch = jax.tree.map(lambda whole: whole.reshape(parts, -1, *whole.shape[1:]), batch)
             new, measured = decomposition.update_in_parts(old, batch, key, way, settings)
             fitted.append(new)
-            losses.append(measured["credit/loss"])
-        return tuple(fitted), {"credit/loss": jnp.mean(jnp.stack(losses))}
+            losses.append(measured)
+        return tuple(fitted), by_team(losses, recipe.task)
 
     credit, measured = jax.lax.scan(one, learner.credit, jax.random.split(key, recipe.agents.fit_updates))
     return credit, jax.tree.map(jnp.mean, measured)
@@ -274,9 +269,17 @@ def assess(learner: Learner, recipe: Recipe) -> dict[str, Float[Array, ""]]:
         return {}
     newest = replay.newest(learner.replay, recipe.agents.episodes)
     reward = learner.replay.reward[newest]
-    r_hat = rewards(learner, learner.replay.features[newest], reward, recipe).ravel()
-    everything = jnp.ones(r_hat.shape, bool)
-    return accuracy.metrics(r_hat, reward.ravel(), everything, recipe.method.in_units)
+    r_hat, found = rewards(learner, learner.replay.features[newest], reward, recipe), []
+    for team in recipe.task.teams:
+        guess, true = (rows[..., team.start : team.stop].ravel() for rows in (r_hat, reward))
+        found.append(accuracy.metrics(guess, true, jnp.ones(guess.shape, bool), recipe.method.in_units))
+    return by_team(found, recipe.task)
+
+
+def by_team(measured: Sequence[dict[str, Array]], task: ParticleTask) -> dict[str, Array]:
+    """The metrics of all teams: those of the first and, where there are several, each team's under its own name too."""
+    teams = zip(task.teams, measured, strict=True) if len(measured) > 1 else ()
+    return measured[0] | {f"{name}_{team.name}": value for team, own in teams for name, value in own.items()}
 
 
 def returns(reward: Float[Array, "*seeds steps episodes agents"], team: Team) -> Float[Array, "*seeds episodes"]:

@@ -20,7 +20,7 @@ from lare.training import many_agents, single_agent
 from lare.training.environments import Diverged
 from lare.training.progress import Clock, Listener, TensorBoard, Terminal, summary_writer
 from lare.training.run import Run, create, default_directory, isolation, locked, open_run
-from lare.training.settings import Plan, Settings, decide
+from lare.training.settings import Plan, Settings, decide, set_in_vain
 
 Given = LatentFunction | str | Path
 """A latent function, or the path of its file."""
@@ -169,6 +169,9 @@ def introduce(session: single_agent.Session | many_agents.Session, listener: Lis
     run, settings = session.run, session.settings
     for message in messages:
         listener.said(message)
+    in_vain = list(set_in_vain(settings, run.config.task).values())
+    if in_vain:
+        listener.said(in_vain[0] + (f" (and {len(in_vain) - 1} more)" if len(in_vain) > 1 else ""))
     if run.function is not None:
         listener.said(f"the latent function runs in {isolation(run.config.task, run.function)}")
     if session.step < settings.warmup:
@@ -181,8 +184,8 @@ def introduce(session: single_agent.Session | many_agents.Session, listener: Lis
 def check_losses(lines: Sequence[dict[str, Any]]) -> None:
     """Raise `Diverged` where a loss is not finite, which metrics.jsonl writes as null."""
     for line in lines:
-        for name in ("critic/loss", "credit/loss"):
-            if name in line and line[name] is None:
+        for name, value in line.items():
+            if name.startswith(("critic/loss", "credit/loss")) and value is None:
                 raise Diverged(
                     f"training diverged: {name} of seed {line['seed']} is not finite at step {line['step']}; "
                     "the last checkpoint is whole"

@@ -60,6 +60,21 @@ def test_an_action_that_is_none_is_refused(action):
         environment.step({**dict.fromkeys(environment.agents, 0), "agent_3": action})
 
 
+@pytest.mark.parametrize("asked", ["step", "render", "state"])
+def test_what_comes_before_the_first_episode_is_refused(asked):
+    environment = ParticleEnv("CN-6")
+    with pytest.raises(LareError, match="there is no episode yet: reset the environment first"):
+        getattr(environment, asked)(*([{}] if asked == "step" else []))
+
+
+def test_nobody_acts_when_an_episode_is_over():
+    environment = ParticleEnv("TriangleArea")
+    environment.reset(seed=0)
+    for _ in range(STEPS):
+        environment.step(dict.fromkeys(environment.agents, 0))
+    assert environment.step({}) == ({},) * 5
+
+
 def test_wrong_names():
     with pytest.raises(LareError, match="did you mean 'PP-6'"):
         ParticleEnv("PP-60")

@@ -101,7 +101,7 @@ def row(redundant: int, history: History, latent: float) -> list[str]:
 
 def held(history: History) -> str:
     """In how many runs the bound held at every episode."""
-    always = np.asarray(theory.coverage(history)) == 1
+    always = np.asarray(theory.held(history))
     return f"{always.sum()} of {always.size}"
 
 

@@ -13,16 +13,16 @@ from lare.experiments.paper.budgets import Budget
 from lare.experiments.paper.exhibits import ERROR, TRAVELLED, Claim, Contender, Exhibit
 from lare.experiments.paper.pages import Page, items, table
 from lare.experiments.statistics import (
-    OF_THREE,
     REPETITIONS,
     RETURN,
     Comparison,
     Group,
-    chance_of_as_many,
     compare,
+    mann_whitney_p,
+    mann_whitney_u,
     mean_and_deviation,
-    pairs_won,
     plus_minus,
+    too_few,
 )
 from lare.tasks.spec import load_task
 from lare.training.run import Run, read_measured
@@ -45,7 +45,8 @@ OF_ONE_AGENT = (
     "the one before).",
 )
 ALWAYS = (
-    "Inputs of decoders and returns are normalised by running statistics, for the baselines as for LaRe (the paper: neither).",
+    "Inputs of decoders and returns are normalised by running statistics, for the baselines as for LaRe, but for what is fitted in "
+    "closed form (the paper: nothing is).",
     "The recorded replies are of a newer language model than the paper's.",
     "The seed of training and the draw of the language model are two things; the paper's change together.",
 )
@@ -167,7 +168,7 @@ def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], 
     few = " (of fewer than four it is the mean)" if fewest < 4 else ""
     yield (
         f"At step {step:,}. IQM: interquartile mean over the seeds{few}, its interval by {REPETITIONS:,} stratified bootstraps; "
-        "sd: standard deviation over the seeds." + (f" {OF_THREE}" if fewest == 3 else "")
+        f"sd: standard deviation over the seeds. {too_few(found.rows, 1)}".rstrip()
     )
 
 
@@ -200,10 +201,10 @@ def claimed(claim: Claim, other: str, exhibit: Exhibit, found: Mapping[str, Comp
     pairs = [units(one.groups[claim.better], one.groups[other]) for one in found.values()]
     if exhibit.key == ERROR:
         pairs = [(-ours, -theirs) for ours, theirs in pairs]
-    won = [pairs_won(ours, theirs) for ours, theirs in pairs]
+    won = [mann_whitney_u(ours, theirs) for ours, theirs in pairs]
     of = [len(ours) * len(theirs) for ours, theirs in pairs]
-    chance = chance_of_as_many(pairs)
-    contrary = chance_of_as_many([(theirs, ours) for ours, theirs in pairs])
+    chance = mann_whitney_p(pairs)
+    contrary = mann_whitney_p([(theirs, ours) for ours, theirs in pairs])
     everywhere = all(2 * count >= all_of_them for count, all_of_them in zip(won, of, strict=True))
     says = "errs less than" if exhibit.key == ERROR else "is at least as good as" if claim.at_least else "is above"
     return [

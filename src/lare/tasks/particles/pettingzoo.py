@@ -63,6 +63,7 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
         self.observation_spaces: dict[str, Space[Any]] = {agent: deepcopy(view) for agent in self.possible_agents}
         self.action_spaces: dict[str, Space[Any]] = {agent: deepcopy(moves) for agent in self.possible_agents}
         self.agents: list[str] = []
+        self.current: State | None = None
         self.key = jax.random.key(np.random.default_rng().integers(2**31))
 
     def observation_space(self, agent: str) -> Space[Any]:
@@ -84,12 +85,14 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
     def step(
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        acted = self.agents
+        state, acted = self.now(), self.agents
+        if not acted:
+            return {}, {}, {}, {}, {}
         for agent in acted:
             if not self.action_spaces[agent].contains(actions.get(agent)):
                 raise LareError(f"the action of {agent} is {actions.get(agent)!r}; it must be 0 to {ACTIONS - 1}")
         chosen = jnp.asarray([int(actions[agent]) for agent in acted])
-        self.current, observation, reward = advance(self.task, self.current, chosen, self.next_key())
+        self.current, observation, reward = advance(self.task, state, chosen, self.next_key())
         self.steps += 1
         ended = self.steps == STEPS
         results = (
@@ -105,11 +108,17 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
 
     def render(self) -> np.ndarray:
         """The state as pixels (height, width, 3)."""
-        return pixels(draw(self.task, np.asarray(self.current.position)))
+        return pixels(draw(self.task, np.asarray(self.now().position)))
 
     def state(self) -> np.ndarray:
         """Positions and velocities of everything, in one row."""
-        return np.concatenate([np.asarray(part).ravel() for part in self.current])
+        return np.concatenate([np.asarray(part).ravel() for part in self.now()])
+
+    def now(self) -> State:
+        """The state of the world. Raises `LareError` where there is none yet."""
+        if self.current is None:
+            raise LareError("there is no episode yet: reset the environment first")
+        return self.current
 
     def by_agent(self, values: Any) -> dict[str, Any]:
         return dict(zip(self.possible_agents, values, strict=True))
