@@ -116,8 +116,8 @@ def test_draws_are_what_is_compared_where_there_are_several(tmp_path, monkeypatc
         processes, "in_a_process", write_run(lambda plan, seed: plan.draw * 1000 + plan.candidates + seed)
     )
     text = reproduce("candidates", BUDGETS["laptop"], Share(), tmp_path / "runs", tmp_path / "out").read_text()
-    assert "| n = 5 is above n = 1 | 6 of 9 |" in text
-    assert "| open |" in text
+    assert "| n = 5 is at least as good as n = 1 | 6 of 9 |" in text
+    assert "| not refuted |" in text
     rows = (tmp_path / "out" / "laptop" / "candidates.csv").read_text().splitlines()
     assert len({tuple(row.split(",")[:8]) for row in rows[1:]}) == len(rows) - 1 == 2 * 3 * 3 * 2
 
