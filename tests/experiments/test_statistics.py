@@ -8,8 +8,8 @@ import pytest
 
 from lare.errors import LareError
 from lare.experiments import statistics
-from lare.experiments.compare import cells, find_runs, warning, what_scores_are, write_comparison
-from lare.experiments.statistics import by_label
+from lare.experiments.compare import cells, find_runs, what_scores_are, write_comparison
+from lare.experiments.statistics import by_label, too_few
 from lare.training.run import Run, describe
 from lare.training.settings import Settings, decide
 from toys import toy_spec
@@ -60,7 +60,7 @@ def test_figures_by_hand(made):
     np.testing.assert_allclose(profile.value, [np.mean(np.array(values) > x) for x in profile.x])
 
 
-def test_the_mann_whitney_p_pairs_by_luck():
+def test_mann_and_whitneys_test_by_hand():
     """By the tables of Mann and Whitney: of 3 against 3, all nine pairs 1 in 20, eight or more 2 in 20."""
     low, high = np.array([1.0, 2, 3]), np.array([4.0, 5, 6])
     assert statistics.mann_whitney_p([(high, low)]) == pytest.approx(1 / 20)
@@ -233,7 +233,7 @@ def test_what_few_seeds_or_draws_cannot_say(tasks, runs, said, made):
         for task in tasks
         for draw, returns in enumerate(runs)
     ]
-    assert warning(statistics.compare(by_label(opened))) == said
+    assert too_few(statistics.compare(by_label(opened))) == said
 
 
 @pytest.mark.parametrize(

@@ -55,11 +55,12 @@ def compare(runs: RunDirectories, out: Path = Path("compare.html")) -> None:
             compared with.
         out: the page to write.
     """
-    from lare.experiments.compare import HEAD, cells, find_runs, warning, what_scores_are, write_comparison
+    from lare.experiments.compare import HEAD, cells, find_runs, what_scores_are, write_comparison
+    from lare.experiments.statistics import too_few
 
     comparison = write_comparison(find_runs(runs), out)
     show(HEAD, cells(comparison))
-    say(f"{what_scores_are(comparison)} {warning(comparison)}".rstrip())
+    say(f"{what_scores_are(comparison)} {too_few(comparison)}".rstrip())
     say(f"wrote {out}")
 
 

@@ -65,11 +65,6 @@ def what_scores_are(comparison: Comparison) -> str:
     return f"Scores are true returns {when}, between fixed ends. {'; '.join(ends)}."
 
 
-def warning(comparison: Comparison) -> str:
-    """Of intervals that promise too much, if there are any."""
-    return too_few(comparison.rows, len(comparison.tasks))
-
-
 def write_comparison(runs: Sequence[Run], out: Path) -> Comparison:
     """Compare runs, and write the page.
 
@@ -90,7 +85,7 @@ def body(title: str, comparison: Comparison) -> Iterable[str]:
         + f" IQM: interquartile mean. Intervals: stratified bootstrap over the seeds, {REPETITIONS} "
         "repetitions; over the draws of the language model where it says draws. sd: standard deviation over the seeds. Better than "
         "first: the probability that a run scores more than one of the first method. A single seed has no interval, nor has a "
-        f"probability of 0 or 1. {warning(comparison)}"
+        f"probability of 0 or 1. {too_few(comparison)}"
     )
     score = "score" if comparison.normalised else "true return"
     yield from figure("Learning", comparison.curves, "environment steps", f"IQM of the {score}", steps=True)

@@ -30,6 +30,9 @@ million steps, the upper end of what public benchmarks report."""
 RETURN = "evaluation/return"
 """What is compared, unless something else is asked for."""
 
+ERROR, CORRELATION = "credit/error", "credit/correlation"
+"""How near the proxy rewards come to the true ones."""
+
 REPETITIONS = 2000
 """Of the bootstrap."""
 
@@ -116,11 +119,11 @@ class Comparison:
     """The scores themselves, by label."""
 
 
-def too_few(rows: Sequence[Row], tasks: int) -> str:
+def too_few(comparison: Comparison) -> str:
     """What is to be said of intervals that promise too much; nothing, where there are enough seeds and draws."""
-    counts = {"seeds": {row.seeds for row in rows}, "draws": {row.draws for row in rows}}
+    counts = {"seeds": {row.seeds for row in comparison.rows}, "draws": {row.draws for row in comparison.rows}}
     found = [(FEW[count], what) for what, some in counts.items() for count in sorted(some & FEW.keys())]
-    if found and tasks > 1:
+    if found and len(comparison.tasks) > 1:
         return "Intervals of two or three seeds, or draws, are too narrow: they hold the true mean in less than 95 of 100 cases."
     return " ".join(
         f"Of {count} {what} the bootstrap's interval can only be their range, which holds the true mean in {cases} cases, not in "

@@ -186,10 +186,10 @@ class Plan(Settings):
 
     def in_force(self, task: TaskSpec) -> dict[str, Any]:
         """All that matters here, by dotted names as on the command line."""
-        named = dict(dotted(self.model_dump()))
+        named, idle = dict(dotted(self.model_dump())), self.idle + self.idle_for_method
         if self.judges in (None, task.judges):
             named["judges"] = "as the task says"
-        return {name: value for name, value in named.items() if not among(name, self.idle + self.idle_for_method)}
+        return {name: value for name, value in named.items() if not among(name, idle)}
 
     @property
     def episodes(self) -> int:

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lare.algorithms.table import Name
-from lare.experiments.statistics import RETURN
+from lare.experiments.statistics import ERROR, RETURN
 from lare.training.settings import AgentSettings
 
-ERROR, TRAVELLED = "credit/error", "evaluation/x_position"
+TRAVELLED = "evaluation/x_position"
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,6 @@ OF_AGENTS = (
     Claim("LaRe-RD", ("dense",), at_least=True),
 )
 AMONG_AGENTS = Claim("LaRe-RD", ("LaRe without agent decomposition",))
-
 
 OFF_AND_ON_POLICY: tuple[Name, ...] = ("td3", "sac", "ddpg", "ppo")
 

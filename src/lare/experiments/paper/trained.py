@@ -10,9 +10,11 @@ from lare.credit.methods import find_method
 from lare.experiments import figures
 from lare.experiments.jobs import Job, job_of
 from lare.experiments.paper.budgets import Budget
-from lare.experiments.paper.exhibits import ERROR, TRAVELLED, Claim, Contender, Exhibit
+from lare.experiments.paper.exhibits import TRAVELLED, Claim, Contender, Exhibit
 from lare.experiments.paper.pages import Page, items, table
 from lare.experiments.statistics import (
+    CORRELATION,
+    ERROR,
     REPETITIONS,
     RETURN,
     Comparison,
@@ -27,8 +29,6 @@ from lare.experiments.statistics import (
 from lare.tasks.spec import load_task
 from lare.training.run import Run, read_measured
 from lare.training.settings import Settings
-
-CORRELATION = "credit/correlation"
 
 LEVEL = 0.025
 """A claim counts as decided where luck alone would give as many pairs at most so often."""
@@ -168,7 +168,7 @@ def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], 
     few = " (of fewer than four it is the mean)" if fewest < 4 else ""
     yield (
         f"At step {step:,}. IQM: interquartile mean over the seeds{few}, its interval by {REPETITIONS:,} stratified bootstraps; "
-        f"sd: standard deviation over the seeds. {too_few(found.rows, 1)}".rstrip()
+        f"sd: standard deviation over the seeds. {too_few(found)}".rstrip()
     )
 
 
