@@ -111,7 +111,7 @@ def small():
                 name: ALGORITHMS[name].settings.model_copy(update={"hidden": (8,), "batch_size": 8, "warmup": 36})
                 for name in ("td3", "ddpg", "sac")
             },
-            "ppo": PPOSettings(hidden=(8,), minibatch=16, epochs=2),
+            "ppo": PPOSettings(hidden=(8,), minibatch_size=16, epochs=2),
             "rollout": RolloutSettings(steps=60, fit_updates=2),
             "credit": CreditSettings(hidden=(8,), drawn_steps=4, steps=16),
         }
@@ -131,7 +131,7 @@ def small_many():
             "seeds": 2,
             "evaluate_every": 100,
             "evaluation_episodes": 4,
-            "ippo": PPOSettings(hidden=(8,), minibatch=100, epochs=1),
+            "ippo": PPOSettings(hidden=(8,), minibatch_size=100, epochs=1),
             "agents": AgentSettings(episodes=4, fit_every=1, fit_updates=2, capacity=6, credit=credit),
         }
         return Settings(**(values | changes))

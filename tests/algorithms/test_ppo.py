@@ -8,7 +8,7 @@ import pytest
 from lare.algorithms import ppo
 from lare.algorithms.ppo import PPOSettings, Rollout
 
-SETTINGS = PPOSettings(hidden=(16,), minibatch=8, epochs=3)
+SETTINGS = PPOSettings(hidden=(16,), minibatch_size=8, epochs=3)
 
 
 def state_of(discrete=True, settings=SETTINGS):
@@ -106,7 +106,7 @@ def test_rewards_of_any_scale_and_offset_train_alike(discrete):
     """Undiscounted episodes of one length: an offset is the same for all, a scale leaves the advantages as they are."""
     ended = np.zeros((6, 4), np.float32)
     ended[-1] = 1
-    settings = PPOSettings(hidden=(16,), minibatch=24, epochs=2, gamma=1.0, gae_lambda=1.0)
+    settings = PPOSettings(hidden=(16,), minibatch_size=24, epochs=2, gamma=1.0, gae_lambda=1.0)
     rollout = rollout_of(ended=ended, discrete=discrete)._replace(continues=jnp.asarray(1 - ended))
     state = state_of(discrete, settings)
     quiet = state._replace(online=state.online._replace(critic=jax.tree.map(jnp.zeros_like, state.online.critic)))
@@ -124,7 +124,7 @@ def test_rewards_of_any_scale_and_offset_train_alike(discrete):
 def test_an_update_against_plain_numpy():
     """One gradient step on a whole rollout, its gradient taken by differences in float64: loss, cut and Adam."""
     settings = PPOSettings(
-        hidden=(4,), minibatch=24, epochs=1, entropy=0.3, value_weight=0.7, gradient_norm=0.1, anneal=True
+        hidden=(4,), minibatch_size=24, epochs=1, entropy_coef=0.3, value_coef=0.7, max_grad_norm=0.1, anneal=True
     )
     state, rollout = state_of(settings=settings), rollout_of()
     rows = jax.tree.map(np.asarray, ppo.prepare(state, rollout, settings)[0])
@@ -166,7 +166,7 @@ def test_an_update_against_plain_numpy():
 
 
 def test_annealing_ends_at_rest():
-    settings = PPOSettings(hidden=(16,), minibatch=8, epochs=1, anneal=True)
+    settings = PPOSettings(hidden=(16,), minibatch_size=8, epochs=1, anneal=True)
     state = state_of(settings=settings)
     after, _ = ppo.update(state, rollout_of(), jax.random.key(1), jnp.array(0.0), settings)
     assert jax.tree.all(jax.tree.map(jnp.array_equal, after.online, state.online))
@@ -177,7 +177,7 @@ def test_annealing_ends_at_rest():
 @pytest.mark.parametrize("discrete", [True, False])
 def test_must_learn_to_follow(discrete):
     """r = 1 where the choice is the sign of s_0; or -(a_0 - s_0)^2. The policy must find out by trying."""
-    settings = PPOSettings(hidden=(32,), minibatch=64, epochs=4, gamma=0.0, learning_rate=3e-3, entropy=0.0)
+    settings = PPOSettings(hidden=(32,), minibatch_size=64, epochs=4, gamma=0.0, learning_rate=3e-3, entropy_coef=0.0)
     state = state_of(discrete, settings)
 
     @jax.jit

@@ -14,7 +14,7 @@ from lare.training import learner as common
 from lare.training import on_policy
 from recipes import LENGTHS, recipe, steps_of, stored
 
-ppo = partial(recipe, algorithm=PPOSettings(hidden=(8,), minibatch=5, epochs=2), turn=20, fit_updates=3)
+ppo = partial(recipe, algorithm=PPOSettings(hidden=(8,), minibatch_size=5, epochs=2), turn=20, fit_updates=3)
 
 
 @pytest.mark.parametrize("method", ["dense", "episodic", "lare-rrdu"])

@@ -25,7 +25,7 @@ def recipe(method, task="TriangleArea", **changes):
     values = {
         "task": find_particle_task(task),
         "method": METHODS[method],
-        "ppo": PPOSettings(hidden=(8,), minibatch=100, epochs=1),
+        "ppo": PPOSettings(hidden=(8,), minibatch_size=100, epochs=1),
         "agents": AgentSettings(
             episodes=COUNT, fit_updates=2, capacity=6, credit=CreditSettings(hidden=(8,), steps=50, drawn_steps=5)
         ),

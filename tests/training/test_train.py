@@ -424,7 +424,7 @@ def test_ppo_must_learn_the_toy(method, phi, tmp_path):
         method=method,
         steps=8000,
         evaluate_every=8000,
-        ppo=PPOSettings(hidden=(32, 32), learning_rate=3e-3, gamma=0.5, minibatch=50),
+        ppo=PPOSettings(hidden=(32, 32), learning_rate=3e-3, gamma=0.5, minibatch_size=50),
         rollout=RolloutSettings(steps=200, fit_updates=50),
         credit=lare.training.settings.CreditSettings(hidden=(32, 32), learning_rate=3e-3, drawn_steps=8, steps=64),
     )
@@ -442,7 +442,7 @@ def test_ppo_must_learn_to_choose(method, tmp_path):
         method=method,
         steps=4000,
         evaluate_every=4000,
-        ppo=PPOSettings(hidden=(32,), learning_rate=3e-3, gamma=0.5, minibatch=50),
+        ppo=PPOSettings(hidden=(32,), learning_rate=3e-3, gamma=0.5, minibatch_size=50),
         rollout=RolloutSettings(steps=200, fit_updates=50),
         credit=lare.training.settings.CreditSettings(hidden=(32,), learning_rate=3e-3, drawn_steps=8, steps=64),
     )

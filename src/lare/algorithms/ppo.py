@@ -39,19 +39,19 @@ class PPOSettings(Checked):
     """Of the generalised advantage estimates: 0 trusts the critic, 1 the rewards."""
     epochs: Annotated[int, Field(ge=1)] = 10
     """How often an update goes over its rollout."""
-    minibatch: Annotated[int, Field(ge=1)] = 64
+    minibatch_size: Annotated[int, Field(ge=1)] = 64
     """Steps of one agent in one gradient step."""
     clip: Annotated[float, Field(gt=0)] = 0.2
     """How far the probability ratio may move."""
     value_clip: Annotated[float, Field(gt=0)] = 0.5
     """How far the value may move in one update, in deviations of the return."""
-    value_weight: Annotated[float, Field(ge=0)] = 0.5
+    value_coef: Annotated[float, Field(ge=0)] = 0.5
     """Of the value loss beside the policy's."""
-    entropy: Annotated[float, Field(ge=0)] = 0.0
+    entropy_coef: Annotated[float, Field(ge=0)] = 0.0
     """Of the policy's entropy beside its objective."""
-    huber: Annotated[float, Field(gt=0)] = 10.0
+    huber_delta: Annotated[float, Field(gt=0)] = 10.0
     """Where the value loss turns from square to linear, in deviations of the return."""
-    gradient_norm: Annotated[float, Field(gt=0)] = 0.5
+    max_grad_norm: Annotated[float, Field(gt=0)] = 0.5
     """What the gradient of actor and critic together is cut down to."""
     anneal: bool = False
     """Let learning rate and clip fall linearly to 0 over the run."""
@@ -198,7 +198,7 @@ def value_loss(
 ) -> Float[Array, ""]:
     """Mean of the worse of two Huber losses: that of the value, and that of the value kept near the old one."""
     near = old + jnp.clip(value - old, -settings.value_clip, settings.value_clip)
-    losses = (optax.huber_loss(guess, target, delta=settings.huber) for guess in (value, near))
+    losses = (optax.huber_loss(guess, target, delta=settings.huber_delta) for guess in (value, near))
     return jnp.mean(jnp.maximum(*losses))
 
 
@@ -218,14 +218,14 @@ def update(
         gain = policy_objective(ratio, rows.advantage, clip)
         loss = value_loss(online.critic(rows.observation)[:, 0], rows.value, rows.target, settings)
         entropy = jnp.mean(online.actor.entropy(rows.observation))
-        total = -gain + settings.value_weight * loss - settings.entropy * entropy
+        total = -gain + settings.value_coef * loss - settings.entropy_coef * entropy
         return total, {"actor/objective": gain, "critic/loss": loss, "actor/entropy": entropy}
 
     def one(carry: tuple[Networks, optax.OptState], rows: Int[Array, " batch"]):
         online, optimizer = carry
         chosen = jax.tree.map(lambda leaf: leaf[rows], batch)
         gradient, measured = jax.grad(loss_of, has_aux=True)(online, chosen)
-        shrink = settings.gradient_norm / jnp.maximum(optax.tree.norm(gradient), settings.gradient_norm)
+        shrink = settings.max_grad_norm / jnp.maximum(optax.tree.norm(gradient), settings.max_grad_norm)
         gradient = jax.tree.map(lambda leaf: leaf * shrink, gradient)
         return descend(online, gradient, optimizer, rate), measured
 
@@ -250,7 +250,7 @@ def prepare(state: PPO, rollout: Rollout, settings: PPOSettings) -> tuple[Miniba
 
 def minibatches(key: PRNGKeyArray, steps: int, settings: PPOSettings) -> Int[Array, "updates batch"]:
     """Which steps each gradient step reads: in every epoch all of them once, but for a remainder that fills no batch."""
-    size = min(settings.minibatch, steps)
+    size = min(settings.minibatch_size, steps)
     count = steps // size
     orders = jax.vmap(lambda key: jax.random.permutation(key, steps))(jax.random.split(key, settings.epochs))
     return orders[:, : count * size].reshape(settings.epochs * count, size)

@@ -39,9 +39,9 @@ class Algorithm:
 
 
 DDPG = TD3Settings(critics=1, policy_noise=0.0, policy_delay=1)
-PPO = PPOSettings(hidden=(256, 256), entropy=0.01, anneal=True)
+PPO = PPOSettings(hidden=(256, 256), entropy_coef=0.01, anneal=True)
 IPPO = PPOSettings(
-    learning_rate=1e-4, gamma=1.0, minibatch=128, clip=0.5, entropy=0.01, gradient_norm=10.0, anneal=True
+    learning_rate=1e-4, gamma=1.0, minibatch_size=128, clip=0.5, entropy_coef=0.01, max_grad_norm=10.0, anneal=True
 )
 
 TABLE = (

@@ -43,10 +43,10 @@ MINIATURE = {
         for row in ALGORITHMS.values()
         if row.kind is Kind.OFF_POLICY
     },
-    "ppo": PPOSettings(hidden=(8,), minibatch=16, epochs=2),
+    "ppo": PPOSettings(hidden=(8,), minibatch_size=16, epochs=2),
     "rollout": RolloutSettings(steps=200, fit_updates=2),
     "credit": SMALL,
-    "ippo": PPOSettings(hidden=(8,), minibatch=100, epochs=1),
+    "ippo": PPOSettings(hidden=(8,), minibatch_size=100, epochs=1),
     "agents": AgentSettings(episodes=4, fit_every=1, fit_updates=2, capacity=16, credit=SMALL),
 }
 """Networks of a few units: it runs, and learns nothing."""
