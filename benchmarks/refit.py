@@ -21,7 +21,9 @@ from lare.credit.methods import Fit
 from lare.normalise import Scale
 from lare.training import learner as common
 from lare.training import replay
-from lare.training.learner import RECENT, Learner, Recipe
+from lare.training.credit_draws import CreditDraws, draw_parts_of_episodes
+from lare.training.learner import RECENT, Learner
+from lare.training.recipe import Recipe
 from lare.training.run import open_run
 from lare.training.single_agent import load_learner
 
@@ -30,13 +32,13 @@ UPDATES, STRETCH = 20_000, 5_000
 
 @partial(jax.jit, static_argnames=("fit", "recipe"))
 def updates(credit: Decomposition, held: replay.Replay, key: jax.Array, fit: Fit, recipe: Recipe) -> Decomposition:
-    def one(credit: Decomposition, drawn: common.CreditDraws) -> tuple[Decomposition, None]:
+    def one(credit: Decomposition, drawn: CreditDraws) -> tuple[Decomposition, None]:
         features = common.features(replay.read(held, drawn.steps), recipe.method)
         chosen = drawn.episodes
         episodes = Episodes(features, drawn.episode, chosen.length, chosen.mean_reward, chosen.counts)
         return decomposition.update(credit, episodes, key, fit, recipe.credit)[0], None
 
-    return jax.lax.scan(one, credit, common.draw_parts_of_episodes(held, key, STRETCH, recipe))[0]
+    return jax.lax.scan(one, credit, draw_parts_of_episodes(held, key, STRETCH, recipe))[0]
 
 
 def refit(learner: Learner, recipe: Recipe, fit: Fit, scale: Scale) -> list[dict[str, float]]:

@@ -29,7 +29,8 @@ from lare.algorithms.td3 import TD3Settings
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
 from lare.training import off_policy, replay
-from lare.training.learner import Recipe, features
+from lare.training.learner import features
+from lare.training.recipe import Recipe
 from lare.training.replay import Replay, Step
 from lare.training.single_agent import Session
 

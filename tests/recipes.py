@@ -9,7 +9,7 @@ from lare.algorithms.td3 import TD3Settings
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import METHODS, Encoder
 from lare.training import learner as common
-from lare.training.learner import Recipe
+from lare.training.recipe import Recipe
 from lare.training.replay import Step
 
 LENGTHS = (5, 12, 3, 9, 12)

@@ -12,6 +12,7 @@ from lare.credit.methods import TABLE, Fit, Reward
 from lare.normalise import magnitude
 from lare.training import learner as common
 from lare.training import replay
+from lare.training.credit_draws import draw_credit, draw_parts_of_episodes
 from recipes import LENGTHS, recipe, steps_of, stored
 
 
@@ -33,35 +34,6 @@ def test_raw_features_are_s_a_and_the_change():
     assert want.shape[1] == chosen.features == 8
 
 
-@pytest.mark.parametrize("key", range(4))
-def test_whole_episodes_are_masked_never_padded(key):
-    chosen = recipe("rd")
-    held = stored(chosen).replay
-    drawn = common.draw_whole_episodes(held, jax.random.key(key), chosen)
-    lengths, counts = np.asarray(drawn.episodes.length), np.asarray(drawn.episodes.counts)
-    # About 24 steps: mean length 8.2, so two episodes, if they fit.
-    assert 1 <= counts.sum() <= 2
-    assert lengths[counts > 0].sum() <= 24
-    for place in np.flatnonzero(counts):
-        rows = np.asarray(drawn.steps)[np.asarray(drawn.episode) == place]
-        np.testing.assert_array_equal(rows, int(drawn.episodes.first[place]) + np.arange(lengths[place]))
-    assert set(np.asarray(drawn.episode)) <= {*np.flatnonzero(counts), chosen.credit.steps}
-
-
-def test_parts_of_episodes_stay_inside_them():
-    chosen = recipe("rrdu")
-    drawn = common.draw_parts_of_episodes(stored(chosen).replay, jax.random.key(0), 7, chosen)
-    first = np.repeat(np.asarray(drawn.episodes.first), 4, axis=1)
-    length = np.repeat(np.asarray(drawn.episodes.length), 4, axis=1)
-    assert drawn.steps.shape == (7, 24)
-    assert (np.asarray(drawn.steps) >= first).all()
-    assert (np.asarray(drawn.steps) < first + length).all()
-    # Of three steps, four cannot be drawn: all of them belong, and the fourth place holds none.
-    belongs = np.asarray(drawn.episode).reshape(7, 6, 4) < 6
-    np.testing.assert_array_equal(belongs.sum(axis=2), np.minimum(drawn.episodes.length, 4))
-    assert (np.asarray(drawn.episodes.length) == 3).any()
-
-
 @pytest.mark.parametrize("drawn", [4, 10])
 def test_the_unbiased_loss_has_the_expectation_of_the_full_one_for_episodes_of_any_length(drawn):
     """Lengths from 3 to 12: with K = 10, three of the five episodes are shorter. RRD's loss is larger."""
@@ -71,7 +43,7 @@ def test_the_unbiased_loss_has_the_expectation_of_the_full_one_for_episodes_of_a
         learner = stored(chosen)
         steep = jax.tree.map(lambda weight: 6 * weight, learner.credit.decoder)  # steps that differ
         learner = learner._replace(credit=learner.credit._replace(decoder=steep))
-        draws = common.draw_parts_of_episodes(learner.replay, jax.random.key(3), 1, chosen)
+        draws = draw_parts_of_episodes(learner.replay, jax.random.key(3), 1, chosen)
         _, measured = common.fit(
             learner.credit, learner.replay, jax.tree.map(lambda one: one[0], draws), jax.random.key(0), chosen
         )
@@ -92,7 +64,7 @@ def test_the_unbiased_loss_has_the_expectation_of_the_full_one_for_episodes_of_a
 def test_padding_counts_for_nothing(method):
     chosen = recipe(method)
     learner = stored(chosen)
-    draws = jax.tree.map(lambda one: one[0], common.draw_credit(learner.replay, jax.random.key(2), 1, chosen))
+    draws = jax.tree.map(lambda one: one[0], draw_credit(learner.replay, jax.random.key(2), 1, chosen))
     padding = np.asarray(draws.episode) >= len(draws.episodes.length)
     assert padding.any()
     elsewhere = draws._replace(steps=jnp.where(padding, 40, draws.steps))
@@ -157,19 +129,6 @@ def test_closed_forms_are_fitted_to_the_episodes_that_have_ended(pieces):
     x = centred[:, :2] / unit
     want = np.linalg.solve(x.T @ x + np.eye(2), x.T @ centred[:, 2]) / unit
     np.testing.assert_allclose(learner.credit.decoder.weight, want, rtol=1e-3)
-
-
-def test_padded_episodes_are_whole_and_repeat_their_end():
-    chosen = recipe("diaster")
-    held = stored(chosen).replay
-    drawn = common.draw_padded_episodes(held, jax.random.key(0), 5, chosen)
-    steps = np.asarray(drawn.steps).reshape(5, chosen.credit.episodes, chosen.longest_episode)
-    for of_update, first, length in zip(
-        steps, np.asarray(drawn.episodes.first), np.asarray(drawn.episodes.length), strict=True
-    ):
-        for row, begin, count in zip(of_update, first, length, strict=True):
-            np.testing.assert_array_equal(row[:count], begin + np.arange(count))
-            assert set(row[count:]) <= {begin + count - 1}
 
 
 def test_state_and_action_alone():

@@ -10,7 +10,8 @@ from jaxtyping import Float
 from lare.credit import closed_form
 from lare.credit.methods import Fit
 from lare.training import replay
-from lare.training.learner import RECENT, Learner, Recipe, features, proxy_rewards
+from lare.training.learner import RECENT, Learner, features, proxy_rewards
+from lare.training.recipe import Recipe
 from lare.training.run import Run
 from lare.training.seeds import of_seed
 from lare.training.single_agent import load_learner

@@ -14,7 +14,7 @@ from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
 from lare.experiments.credit import DELTA, credit_of, factor_labels
 from lare.experiments.html import function_text, note, table, write_page
-from lare.experiments.statistics import CORRELATION, ERROR, REFERENCES, RETURN
+from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN
 from lare.source import source
 from lare.tasks.spec import TaskSpec
 from lare.training.run import Run, open_run

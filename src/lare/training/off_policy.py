@@ -19,7 +19,9 @@ from lare.credit.decomposition import Decomposition
 from lare.networks import MLP
 from lare.training import learner as common
 from lare.training import replay
-from lare.training.learner import Compiled, CreditDraws, Learner, Recipe, draw_credit, rewards
+from lare.training.credit_draws import CreditDraws, draw_credit
+from lare.training.learner import Compiled, Learner, rewards
+from lare.training.recipe import Recipe
 from lare.training.replay import Replay
 
 

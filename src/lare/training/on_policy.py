@@ -19,7 +19,8 @@ from lare.algorithms.ppo import Policy
 from lare.normalise import Moments, observe, standardise
 from lare.training import learner as common
 from lare.training import replay
-from lare.training.learner import Compiled, Learner, Recipe, fit_often, rewards
+from lare.training.learner import Compiled, Learner, fit_often, rewards
+from lare.training.recipe import Recipe
 
 Actor = tuple[Policy, Moments]
 """A policy, and what its observations are normalised by."""

@@ -27,7 +27,8 @@ from lare.training.environments import (
     generator,
     make_episodic,
 )
-from lare.training.learner import Compiled, Learner, Recipe, forget_episode, init
+from lare.training.learner import Compiled, Learner, forget_episode, init
+from lare.training.recipe import Recipe
 from lare.training.run import Run
 from lare.training.seeds import lines, seed_keys
 from lare.training.settings import Plan

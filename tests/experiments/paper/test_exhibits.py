@@ -14,7 +14,7 @@ from lare.experiments.paper.budgets import BUDGETS
 from lare.experiments.paper.exhibits import EXHIBITS, TABLE
 from lare.experiments.paper.reproduce import NAMES, UNTRAINED, listed, reproduce
 from lare.experiments.paper.trained import jobs_of, verdict
-from lare.experiments.statistics import ERROR
+from lare.experiments.scores import ERROR
 from lare.experiments.sweep import Share
 from lare.llm.recording import shipped_recordings
 from lare.training import train as training

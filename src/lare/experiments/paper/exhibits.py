@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lare.algorithms.table import Name
-from lare.experiments.statistics import ERROR, RETURN
+from lare.experiments.scores import ERROR, RETURN
 from lare.training.settings import AgentSettings
 
 TRAVELLED = "evaluation/x_position"

@@ -12,13 +12,10 @@ from lare.experiments.jobs import Job, job_of
 from lare.experiments.paper.budgets import Budget
 from lare.experiments.paper.exhibits import TRAVELLED, Claim, Contender, Exhibit
 from lare.experiments.paper.pages import Page, items, table
+from lare.experiments.scores import CORRELATION, ERROR, RETURN, Group
 from lare.experiments.statistics import (
-    CORRELATION,
-    ERROR,
     REPETITIONS,
-    RETURN,
     Comparison,
-    Group,
     compare,
     mann_whitney_p,
     mann_whitney_u,

@@ -1,0 +1,124 @@
+"""Which runs are laid beside which, and the scores that make them comparable.
+
+A *score* is a run's return at an evaluation: as it is where there is one task, else between 0, what a random policy earns, and
+1, a fixed reference (`REFERENCES`).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from lare.errors import LareError
+from lare.training.run import Run
+
+REFERENCES = {
+    "Reacher-v4": (-44.0, -2.7),
+    "Walker2d-v4": (3.4, 4600.0),
+    "HalfCheetah-v4": (-271.0, 10_200.0),
+}
+"""Returns that count as 0 and as 1. 0: mean over 20 episodes of uniformly random actions. 1: TD3 on true rewards after a
+million steps, the upper end of what public benchmarks report."""
+
+RETURN = "evaluation/return"
+"""What is compared, unless something else is asked for."""
+
+ERROR, CORRELATION = "credit/error", "credit/correlation"
+"""How near the proxy rewards come to the true ones."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """The runs of one label."""
+
+    label: str
+    seeds: tuple[int, ...]
+    draws: tuple[int, ...]
+    steps: tuple[int, ...]
+    scores: Float[np.ndarray, "draws seeds tasks steps"]
+
+
+def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """The runs by method; with the algorithm where several are compared, and with whatever else tells runs of a method apart."""
+    plans = [run.config.settings.in_force(run.config.task) for run in runs]
+    several = len({plan["algorithm"] for plan in plans}) > 1
+    found: dict[str, list[Run]] = {}
+    for run, plan in zip(runs, plans, strict=True):
+        alike = [other for other in plans if all(other[name] == plan[name] for name in ("method", "algorithm"))]
+        told = (name for name in plan if name not in IGNORED and any(other[name] != plan[name] for other in alike))
+        parts = [plan["method"], *([plan["algorithm"]] if several else []), *(f"{name} {plan[name]}" for name in told)]
+        found.setdefault(", ".join(parts), []).append(run)
+    return {name: some for label, of_label in found.items() for name, some in by_function(label, of_label).items()}
+
+
+def by_function(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Runs that are alike in all but their latent functions, by these; draws of the language model are told apart by number."""
+    places = {run.directory: (run.config.task.name, run.config.settings.draw) for run in runs}
+    functions = {(places[run.directory], run.config.function_sha256) for run in runs}
+    if len(functions) == len(set(places.values())):
+        return {label: list(runs)}
+    found: dict[str, list[Run]] = {}
+    for run in runs:
+        name = " ".join(digest[:8] for digest in run.config.function_sha256)
+        found.setdefault(f"{label}, phi {name}", []).append(run)
+    return found
+
+
+IGNORED = {"seed", "seeds", "draw", "steps", "evaluate_every", "evaluation_episodes"}
+"""Settings that make no other method of it."""
+
+
+def grouped(runs: Mapping[str, Sequence[Run]], key: str) -> tuple[list[Group], tuple[str, ...]]:
+    """The curves by label, and the tasks. Raises `LareError` where a table of them would have holes."""
+    tasks = tuple(sorted({run.config.task.name for of_label in runs.values() for run in of_label}))
+    if len(tasks) > 1 and (unknown := [task for task in tasks if task not in REFERENCES]):
+        raise LareError(
+            f"there is no reference for {', '.join(unknown)}, so its returns cannot be laid beside those of other tasks: "
+            "compare the runs of each task by themselves"
+        )
+    specs: dict[str, Run] = {}
+    for run in (run for of_label in runs.values() for run in of_label):
+        other = specs.setdefault(run.config.task.name, run)
+        if other.config.task.digest != run.config.task.digest:
+            raise LareError(
+                f"{run.directory} and {other.directory} are runs of two tasks that are both called {run.config.task.name}: "
+                "compare them apart"
+            )
+    curves: dict[tuple[str, str, int, int], tuple[Run, dict[int, float]]] = {}
+    for label, run in ((label, run) for label, of_label in runs.items() for run in of_label):
+        lines = run.metrics()
+        for seed in run.seeds:
+            place = (label, run.config.task.name, run.config.settings.draw, seed)
+            if place in curves:
+                other = curves[place][0].directory
+                raise LareError(
+                    f"{run.directory} and {other} are both {label} on {place[1]} with seed {seed}: leave one out"
+                )
+            curves[place] = run, curve(lines, seed, key)
+            if not lines:
+                raise LareError(f"{run.directory} has no evaluation yet: leave it out")
+    steps = sorted(set.intersection(*(set(values) for _, values in curves.values())))
+    if not steps:
+        raise LareError("the runs have no step in common at which all of them were evaluated")
+    return [group_of(label, tasks, curves, steps) for label in runs], tasks
+
+
+def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[int]) -> Group:
+    draws, seeds = (sorted({key[place] for key in curves if key[0] == label}) for place in (2, 3))
+
+    def values(draw: int, seed: int, task: str) -> list[float]:
+        if (label, task, draw, seed) not in curves:
+            raise LareError(f"{label} on {task} lacks a run with seed {seed} and draw {draw}, which it has elsewhere")
+        found = curves[label, task, draw, seed][1]
+        low, high = REFERENCES[task] if len(tasks) > 1 else (0.0, 1.0)
+        return [(found[step] - low) / (high - low) for step in steps]
+
+    scores = [[[values(draw, seed, task) for task in tasks] for seed in seeds] for draw in draws]
+    return Group(label, tuple(seeds), tuple(draws), tuple(steps), np.array(scores))
+
+
+def curve(lines: Sequence[Mapping[str, Any]], seed: int, key: str) -> dict[int, float]:
+    """What was measured, by step."""
+    return {line["step"]: float(line[key]) for line in lines if line["seed"] == seed and line.get(key) is not None}

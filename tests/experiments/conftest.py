@@ -1,0 +1,31 @@
+"""Runs that were never trained, for what is made of finished ones."""
+
+import json
+
+import pytest
+
+from lare.training.run import Run, describe
+from lare.training.settings import Settings, decide
+from toys import toy_spec
+
+
+@pytest.fixture
+def made(tmp_path):
+    """Makes a run directory: configuration and metrics, nothing trained."""
+
+    def make(name, returns, task="Chase", steps=(50, 100), method="dense", **settings):
+        spec = toy_spec(name=task)
+        plan = decide(Settings(method=method, steps=100, seeds=len(returns), **settings), spec)
+        directory = tmp_path / "runs" / task / name
+        directory.mkdir(parents=True)
+        config = describe(spec, plan, ())
+        (directory / "config.json").write_text(config.model_dump_json())
+        lines = [
+            {"step": step, "seed": seed, "evaluation/return": value * share}
+            for step, share in zip(steps, (0.5, 1.0), strict=bool(steps))
+            for seed, value in zip(plan.all_seeds, returns, strict=True)
+        ]
+        (directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        return Run(directory, config, ())
+
+    return make

@@ -1,0 +1,98 @@
+"""Which runs make up a row of a comparison, and which cannot be compared."""
+
+from pathlib import Path
+
+import pytest
+
+from lare.errors import LareError
+from lare.experiments.compare import find_runs
+from lare.experiments.scores import RETURN, by_label, grouped
+from lare.training.run import Run
+from toys import toy_spec
+
+
+def test_tasks_that_judge_differently_are_laid_side_by_side():
+    """Reacher-v4 judges the observation before a step, the others the one after it: that makes no other method of one."""
+    kept = Path(__file__).parents[2] / "benchmarks" / "results" / "reproduce" / "laptop"
+    runs = find_runs(
+        [kept / task / f"{name}-td3" for task in ("Reacher-v4", "Walker2d-v4") for name in ("dense", "rrdu")]
+    )
+    runs += find_runs([kept / task / "lare-rrdu-td3-draw0" for task in ("Reacher-v4", "Walker2d-v4")])
+    groups, tasks = grouped(by_label(runs), RETURN)
+    assert (tasks, [group.label for group in groups]) == (("Reacher-v4", "Walker2d-v4"), ["dense", "rrdu", "lare-rrdu"])
+
+
+def test_runs_of_one_method_are_told_apart_by_their_settings(made):
+    slow = {"credit": {"learning_rate": 1e-4}}
+    runs = [made("a", [1.0], method="rd"), made("b", [2.0], method="rd", **slow), made("c", [3.0])]
+    names = list(by_label(runs))
+    assert names == ["rd, credit.learning_rate 0.0003", "rd, credit.learning_rate 0.0001", "dense"]
+    runs.append(made("d", [3.0], algorithm="ddpg"))
+    assert list(by_label(runs))[1:] == ["rd, td3, credit.learning_rate 0.0001", "dense, td3", "dense, ddpg"]
+
+
+def with_function(run, *digests):
+    return Run(run.directory, run.config.model_copy(update={"function_sha256": digests}), ())
+
+
+def test_runs_of_two_functions_are_told_apart_by_them(made):
+    """Whatever their seeds are; and not where two draws of the language model make up one row."""
+    first, second = made("a", [1.0], method="lare-rd"), made("b", [2.0], method="lare-rd", seed=1)
+    dense, one, other = made("c", [3.0]), "0123456789abcdef", "fedcba9876543210"
+    runs = [with_function(first, one), with_function(second, other), dense]
+    assert list(by_label(runs)) == ["lare-rd, phi 01234567", "lare-rd, phi fedcba98", "dense"]
+    assert list(by_label([with_function(first, one), with_function(second, one)])) == ["lare-rd"]
+    drawn = made("d", [2.0], method="lare-rd", draw=1)
+    found = by_label([with_function(first, one), with_function(drawn, other)])
+    assert {label: len(runs) for label, runs in found.items()} == {"lare-rd": 2}
+
+
+def test_two_tasks_of_one_name_are_not_compared(made):
+    first, second = made("a", [1.0]), made("b", [2.0], method="rd")
+    second = Run(second.directory, second.config.model_copy(update={"task": toy_spec(judges="after")}), ())
+    with pytest.raises(LareError) as error:
+        grouped(by_label([first, second]), RETURN)
+    assert str(error.value) == (
+        f"{second.directory} and {first.directory} are runs of two tasks that are both called Chase: compare them apart"
+    )
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        (
+            [("a", "Chase", {}), ("b", "Reacher-v4", {})],
+            "there is no reference for Chase, so its returns cannot be laid beside those of other tasks: compare the runs of "
+            "each task by themselves",
+        ),
+        (
+            [("a", "Chase", {}), ("b", "Chase", {"evaluation_episodes": 3})],
+            "{runs}/Chase/b and {runs}/Chase/a are both dense on Chase with seed 0: leave one out",
+        ),
+        (
+            [("a", "Walker2d-v4", {}), ("a", "Reacher-v4", {}), ("b", "Reacher-v4", {"seed": 2})],
+            "dense on Walker2d-v4 lacks a run with seed 2 and draw 0, which it has elsewhere",
+        ),
+        (
+            [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": (60, 70)})],
+            "the runs have no step in common at which all of them were evaluated",
+        ),
+        (
+            [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": ()})],
+            "{runs}/Chase/b has no evaluation yet: leave it out",
+        ),
+    ],
+)
+def test_what_cannot_be_compared(runs, message, made, tmp_path):
+    opened = [made(name, [1.0, 2.0], task, **settings) for name, task, settings in runs]
+    with pytest.raises(LareError) as error:
+        grouped(by_label(opened), RETURN)
+    assert str(error.value) == message.format(runs=tmp_path / "runs")
+
+
+def test_what_the_task_says_anyway_makes_no_other_method(made):
+    runs = [made("a", [1.0], method="lare-rd"), made("b", [2.0], method="lare-rd", judges=toy_spec().judges)]
+    assert list(by_label(runs)) == ["lare-rd"]
+    runs = [made("c", [1.0]), made("d", [2.0], judges="after", credit={"hidden": (8,)}, draw=3)]
+    assert list(by_label(runs)) == ["dense"]
+    assert list(by_label([made("e", [1.0], method="lare-rd", judges="after"), runs[0]])) == ["lare-rd", "dense"]
