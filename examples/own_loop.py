@@ -21,8 +21,8 @@ from lare.credit.methods import Fit, find_method
 from lare.tasks.episodic import TRUE_REWARD
 
 TASK, METHOD, SETTINGS = lare.load_task("HalfCheetah-v4"), find_method("lare-rd"), CreditSettings(hidden=(64, 64))
-BATCH = 4
-"""Episodes in one update of the decoder."""
+BATCH, LONGEST = 4, 1000
+"""Episodes in one update of the decoder, and the steps of the longest one."""
 
 
 def play(environment: gymnasium.Env, phi: lare.LatentFunction) -> tuple[np.ndarray, float, np.ndarray]:
@@ -39,12 +39,17 @@ def play(environment: gymnasium.Env, phi: lare.LatentFunction) -> tuple[np.ndarr
 
 
 def together(episodes: list[tuple[np.ndarray, float]]) -> Episodes:
-    """Whole episodes, one behind the other, as the decoder is fitted to them."""
+    """Whole episodes, one behind the other, as the decoder is fitted to them.
+
+    Always as many rows, so that nothing is compiled twice: those behind the last step are of an episode that there is not.
+    """
     length = np.array([len(z) for z, _ in episodes])
     returned = np.array([paid for _, paid in episodes], np.float32)
+    padding = BATCH * LONGEST - length.sum()
+    number = np.repeat(np.arange(len(episodes)), length)
     return Episodes(
-        features=jnp.asarray(np.concatenate([z for z, _ in episodes])),
-        episode=jnp.asarray(np.repeat(np.arange(len(episodes)), length)),
+        features=jnp.asarray(np.pad(np.concatenate([z for z, _ in episodes]), ((0, padding), (0, 0)))),
+        episode=jnp.asarray(np.pad(number, (0, padding), constant_values=len(episodes))),
         length=jnp.asarray(length),
         mean_reward=jnp.asarray(returned / length),
         counts=jnp.ones(len(episodes)),
@@ -59,8 +64,9 @@ def main(episodes: int = 40, updates: int = 50) -> float:
     phi = lare.design(TASK)  # from the recorded replies; `lare.load_function("phi.py", TASK)` for one of your own
     draw = np.random.default_rng(0)
 
-    credit = decomposition.init(jax.random.key(0), phi.size, METHOD, SETTINGS, steps=1000, agents=1)
+    credit = decomposition.init(jax.random.key(0), phi.size, METHOD, SETTINGS, steps=LONGEST, agents=1)
     fit = jax.jit(partial(decomposition.update, fit=Fit.ALL_STEPS, settings=SETTINGS))
+    reward = partial(decomposition.proxy_rewards, settings=SETTINGS)
     stored: list[tuple[np.ndarray, float]] = []
     for number in range(episodes):
         z, paid, _ = play(environment, phi)
@@ -70,10 +76,12 @@ def main(episodes: int = 40, updates: int = 50) -> float:
         for key in jax.random.split(jax.random.key(number), updates):
             drawn = [stored[one] for one in draw.integers(len(stored), size=BATCH)]
             credit, _ = fit(credit, together(drawn), key)
-        # Here your algorithm trains, on r_hat of whatever steps it draws: always by the newest decoder, never stored.
+        r_hat = reward(credit, jnp.asarray(z))
+        # Here your algorithm trains. An on-policy one takes this r_hat for its newest episode; one with a replay buffer keeps z,
+        # not r_hat, and asks again for whatever it draws: by the newest decoder, for what the decoder said before is stale.
 
     z, _, true = play(environment, phi)
-    r_hat = decomposition.proxy_rewards(credit, jnp.asarray(z), SETTINGS)
+    r_hat = reward(credit, jnp.asarray(z))
     environment.close()
     phi.close()
     return float(np.corrcoef(r_hat, true)[0, 1])

@@ -120,12 +120,14 @@ def test_what_is_not_documented_must_be_filled_in(tmp_path):
         ("Nowhere-v0", "environment 'Nowhere-v0' cannot be made: Environment `Nowhere` doesn't exist."),
         ("a b", "environment 'a b' cannot be made: "),
         ("toys/Told-v0:x", "environment 'toys/Told-v0:x' cannot be made: "),
+        ("nowhere:Told-v0", "environment 'nowhere:Told-v0' cannot be made: No module named 'nowhere'."),
     ],
 )
 def test_an_environment_that_cannot_be_made(environment, message):
     with pytest.raises(LareError) as error:
         draft(environment)
     assert str(error.value).startswith(message)
+    assert str(error.value).endswith(" (a module in this folder is found with PYTHONPATH=.)") == (":Told" in environment)
 
 
 class Odd(Silent):

@@ -80,7 +80,7 @@ class Episodes(NamedTuple):
 
     features: Float[Array, "rows *agents features"]
     episode: Int[Array, " rows"]
-    """Which of the episodes a row belongs to; a number outside 0..episodes-1 where the row is padding."""
+    """Which of the episodes a row belongs to; `episodes` or more where the row is padding."""
     length: Int[Array, " episodes"]
     mean_reward: Float[Array, " episodes"]
     """R/T."""

@@ -29,6 +29,9 @@ def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) 
         except (Exception, SystemExit) as error:
             logging.getLogger(__name__).debug("making %s failed", environment, exc_info=True)
             reason = str(error).strip().splitlines() or [type(error).__name__]
-            library = os.environ.get("MUJOCO_GL")
-            missing = f" (is MUJOCO_GL={library} installed?)" if library and isinstance(error, AttributeError) else ""
-            raise LareError(f"environment {environment!r} cannot be made: {reason[0]}{missing}") from error
+            hint, library = "", os.environ.get("MUJOCO_GL")
+            if library and isinstance(error, AttributeError):
+                hint = f" (is MUJOCO_GL={library} installed?)"
+            if isinstance(error, ModuleNotFoundError):
+                hint = " (a module in this folder is found with PYTHONPATH=.)"
+            raise LareError(f"environment {environment!r} cannot be made: {reason[0]}{hint}") from error
