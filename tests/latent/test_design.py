@@ -2,17 +2,18 @@
 
 import json
 
+import gymnasium
 import pytest
 
 from lare.errors import LareError
 from lare.latent import design as module
 from lare.latent.checks import Check
-from lare.latent.design import ATTEMPTS, LONGEST_QUOTE, DesignBroken, DesignFailed, design
-from lare.latent.verify import Verdict, random_steps
+from lare.latent.design import ATTEMPTS, LONGEST_QUOTE, DesignBroken, DesignFailed, DesignStopped, design
+from lare.latent.verify import Verdict
 from lare.llm.prompts import candidate, combine, correct
 from lare.llm.recording import read_recording
 from lare.tasks.spec import read_task, shipped_tasks
-from toys import PHI, phi, toy_spec
+from toys import PHI, Chase, phi, toy_spec
 
 
 def reply(source: str) -> str:
@@ -45,12 +46,6 @@ class Scripted:
     def reply(self, messages, sample):
         self.asked.append((list(messages), sample))
         return self.lines.pop(0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def steps():
-    """The toy's steps, made before candidates ask for them in threads: its instances share one action space."""
-    random_steps(toy_spec())
 
 
 @pytest.fixture
@@ -276,6 +271,43 @@ def test_what_was_said_is_kept_when_the_model_leaves(chase):
     with pytest.raises(LareError) as error:
         design(chase, model=Leaves(), candidates=1)
     assert not isinstance(error.value, DesignFailed)
+
+
+def test_what_was_said_is_kept_when_somebody_stops_it(chase):
+    class Stops(Scripted):
+        def reply(self, messages, sample):
+            if not self.lines:
+                raise KeyboardInterrupt
+            return super().reply(messages, sample)
+
+    with pytest.raises(DesignStopped, match=r"^stopped$") as error:
+        design(chase, model=Stops(GOOD), candidates=3)
+    assert [exchange.replies for exchange in error.value.recorder.exchanges] == [[GOOD]]
+    assert error.value.status == 130
+    with pytest.raises(KeyboardInterrupt):
+        design(chase, model=Stops(), candidates=3)
+
+
+class Fails(Chase):
+    def reset(self, *, seed=None, options=None):
+        raise RuntimeError("no track\nin sight")
+
+
+gymnasium.register("misfits/Fails-v0", entry_point=Fails, max_episode_steps=20)
+
+
+def test_an_environment_that_does_not_run_costs_nothing():
+    model = Scripted(GOOD)
+    with pytest.raises(LareError) as error:
+        design(toy_spec(environment="misfits/Fails-v0"), model=model, candidates=1)
+    assert str(error.value) == "environment 'misfits/Fails-v0' failed in reset: no track"
+    assert model.lines == [GOOD]
+
+
+def test_an_empty_reply_is_not_sent_back_empty(chase, trusting):
+    model = Scripted("", GOOD)
+    design(chase, model=model, candidates=1)
+    assert model.asked[1] == (correct(candidate(chase), "(an empty reply)", "the reply is empty"), 0)
 
 
 def test_half_a_character_goes_back_as_an_error(chase, tmp_path):

@@ -103,6 +103,11 @@ def test_who_depends_on_the_batch_is_found_by_it(evaluator, body):
     assert str(error.value) == SENTINEL
 
 
+def test_a_large_factor_hides_no_small_one(evaluator):
+    with pytest.raises(LatentRewardError, match="have other factors when they are judged again"):
+        evaluator(phi("return [1e7 * observation[:, 0:1], action + (len(action) == 3)]"), ("a", "b"))(*batch(50))
+
+
 def test_the_last_digits_may_differ(evaluator):
     # As they do in matrix products of another size.
     evaluator(phi("return [action * (1 + 1e-6 * (len(action) == 4))]"), ("a",))(*batch(50))

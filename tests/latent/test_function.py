@@ -315,3 +315,8 @@ def test_null(chase):
 def test_save_nowhere(sound, tmp_path):
     with pytest.raises(LareError, match="cannot be written"):
         sound.save(tmp_path / "none" / "phi.py")
+
+
+def test_headers_beneath_headers_cost_no_time():
+    """In a square of them a function file would take minutes."""
+    assert normal("# lare: \n\n" * 60_000 + "\nx\n\n") == "x"

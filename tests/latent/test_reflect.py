@@ -2,15 +2,19 @@
 
 import json
 
+import gymnasium
 import numpy as np
 import pytest
 
 from lare.errors import LareError
+from lare.latent import design as module
 from lare.latent.design import design
 from lare.latent.function import verified
 from lare.latent.reflect import episodes_of, gather, held_out_fit
+from lare.latent.verify import random_steps
 from lare.llm import prompts
-from toys import toy_spec
+from lare.llm.recording import RecordedModel, read_recording
+from toys import Chase, toy_spec
 
 
 def source(*factors: str) -> str:
@@ -103,6 +107,65 @@ def test_a_better_function_is_kept_and_a_worse_one_is_not():
     assert model.asked[1] == prompts.reflect(
         task, json.dumps({"Understand": "", "Analyze": "", "Functions": WRONG}), evidence
     )
+
+
+def test_what_was_recorded_answers_again(tmp_path):
+    """Two rounds that ask for the same have two replies."""
+    lines, path = (WRONG, CONSTANT, RIGHT), tmp_path / "talk.json"
+    first = design(toy_spec(), model=Says(*lines), candidates=1, reflect=2, record=path)
+    model = RecordedModel([read_recording(path.read_text(), "talk.json")], "Chase")
+    again = design(toy_spec(), model=model, candidates=1, reflect=2)
+    assert first.source == again.source == RIGHT
+
+
+@pytest.mark.parametrize("error", [LareError("the environment has gone"), KeyboardInterrupt()])
+def test_what_was_verified_is_kept_where_nothing_can_be_shown(monkeypatch, error):
+    def gone(*_):
+        raise error
+
+    monkeypatch.setattr(module, "episodes_of", gone)
+    said = []
+    model = Says(RIGHT)
+    assert design(toy_spec(), model=model, candidates=1, reflect=3, said=said.append).source == RIGHT
+    assert said[-1] == f"no reflection: {str(error) or 'stopped'}"
+
+
+def test_whoever_stops_a_reflection_takes_what_there_is():
+    class Stops(Says):
+        def reply(self, messages, sample):
+            if not self.lines:
+                raise KeyboardInterrupt
+            return super().reply(messages, sample)
+
+    said = []
+    assert design(toy_spec(), model=Stops(RIGHT), candidates=1, reflect=3, said=said.append).source == RIGHT
+    assert said[-1] == "reflection 1: stopped"
+
+
+class Reused(Chase):
+    """Writes every observation into the same memory."""
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        self.memory = np.array(observation)
+        return self.memory, info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        self.memory[:] = observation
+        return self.memory, *rest
+
+
+gymnasium.register("misfits/Reused-v0", entry_point=Reused, max_episode_steps=20)
+
+
+@pytest.mark.filterwarnings("ignore:.*share an object")  # Gymnasium sees it too
+def test_observations_are_copied(episodes):
+    task = toy_spec(environment="misfits/Reused-v0")
+    for one, other in zip(episodes_of(task), episodes, strict=True):
+        np.testing.assert_array_equal(one.observation, other.observation)
+    for one, other in zip(random_steps(task), random_steps(toy_spec()), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_round_that_fails_changes_nothing():

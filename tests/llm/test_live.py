@@ -62,6 +62,22 @@ def test_a_reply_and_what_was_asked(served):
     assert waited == []
 
 
+def test_a_reply_that_was_cut_off_is_said_to_be(served):
+    answer = completion("half of")
+    answer["choices"][0]["finish_reason"] = "length"
+    said = []
+    _, model, _ = served(lambda handler: handler.send(200, json.dumps(answer).encode()), said=said.append)
+    assert model.reply(ASKED, 0) == "half of"
+    assert said == ["m: a reply was cut off at the 16,384 tokens that it was allowed"]
+
+
+def test_no_request_is_made_that_leaves_no_room_for_a_reply(served):
+    server, model, _ = served(says("hello"), budget=Budget(tokens=most_tokens(ASKED) + live.SHORTEST_REPLY - 1))
+    with pytest.raises(BudgetSpent, match="might pass the budget"):
+        model.reply(ASKED, 0)
+    assert server.requests == []
+
+
 @pytest.mark.parametrize("status", [408, 409, 429, 500, 502, 503, 529])
 def test_what_may_pass_is_tried_again(served, status):
     server, model, waited = served(refuses(status), refuses(status), says("hello"))

@@ -1,12 +1,13 @@
 """Recorded models: they answer what they know, and say plainly what they do not."""
 
 import json
+import os
 
 import pytest
 
 from lare.errors import LareError
 from lare.llm.prompts import candidate, combine
-from lare.llm.recording import RecordedModel, read_recording, shipped_recordings
+from lare.llm.recording import RecordedModel, Recorder, read_recording, shipped_recordings
 from lare.tasks.spec import read_task
 from toys import toy_spec
 
@@ -114,3 +115,37 @@ def test_a_broken_recording_is_refused(text, message):
 def test_a_recording_nested_without_end():
     with pytest.raises(LareError, match=r"recording X\.json is not JSON"):
         read_recording("[" * 100_000, "X.json")
+
+
+def test_what_is_kept_outlives_a_write_that_fails(tmp_path, monkeypatch):
+    path = tmp_path / "talk.json"
+    recorder = Recorder("Chase", "factors", path=path)
+    recorder.take("candidate", KNOWN, "one", "Somebody")
+    before = path.read_text()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "replace", full)
+        with pytest.raises(LareError) as error:
+            recorder.take("candidate", KNOWN, "two", "Somebody")
+    assert str(error.value) == f"{path} cannot be written: No space left on device"
+    assert path.read_text() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["talk.json"]
+    recorder.keep("Somebody")
+    assert read_recording(path.read_text(), "talk.json").exchanges[0].replies == ["one", "two"]
+
+
+def test_a_first_write_that_fails_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(LareError, match="No space left on device"):
+        Recorder("Chase", "factors", path=tmp_path / "talk.json").take("candidate", KNOWN, "one", "Somebody")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_same_request_at_two_times_has_two_replies():
+    other, later = EXCHANGE | {"messages": [], "replies": ["else"]}, EXCHANGE | {"replies": ["three"]}
+    again = RECORDING | {"exchanges": [EXCHANGE, other, later]}
+    model = RecordedModel([read_recording(json.dumps(again), "Chase.draw3.json")], "Chase")
+    assert [model.reply(KNOWN, sample) for sample in range(3)] == ["one", "two", "three"]

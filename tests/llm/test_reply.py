@@ -27,7 +27,10 @@ def test_a_reply_is_read():
         ("```json\n{}\n```", "the reply is not one JSON object: Expecting value: line 1 column 1 (char 0)"),
         ("{} {}", "the reply is not one JSON object: Extra data: line 1 column 4 (char 3)"),
         ('{"Understand": "u"', "the reply is not one JSON object: Expecting ',' delimiter: line 1 column 19 (char 18)"),
-        ('{"a": "\n"}', "the reply is not one JSON object: Invalid control character at: line 1 column 8 (char 7)"),
+        (
+            '{"a": "\n"}',
+            "the reply's JSON object is not as asked for: the key 'Understand' is missing (and 2 more)",
+        ),
         ("[]", "the reply is JSON, but not an object: '[]'"),
         ("null", "the reply is JSON, but not an object: 'null'"),
         (json.dumps("x" * 99), "the reply is JSON, but not an object: '\"" + "x" * 39 + "'"),
@@ -67,11 +70,22 @@ CODE = "def evaluation_func(observation, action):\n    return [action]"
         (json.dumps(GOOD | {"Functions": f"```python\n{CODE}\n```"}), "u"),
         (f"The cart moves.\n```python\n{CODE}\n```\nThat is all.", "The cart moves.\n"),
         (f"First:\n```sh\npip install numpy\n```\n```\n{CODE}\n```", "First:\n```sh\npip install numpy\n```\n"),
+        (json.dumps(GOOD | {"Functions": f"```python3\n{CODE}\n```"}), "u"),
+        (json.dumps(GOOD | {"Functions": CODE}).replace("\\n", "\n"), "u"),
+        (f"<think>As {json.dumps(GOOD)}?</think>\n{json.dumps(GOOD | {'Functions': CODE})}", "u"),
+        (f"A draft: {json.dumps(GOOD)}, or better: {json.dumps(GOOD | {'Functions': CODE})}", "u"),
+        (f'First {{"Functions": "draft"}}, then {json.dumps(GOOD | {"Functions": CODE})}, {{"Functions": "x"}}', "u"),
+        ("{}" * 150 + json.dumps(GOOD | {"Functions": CODE}), "u"),
     ],
 )
 def test_a_reply_is_found_among_other_words(text, understood):
     reply = parse(text)
     assert (reply.understand, reply.functions.strip()) == (understood, CODE)
+
+
+def test_a_fence_in_a_docstring_is_no_function():
+    source = 'def evaluation_func(observation, action):\n    """Scores.\n    ```\n    x = 1\n    ```\n    """\n    return [action]'
+    assert parse(json.dumps(GOOD | {"Functions": source})).functions == source
 
 
 JSON = st.recursive(

@@ -91,7 +91,11 @@ def test_like_over_two_generations(spec_file, tmp_path):
         ({"name": "a/b"}, "task '{file}': name = 'a/b': string should match pattern '^[\\w.\\-]+$'"),
         ({"action_size": 0}, "task '{file}': action_size = 0: input should be greater than or equal to 1"),
         ({"max_episode_steps": 0}, "task '{file}': max_episode_steps = 0: input should be greater than or equal to 1"),
-        ({"like": 3}, "task '{file}': like = 3 must name other tasks, without a circle"),
+        ({"like": 3}, "task '{file}': like = 3 must be another task, without a circle"),
+        ({"like": []}, "task '{file}': like = [] must be another task, without a circle"),
+        ({"like": ["PP-6"]}, "task '{file}': like = ['PP-6'] must be another task, without a circle"),
+        ({"teams": "PP-6"}, "task '{file}': teams = 'PP-6' must be a list of other tasks, without a circle"),
+        ({"teams": [3]}, "task '{file}': teams = [3] must be a list of other tasks, without a circle"),
         (
             {"like": "Reacher"},
             f"no task 'Reacher' (did you mean 'Reacher-v4'?): neither a file nor one of the shipped tasks, {NAMES}",
@@ -224,7 +228,7 @@ def test_like_in_a_circle_is_refused(tmp_path, circle):
         file.write_text(f'like = "{files[(place + 1) % len(files)]}"')
     with pytest.raises(LareError) as error:
         read_task(files[0])
-    assert str(error.value) == f"task '{files[-1]}': like = '{files[0]}' must name other tasks, without a circle"
+    assert str(error.value) == f"task '{files[-1]}': like = '{files[0]}' must be another task, without a circle"
 
 
 @pytest.mark.parametrize("key", ["name", "description", "observation", "action", "environment"])

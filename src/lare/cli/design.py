@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -12,6 +12,9 @@ from lare.cli.terminal import Kind, Task, free_name, progress, say
 from lare.errors import LareError
 from lare.latent.function import LatentFunction
 from lare.tasks.spec import TaskSpec
+
+if TYPE_CHECKING:
+    from lare.latent.design import DesignFailed
 
 BUDGET, REQUESTS = 400_000, 60
 """Tokens and requests of one design, at most."""
@@ -58,7 +61,7 @@ def design(
         record: a file that takes every exchange, for --model FILE; it must not exist, and not be the .json of --out.
         out: a .py file to write, with the replies and checks in a .json beside it; it must not exist.
     """
-    from lare.latent.design import DesignBroken, DesignFailed
+    from lare.latent.design import DesignFailed
     from lare.latent.design import design as design_function
     from lare.llm.budget import Budget
     from lare.llm.live import LiveModel
@@ -89,11 +92,9 @@ def design(
             said=progress,
         )
     except DesignFailed as error:
-        path = record if record and record.is_file() else free_name(Path(f"{spec.name}.attempts.json"))
-        if path != record:
-            error.recorder.write(path, error.model)
-        progress(f"lare: {error}\nevery attempt is kept in {path}")
-        sys.exit(2 if isinstance(error, DesignBroken) else 1)
+        progress(f"lare: {error}")
+        keep_attempts(error, free_name(Path(f"{spec.name}.attempts.json")))
+        sys.exit(error.status)
     finally:
         if cost.requests_made:
             progress(f"{asked.name}: {cost.summary(price)}")
@@ -101,6 +102,22 @@ def design(
         print_function(function, free_name(Path(f"{spec.name}.py")))
     else:
         save_function(function, out)
+
+
+def keep_attempts(failed: "DesignFailed", instead: Path) -> None:
+    """Keep what was said, in its own file or `instead`; where no file can be written, print it: it was paid for."""
+    recorder, model = failed.recorder, failed.model
+    for path in (recorder.path, instead):
+        try:
+            if path is None or (path == recorder.path and not recorder.begun):
+                continue
+            recorder.write(path, model, new=path != recorder.path)
+        except LareError as error:
+            progress(f"lare: {error}")
+        else:
+            progress(f"every attempt is kept in {path}")
+            return
+    say(recorder.text(model))
 
 
 def print_function(function: LatentFunction, instead: Path) -> None:

@@ -36,6 +36,8 @@ LONGEST_QUOTE = 20_000
 class DesignFailed(LareError):
     """No attempt passed. `recorder` holds all of them, and whatever else was said."""
 
+    status = 1
+
     def __init__(self, message: str, recorder: Recorder, model: str):
         super().__init__(message)
         self.recorder, self.model = recorder, model
@@ -43,6 +45,14 @@ class DesignFailed(LareError):
 
 class DesignBroken(DesignFailed):
     """The model could not be asked any more before an attempt passed."""
+
+    status = 2
+
+
+class DesignStopped(DesignFailed):
+    """Somebody stopped it before an attempt passed."""
+
+    status = 130
 
 
 @dataclass(frozen=True)
@@ -83,8 +93,9 @@ class Conversation:
     recorder: Recorder
     said: Callable[[str], None]
 
-    def ask(self, stage: Stage, messages: Sequence[Message], sample: int = 0) -> str:
-        reply = self.model.reply(messages, sample)
+    def ask(self, stage: Stage, messages: Sequence[Message]) -> str:
+        """A reply to a request, another one each time that it is asked."""
+        reply = self.model.reply(messages, self.recorder.asked(stage, messages))
         self.recorder.take(stage, messages, reply, self.model.name)
         return reply
 
@@ -95,7 +106,7 @@ class Conversation:
         without pre-verification nobody looks.
         """
         request = prompts.candidate(self.task, self.kind)
-        replies = [self.ask("candidate", request, sample) for sample in range(candidates)]
+        replies = [self.ask("candidate", request) for _ in range(candidates)]
         if candidates == 1:
             return request, replies[0]
         sound = self.sound(replies) if pre_verification else []
@@ -104,7 +115,6 @@ class Conversation:
 
     def sound(self, replies: Sequence[str]) -> list[str]:
         """Those that can be read and pass."""
-        random_steps(self.task)  # once, before several want them at the same time
         with ThreadPoolExecutor() as pool:
             tried = list(pool.map(lambda reply: examine(reply, self.task, self.kind), replies))
         for number, attempt in enumerate(tried, start=1):
@@ -137,10 +147,14 @@ class Conversation:
     def reflect(self, best: Attempt, rounds: int, policy: Policy | None) -> Attempt:
         """Show the model what its factors did on whole episodes; keep the function that predicts returns best.
 
-        Whatever goes wrong on the way, there is a verified function to go back to.
+        Whatever goes wrong on the way, there is a verified function to go back to; whoever stops it takes that.
         """
-        episodes = episodes_of(self.task, policy)
-        evidence = gather(self.made(best), self.task, episodes)
+        try:
+            episodes = episodes_of(self.task, policy)
+            evidence = gather(self.made(best), self.task, episodes)
+        except (LareError, KeyboardInterrupt) as error:
+            self.said(f"no reflection: {str(error) or 'stopped'}")
+            return best
         self.said(f"reflection: before it, a linear decoder explains {evidence.fit:.3f} of unseen returns")
         for number in range(1, rounds + 1):
             try:
@@ -150,6 +164,9 @@ class Conversation:
             except LareError as error:
                 self.said(f"reflection {number}: {error}")
                 continue
+            except KeyboardInterrupt:
+                self.said(f"reflection {number}: stopped")
+                return best
             better = found.fit > evidence.fit
             self.said(f"reflection {number}: {found.fit:.3f}, {'kept' if better else 'not better'}")
             if better:
@@ -177,8 +194,8 @@ def check_recorded(task: TaskSpec, kind: Kind, draw: int, candidates: int) -> No
 
 
 def quoted(reply: str) -> str:
-    """A reply as it is shown to the model again: not without end."""
-    return reply[:LONGEST_QUOTE]
+    """A reply as it is shown to the model again: not without end, and not empty, which some servers refuse."""
+    return reply[:LONGEST_QUOTE] if reply.strip() else "(an empty reply)"
 
 
 def run_once(source: str, task: TaskSpec, kind: Kind) -> np.ndarray:
@@ -220,8 +237,8 @@ def design(
         said: is told how it goes.
 
     Raises:
-        DesignFailed: no attempt passed. `DesignBroken` where the model could not be asked any more.
-        LareError: the model cannot answer, or each team of the task has a function of its own.
+        DesignFailed: no attempt passed. `DesignBroken` where the model could not be asked any more, `DesignStopped` after Ctrl-C.
+        LareError: the model cannot answer, the environment does not run, or each team of the task has a function of its own.
     """
     the_role(task)
     if not 1 <= candidates <= MOST_CANDIDATES:
@@ -229,6 +246,9 @@ def design(
     if reflect < 0:
         raise LareError(f"reflect = {reflect}: there can be no fewer rounds than none")
     model = model or recorded_model(task.name, kind, draw)
+    random_steps(
+        task
+    )  # what cannot be played is found out before a model is paid, and once, before threads want the steps
     recorder = Recorder(task.name, kind, getattr(model, "temperature", None), record)
     conversation = Conversation(task, kind, model, recorder, said)
     try:
@@ -240,4 +260,8 @@ def design(
         if not recorder.exchanges:
             raise
         raise DesignBroken(str(error), recorder, model.name) from error
+    except KeyboardInterrupt:
+        if not recorder.exchanges:
+            raise
+        raise DesignStopped("stopped", recorder, model.name) from None
     return conversation.made(conversation.reflect(attempt, reflect, policy) if reflect else attempt)

@@ -146,12 +146,8 @@ class LatentFunction:
 
 def normal(source: str) -> str:
     """The source as it is kept: line ends of one kind, no blank lines around it, and no header but that of `save`."""
-    text = "\n".join(source.splitlines()).strip("\n")
-    while text.startswith(
-        HEADER
-    ):  # beneath one there may be another, behind blank lines: who writes that is not `save`
-        text = split_header(text)[1].strip("\n")
-    return text
+    lines = itertools.dropwhile(lambda line: not line or line.startswith(HEADER), source.splitlines())
+    return "\n".join(lines).rstrip("\n")
 
 
 def verified(source: str, task: TaskSpec, kind: Kind = "factors") -> LatentFunction:

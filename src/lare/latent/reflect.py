@@ -4,10 +4,12 @@ The judge is the plainest decoder there is: a linear map from an episode's mean 
 regression and asked about the episodes that it has not seen.
 """
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium
 import numpy as np
 from jaxtyping import Float
 
@@ -40,24 +42,24 @@ class Episode:
 
 def episodes_of(task: TaskSpec, policy: Policy | None = None, count: int = EPISODES, seed: int = 0) -> list[Episode]:
     """Episodes under a policy, or under random actions."""
-    environment = make(task.environment, task.max_episode_steps)
-    environment.action_space.seed(seed)
-    found = []
-    for number in range(count):
-        observation, _ = environment.reset(seed=seed + number)
-        observations, actions, rewards, ended = [observation], [], [], False
-        while not ended:
-            action = environment.action_space.sample() if policy is None else policy(observation)
-            observation, reward, terminated, truncated, _ = environment.step(action)
-            observations.append(observation)
-            actions.append(action)
-            rewards.append(float(reward))
-            ended = terminated or truncated
-        found.append(
-            Episode(np.asarray(observations, np.float32), np.asarray(actions, np.float32), np.asarray(rewards))
-        )
-    environment.close()
-    return found
+    with contextlib.closing(make(task.environment, task.max_episode_steps)) as environment:
+        environment.action_space.seed(seed)
+        return [episode_of(environment, policy, seed + number) for number in range(count)]
+
+
+def episode_of(environment: gymnasium.Env, policy: Policy | None, seed: int) -> Episode:
+    """One of them. What it observes is copied: the environment may write the next observation into the same memory."""
+    observation = np.array(environment.reset(seed=seed)[0], np.float32)
+    observations, actions, rewards, ended = [observation], [], [], False
+    while not ended:
+        action = environment.action_space.sample() if policy is None else policy(observation)
+        after, reward, terminated, truncated, _ = environment.step(action)
+        observation = np.array(after, np.float32)
+        observations.append(observation)
+        actions.append(np.array(action, np.float32))
+        rewards.append(float(reward))
+        ended = terminated or truncated
+    return Episode(np.stack(observations), np.stack(actions), np.array(rewards))
 
 
 def factors_of(function: LatentFunction, task: TaskSpec, episode: Episode) -> Float[np.ndarray, "steps factors"]:

@@ -84,18 +84,17 @@ def steps_in(
     name: str, max_episode_steps: int | None, steps: int, seed: int
 ) -> tuple[Float[np.ndarray, "steps observation"], Float[np.ndarray, "steps action"]]:
     """The same by the environment. Read-only: they are given to everybody who asks."""
-    environment = make(name, max_episode_steps)
-    environment.action_space.seed(seed)
     observations, actions = [], []
-    observation, _ = environment.reset(seed=seed)
-    for _ in range(steps):
-        action = environment.action_space.sample()
-        observations.append(observation)
-        actions.append(action)
-        observation, _, terminated, truncated, _ = environment.step(action)
-        if terminated or truncated:
-            observation, _ = environment.reset()
-    environment.close()
+    with contextlib.closing(make(name, max_episode_steps)) as environment:
+        environment.action_space.seed(seed)
+        observation, _ = environment.reset(seed=seed)
+        for _ in range(steps):
+            action = environment.action_space.sample()
+            observations.append(np.array(observation, np.float32))  # a copy: the environment may write into it again
+            actions.append(np.array(action, np.float32))
+            observation, _, terminated, truncated, _ = environment.step(action)
+            if terminated or truncated:
+                observation, _ = environment.reset()
     recorded = np.asarray(observations, np.float32), np.asarray(actions, np.float32)
     for array in recorded:
         array.setflags(write=False)

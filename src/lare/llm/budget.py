@@ -27,16 +27,16 @@ class Budget:
     estimated: bool = False
     """Whether a server said nothing of tokens, and they were counted as bytes."""
 
-    def allow(self, messages: Sequence[Message]) -> int:
-        """How many tokens the reply to a request may have. No token is shorter than a byte.
+    def allow(self, messages: Sequence[Message], least: int = 1) -> int:
+        """How many tokens the reply to a request may have, `least` or more. No token is shorter than a byte.
 
         Raises:
-            BudgetSpent: there is no request, or no token, left.
+            BudgetSpent: there is no request, or there are not as many tokens, left.
         """
         if self.requests_made >= self.requests:
             raise BudgetSpent(f"the budget of {self.requests} requests is spent")
         left = self.tokens - self.tokens_in - self.tokens_out - most_tokens(messages)
-        if left < 1:
+        if left < least:
             used = self.tokens_in + self.tokens_out
             raise BudgetSpent(f"the next request might pass the budget of {self.tokens:,} tokens ({used:,} are used)")
         return left

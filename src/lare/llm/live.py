@@ -147,7 +147,7 @@ class LiveModel:
         """One request: the reply, or why there is none."""
         import openai
 
-        allowed = min(self.longest, self.budget.allow(messages))
+        allowed = min(self.longest, self.budget.allow(messages, SHORTEST_REPLY))
         options: dict[str, Any] = {LIMITS[self.limit_name]: allowed}
         if LADDER[self.rung] is not None:
             options["response_format"] = LADDER[self.rung]
@@ -182,13 +182,13 @@ class LiveModel:
         except Exception as error:  # what the transport raises while a body is read depends on the client's version
             self.count_all(messages, allowed)
             return Failure(self.scrubbed(f"the answer broke off ({type(error).__name__}: {error})"), again=True)
-        return self.read(body, messages)
+        return self.read(body, messages, allowed)
 
     def count_all(self, messages: Sequence[Message], allowed: int) -> None:
         """Count a request that was broken off at the most that it may have cost: somebody may have answered it."""
         self.budget.count(None, messages, "x" * allowed)
 
-    def read(self, body: bytes, messages: Sequence[Message]) -> "str | Failure":
+    def read(self, body: bytes, messages: Sequence[Message], allowed: int) -> "str | Failure":
         """The text of a chat completion. An answer that is none is tried again: something is wrong on the way."""
         try:
             answer = json.loads(body)
@@ -203,6 +203,8 @@ class LiveModel:
                 self.scrubbed(f"the answer is not a chat completion ({type(error).__name__}: {error})"), again=True
             )
         self.budget.count(answer.get("usage"), messages, text)
+        if answer["choices"][0].get("finish_reason") == "length":
+            self.said(f"{self.name}: a reply was cut off at the {allowed:,} tokens that it was allowed")
         return text
 
     def refused(self, error: Any) -> "Failure":

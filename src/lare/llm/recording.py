@@ -77,10 +77,15 @@ class RecordedModel:
 
     def reply(self, messages: Sequence[Message], sample: int) -> str:
         for recording in self.recordings:
-            for exchange in recording.exchanges:
-                if exchange.messages == list(messages) and sample < len(exchange.replies):
-                    self.name = f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
-                    return exchange.replies[sample]
+            replies = [
+                reply
+                for exchange in recording.exchanges
+                if exchange.messages == list(messages)
+                for reply in exchange.replies
+            ]
+            if sample < len(replies):
+                self.name = f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
+                return replies[sample]
         raise LareError(
             f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}): recordings answer only "
             "the exact texts of a shipped task, and the number of candidates that was recorded (or 1). Ask a live model "
@@ -92,7 +97,8 @@ class RecordedModel:
 class Recorder:
     """Takes down every exchange of a design, and keeps it in a file from the first reply on, if there is one.
 
-    A file is never overwritten: it must not be there when the first reply comes.
+    A file is never overwritten: it must not be there when the first reply comes. What it holds is never lost: it is replaced as
+    a whole.
     """
 
     task: str
@@ -100,6 +106,12 @@ class Recorder:
     temperature: float | None = None
     path: Path | None = None
     exchanges: list[Exchange] = field(default_factory=list)
+    begun: bool = False
+    """Whether the file is ours."""
+
+    def asked(self, stage: Stage, messages: Sequence[Message]) -> int:
+        """How many replies there are to a request already."""
+        return sum(len(one.replies) for one in self.exchanges if (one.stage, one.messages) == (stage, list(messages)))
 
     def take(self, stage: Stage, messages: Sequence[Message], reply: str, model: str) -> None:
         """Add a reply to a request; the same request again adds to its replies."""
@@ -110,11 +122,34 @@ class Recorder:
             replies = [reply]
         self.exchanges.append(Exchange(stage=stage, messages=list(messages), replies=replies))
         if self.path is not None:
-            first = len(self.exchanges) == len(replies) == 1
-            self.write(self.path, model, new=first)
+            self.keep(model)
+
+    def keep(self, model: str) -> None:
+        """Write all of it to its own file."""
+        assert self.path is not None
+        self.write(self.path, model, new=not self.begun)
+        self.begun = True
 
     def write(self, path: Path, model: str, new: bool = True) -> None:
         """Raises `LareError` where the file cannot be written, or is there and should be `new`."""
+        draft = path.with_name(f"{path.name}.part")
+        try:
+            if new:
+                path.touch(exist_ok=False)
+            try:
+                draft.write_text(self.text(model), encoding="utf-8")
+                draft.replace(path)
+            except OSError:
+                for unfinished in (draft, *([path] if new else [])):
+                    unfinished.unlink(missing_ok=True)
+                raise
+        except FileExistsError:
+            raise LareError(f"{path} exists, and is not overwritten; choose another --record") from None
+        except OSError as error:
+            raise LareError(f"{path} cannot be written: {error.strerror}") from error
+
+    def text(self, model: str) -> str:
+        """The file."""
         recording = Recording(
             task=self.task,
             kind=self.kind,
@@ -124,10 +159,4 @@ class Recorder:
             temperature=self.temperature,
             exchanges=self.exchanges,
         )
-        try:
-            with path.open("x" if new else "w", encoding="utf-8") as file:
-                file.write(recording.model_dump_json(indent=1) + "\n")
-        except FileExistsError:
-            raise LareError(f"{path} exists, and is not overwritten; choose another --record") from None
-        except OSError as error:
-            raise LareError(f"{path} cannot be written: {error.strerror}") from error
+        return recording.model_dump_json(indent=1) + "\n"

@@ -30,8 +30,16 @@ class Reply(Checked):
     """Source of `evaluation_func(observation, action)`."""
 
 
-FENCE = re.compile(r"```[ \t]*+([A-Za-z]*+)[ \t]*+\r?\n(.*?)```", re.DOTALL)
+FENCE = re.compile(r"```[ \t]*+([\w.+-]*+)[ \t]*+\r?\n(.*?)```", re.DOTALL)
 """A fenced block, with its language."""
+
+THOUGHT = re.compile(r"<think(?:ing)?>.*?</think(?:ing)?>", re.DOTALL)
+"""What some models say to themselves, drafts and all, before they answer."""
+
+START = re.compile(r'\{\s*"')
+"""Where an object may begin."""
+
+KEYS = {"Understand", "Analyze", "Functions"}
 
 
 def parse(text: str) -> Reply:
@@ -45,8 +53,9 @@ def parse(text: str) -> Reply:
     if len(text) > LONGEST:
         raise MalformedReply(f"the reply has {len(text)} characters; at most {LONGEST} are read")
     check_characters(text)
+    text = THOUGHT.sub("", text) or text
     try:
-        values = json.loads(text)
+        values = json.loads(text, strict=False)  # lines may end within a string
     except (ValueError, RecursionError) as error:
         values = embedded(text)
         if values is None:
@@ -60,7 +69,8 @@ def parse(text: str) -> Reply:
     for part in (reply.understand, reply.analyze, reply.functions):
         check_characters(part)
     inner = FENCE.search(reply.functions)
-    return reply.model_copy(update={"functions": inner[2]}) if inner else reply
+    fenced = inner is not None and "def " not in reply.functions[: inner.start()]
+    return reply.model_copy(update={"functions": inner[2]}) if fenced else reply
 
 
 def check_characters(text: str) -> None:
@@ -74,16 +84,19 @@ def check_characters(text: str) -> None:
 
 
 def embedded(text: str) -> dict[str, Any] | None:
-    """The object that stands somewhere in a text, or the function that stands in a fence."""
-    decoder = json.JSONDecoder()
-    starts = [place for place, letter in enumerate(text) if letter == "{"][:MOST_STARTS]
-    for start in starts:
+    """The last whole object that stands somewhere in a text, or the function that stands in a fence."""
+    decoder, partial = json.JSONDecoder(strict=False), None
+    for start in [match.start() for match in START.finditer(text)][: -MOST_STARTS - 1 : -1]:
         try:
             value, _ = decoder.raw_decode(text, start)
         except (ValueError, RecursionError):
             continue
-        if isinstance(value, dict) and "Functions" in value:
+        if value.keys() >= KEYS:
             return value
+        if "Functions" in value:
+            partial = value
+    if partial is not None:
+        return partial
     for fence in FENCE.finditer(text):
         if "def " in fence[2]:
             return {"Understand": text[: fence.start()], "Analyze": "", "Functions": fence[2]}

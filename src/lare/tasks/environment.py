@@ -6,6 +6,7 @@ import warnings
 from typing import Any
 
 import gymnasium
+from gymnasium.utils import RecordConstructorArgs
 
 from lare.errors import LareError
 from lare.tasks import mujoco, particles
@@ -13,6 +14,38 @@ from lare.tasks.spaces import as_rows
 
 mujoco.register()
 particles.register()
+
+
+class Guarded(gymnasium.Wrapper, RecordConstructorArgs):
+    """An environment is foreign code: whatever its `reset` and `step` raise is a `LareError` of one line."""
+
+    def __init__(self, env: gymnasium.Env, name: str):
+        RecordConstructorArgs.__init__(
+            self, name=name
+        )  # without which Gymnasium could not make the same environment again
+        super().__init__(env)
+        self.name = name
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        try:
+            return self.env.reset(**options)
+        except Exception as error:
+            raise fault(f"environment {self.name!r} failed in reset", error) from error
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        try:
+            return self.env.step(action)
+        except Exception as error:
+            raise fault(f"environment {self.name!r} failed in step", error) from error
+
+
+def fault(what: str, error: BaseException, hint: str = "") -> LareError:
+    """What went wrong in foreign code, in a line. One that says so itself is left as it is."""
+    if isinstance(error, LareError):
+        return error
+    logging.getLogger(__name__).debug("%s", what, exc_info=error)
+    reason = str(error).strip().splitlines() or [type(error).__name__]
+    return LareError(f"{what}: {reason[0]}{hint}")
 
 
 def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) -> gymnasium.Env:
@@ -24,14 +57,12 @@ def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) 
         warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
         try:
-            return as_rows(gymnasium.make(environment, max_episode_steps=max_episode_steps, **kwargs))
-        # An environment is foreign code: anything may come out of its constructor.
-        except (Exception, SystemExit) as error:
-            logging.getLogger(__name__).debug("making %s failed", environment, exc_info=True)
-            reason = str(error).strip().splitlines() or [type(error).__name__]
+            made = gymnasium.make(environment, max_episode_steps=max_episode_steps, **kwargs)
+            return as_rows(Guarded(made, environment))
+        except (Exception, SystemExit) as error:  # anything may come out of its constructor
             hint, library = "", os.environ.get("MUJOCO_GL")
             if library and isinstance(error, AttributeError):
                 hint = f" (is MUJOCO_GL={library} installed?)"
             if isinstance(error, ModuleNotFoundError):
                 hint = " (a module in this folder is found with PYTHONPATH=.)"
-            raise LareError(f"environment {environment!r} cannot be made: {reason[0]}{hint}") from error
+            raise fault(f"environment {environment!r} cannot be made", error, hint) from error

@@ -205,4 +205,5 @@ def bounds(space: gymnasium.Space) -> str:
 def quoted(text: str) -> str:
     """A text as TOML's string of several lines."""
     escaped = text.replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
+    escaped = re.sub(r"[\x00-\x08\x0b-\x1f\x7f]", lambda letter: f"\\u{ord(letter[0]):04x}", escaped)
     return f'"""\n{escaped}\n"""'

@@ -1,5 +1,6 @@
 """A task: an environment and the texts that describe it, read from TOML and checked against the environment."""
 
+import contextlib
 import hashlib
 import tomllib
 from importlib.resources import files
@@ -144,11 +145,14 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
         values = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # TOMLDecodeError is one; a number without end is another
         raise LareError(f"task {task!r} is not valid TOML: {error}") from error
-    for key in ("like", "teams"):
-        named = values.get(key, [])
-        for other in named if isinstance(named, list) else [named]:
-            if not isinstance(other, str) or beside(task, other) in (*seen, task):
-                raise LareError(f"task {task!r}: {key} = {named!r} must name other tasks, without a circle")
+    for key, kind in (("like", str), ("teams", list)):
+        named = values.get(key, kind())
+        others = [named] if kind is str and key in values else named
+        if not isinstance(named, kind) or not all(
+            isinstance(other, str) and beside(task, other) not in (*seen, task) for other in others
+        ):
+            what = "another task" if kind is str else "a list of other tasks"
+            raise LareError(f"task {task!r}: {key} = {named!r} must be {what}, without a circle")
     if "teams" in values:
         values["teams"] = [read_values(beside(task, team), (*seen, task)) for team in values["teams"]]
     parent = values.pop("like", None)
@@ -222,7 +226,10 @@ def is_discrete(spec: TaskSpec) -> bool:
 
 def time_limit(spec: TaskSpec) -> int:
     """The most steps that an episode can have. Raises `LareError` where neither spec nor environment sets a limit."""
-    limit = spec.max_episode_steps or gymnasium.spec(spec.environment.rpartition(":")[2]).max_episode_steps
+    if spec.max_episode_steps:
+        return spec.max_episode_steps
+    with contextlib.closing(make(spec.environment)) as environment:
+        limit = environment.spec and environment.spec.max_episode_steps
     if limit is None:
         raise LareError(
             f"task {spec.name!r}: {spec.environment} has no time limit, so an episode may never pay; "

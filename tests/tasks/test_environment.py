@@ -1,0 +1,53 @@
+"""Environments that fail, in one line."""
+
+import gymnasium
+import pytest
+
+from lare.errors import LareError
+from lare.latent.verify import steps_in
+from lare.tasks.environment import make
+from toys import Chase
+
+
+class Falters(Chase):
+    """Fails where it is told to."""
+
+    def __init__(self, where):
+        super().__init__()
+        self.where = where
+
+    def reset(self, *, seed=None, options=None):
+        if self.where == "reset":
+            raise OSError("no asset\ntrack.bin")
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        if self.where == "step":
+            raise ZeroDivisionError
+        if self.where == "itself":
+            raise LareError("the battery is empty")
+        return super().step(action)
+
+
+for where in ("reset", "step", "itself"):
+    gymnasium.register(f"misfits/{where}-v0", entry_point=Falters, kwargs={"where": where}, max_episode_steps=20)
+
+
+@pytest.mark.parametrize(
+    ("where", "message"),
+    [
+        ("reset", "environment 'misfits/reset-v0' failed in reset: no asset"),
+        ("step", "environment 'misfits/step-v0' failed in step: ZeroDivisionError"),
+        ("itself", "the battery is empty"),
+    ],
+)
+def test_a_failure_is_one_line(where, message):
+    with pytest.raises(LareError) as error:
+        steps_in(f"misfits/{where}-v0", None, 1, 0)
+    assert str(error.value) == message
+
+
+def test_gymnasium_can_make_it_again():
+    environment = make("toys/Chase-v0")
+    assert environment.spec is not None
+    assert gymnasium.make(environment.spec).reset(seed=0)[0] == pytest.approx(environment.reset(seed=0)[0])
