@@ -85,7 +85,7 @@ def test_an_unknown_choice_lists_those_there_are(command):
         ("Reacher-v4 --algorithm ppo --chunk 10", "chunk makes no difference to ppo on Reacher-v4"),
         (
             "Reacher-v4 --draw 1 --function phi.py",
-            "--draw and --candidates choose a recorded function, and --function gives one: leave either out",
+            "draw and candidates choose a recorded function, and a function is given: leave either out",
         ),
         ("Reacher-v4 --seed 2147483647 --seeds 2", "seed = 2147483647 and 1 that follow it: the largest is 2147483647"),
     ],

@@ -7,6 +7,7 @@ import pytest
 
 from lare.algorithms import ppo
 from lare.algorithms.ppo import PPOSettings, Rollout
+from lare.normalise import deviation, observe
 
 SETTINGS = PPOSettings(hidden=(16,), minibatch_size=8, epochs=3)
 
@@ -51,6 +52,24 @@ def test_out_of_time_bootstraps_and_a_termination_does_not():
     rollout = rollout_of(1, 2, ended=ended)._replace(continues=jnp.array([[1.0, 0.0]]))
     got = ppo.advantages(rollout, jnp.zeros((1, 2)), jnp.full((1, 2), 10.0), SETTINGS)
     np.testing.assert_allclose(got - rollout.reward, [[9.9, 0.0]], rtol=1e-5, atol=1e-6)
+
+
+def test_values_are_in_units_of_the_reward_and_targets_in_deviations_of_the_return():
+    state, rollout = state_of(), rollout_of()
+    state = state._replace(returns=observe(state.returns, jnp.array([[3.0], [11.0]])))
+    said = np.asarray(state.online.critic(rollout.observation))[..., 0]
+    value = np.asarray(ppo.values(state, rollout.observation))
+    np.testing.assert_allclose(value, 7 + 4 * said, rtol=1e-5)
+    batch, returns = ppo.prepare(state, rollout, SETTINGS)
+    advantage = ppo.advantages(rollout, jnp.asarray(value), ppo.values(state, rollout.next_observation), SETTINGS)
+    want = np.asarray(advantage) + value
+    np.testing.assert_allclose(
+        batch.target * float(deviation(returns)[0]) + float(returns.mean[0]), want.ravel(), rtol=1e-4
+    )
+    assert float(returns.mean[0]) == pytest.approx((3 + 11 + want.sum()) / 26, rel=1e-4)
+    np.testing.assert_allclose(batch.value, said.ravel(), rtol=1e-5)
+    centred = np.asarray(advantage - advantage.mean()) / np.asarray(advantage).std()
+    np.testing.assert_allclose(batch.advantage, centred.ravel(), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -74,16 +74,16 @@ def test_targets_wait_for_their_turn(state, batch):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.parametrize(("log_sigma", "falls"), [(0.0, True), (-5.0, False)])
-def test_the_temperature_follows_the_entropy(state, batch, log_sigma, falls):
-    """Where the entropy is above -dim(A) it falls, else it rises: by Adam's step size, at the first step."""
+@pytest.mark.parametrize(("log_sigma", "entropy", "falls"), [(0.0, 1.2, True), (-1.9, -1, True), (-5.0, -7.2, False)])
+def test_the_temperature_follows_the_entropy(state, batch, log_sigma, entropy, falls):
+    """Where the entropy is above -dim(A) = -2 it falls, else it rises: by Adam's step size, at the first step."""
     layers = state.online.actor.layers
     last = jax.tree.map(jnp.zeros_like, layers[-1])
     last = jax.tree.map(lambda leaf: jnp.array([0.0, 0, log_sigma, log_sigma]) if leaf.shape == (4,) else leaf, last)
     actor = eqx.tree_at(lambda actor: actor.layers[-1], state.online.actor, last)
     start = state._replace(online=state.online._replace(actor=actor))
     after, measured = sac.update(start, batch, jax.random.key(2), jnp.array(0), SETTINGS)
-    assert (float(measured["actor/entropy"]) > -2) == falls
+    assert float(measured["actor/entropy"]) == pytest.approx(entropy, abs=0.3)
     assert float(measured["actor/temperature"]) == pytest.approx(0.5)
     change = float(after.online.log_temperature - state.online.log_temperature)
     assert change == pytest.approx(-3e-4 if falls else 3e-4, rel=1e-3)

@@ -149,3 +149,18 @@ def test_uncertainty_holds_and_shrinks():
         assert (np.abs(r_hat - (rows[:50] @ WEIGHT + 0.7)) <= np.asarray(width)).all()
         widths.append(float(width.mean()))
     assert widths[1] < widths[0] / 2
+
+
+def test_a_constant_says_nothing_however_long_episodes_are():
+    """The sum of 0.1, divided by the length, is 0.1 and a rounding error that tells the length."""
+    random, totals = np.random.default_rng(0), no_totals(2)
+    take = jax.jit(take_in)
+    lengths = random.integers(20, 999, 60)
+    for length in lengths:
+        factors = np.stack([random.normal(size=length), np.full(length, 0.1)], axis=1).astype(np.float32)
+        paid, ended = np.full(999, 0.5 + length / 500, np.float32), np.arange(999) == length - 1
+        padded = np.concatenate([factors, np.full((999 - length, 2), 0.1, np.float32)])
+        totals = forget_running(take(totals, jnp.asarray(padded), jnp.asarray(paid), jnp.asarray(ended)))
+    decoder = ridge_regression(totals, 1.0)
+    assert float(decoder.weight[1]) == 0
+    assert float(decoder.bias) == pytest.approx((0.5 + lengths / 500).mean(), abs=0.2)

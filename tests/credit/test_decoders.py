@@ -80,6 +80,15 @@ def test_a_bottleneck_costs_its_divergence():
     assert float(bottleneck(features(), KEY).penalty.mean()) == pytest.approx(want, rel=1e-5)
 
 
+def test_a_bottleneck_draws_its_code_from_a_gaussian():
+    bottleneck, noise = made("bottleneck"), jax.random.normal(KEY, (EPISODES * STEPS, AGENTS, 2))
+    mean, log_variance = jnp.split(bottleneck.encoder(features()), 2, axis=-1)
+    assert float(jnp.abs(log_variance).max()) > 0.1
+    for key, code in ((KEY, mean + jnp.sqrt(jnp.exp(log_variance)) * noise), (None, mean)):
+        want = bottleneck.decoder(code, None).r_hat
+        np.testing.assert_allclose(bottleneck(features(), key).r_hat, want, rtol=1e-4, atol=1e-5)
+
+
 def test_arel_gives_every_agent_the_same_and_costs_its_variance():
     decoded = made("arel")(features(), None)
     given = by_episode(decoded.r_hat)

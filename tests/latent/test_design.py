@@ -216,6 +216,7 @@ def test_without_verification_whatever_runs_is_kept(chase):
     function = design(chase, model=model, candidates=1, pre_verification=False)
     assert (function.source, function.size) == (source, 2)
     assert function.checks == (Check("executed", True, ""),)
+    assert (function.names, function.meanings) == (["factor_1", "factor_2"], ["", ""])  # nothing of it is parsed here
     assert model.lines == [GOOD]
 
 

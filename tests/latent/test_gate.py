@@ -28,6 +28,7 @@ DTYPES = "a dtype must be one of np.bool_, np.float32, np.float64, np.int32, np.
 WITH = "with is available only as `with np.errstate(divide='ignore')` and the like"
 IMPORTS = "only `import numpy as np` and `import math` are available"
 LONG_NAME = "write `import numpy as np` and the function's full name"
+IDENTITY = "is and is not stand beside None, True or False only: use =="
 NAMED_LAMBDA = "a lambda must be given a name, and be called by it: name = lambda ..."
 
 
@@ -350,6 +351,10 @@ def said(source: str) -> list[str]:
             for change in ("action[0] = 1", "action[:, 0] *= 2", "action.T[0] = 1", "action.reshape(-1)[0] = 1", "action.append(1)")
         ],
         (phi("observation += 1"), ["E-INPUT line 2: `observation ...=` writes into the input: copy it first"]),
+        *[
+            (phi(f"x = np.bool_(1)\nreturn [action * ({test})]"), [f"E-CONSTRUCT line 3: {IDENTITY}"])
+            for test in ("(action.sum() > 0) is x", "x is not x", "None is x is x", "1 is x")
+        ],
         # Recursion
         (
             phi("return evaluation_func(observation, action)"),
@@ -462,6 +467,8 @@ def test_the_same_is_not_said_twice_of_a_line():
         phi("return [action.astype(float), action.astype('f4'), action.astype(observation.dtype), np.zeros(3, 'int')]"),
         phi("x = np.finfo(np.float32)\nreturn [action * np.finfo(np.float64).max * x.eps * np.finfo('f4').tiny]"),
         phi("return [np.einsum('ij, ij -> i', action, action)[..., None], np.pad(action, 1, 'edge')]"),
+        phi("return [np.einsum('...i,...i->...', action, action)[:, None]]"),
+        phi("x = None\nreturn [action if x is None else x, action * (True is not x)]"),
         phi("with np.errstate(divide='ignore', over='ignore'):\n    return [1 / action]"),
         phi("for i, (x, y) in enumerate(zip([1], [2])):\n    if i: continue\n    break\nelse:\n    pass\nreturn [action]"),
         phi("return [action if 0 < action.shape[0] <= 3 and not None else ~(action > 0) & (action < 1)]"),

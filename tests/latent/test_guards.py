@@ -24,6 +24,9 @@ from programs import run
         ("2 ** -4097", "a power of integers"),
         ("x = 2 ** 2000\nx * x * x", "a product of huge integers"),
         ("x = 2 ** 2000\nfor i in range(9): x *= x", "a product of huge integers"),
+        ("np.prod([2 ** 2000] * 3000)", "an integer that no array holds"),
+        ("np.array([[1, 2 ** 65]])", "an integer that no array holds"),
+        ("np.clip(action, 0, max=2 ** 65)", "an integer that no array holds"),
     ],
 )
 def test_growth_without_a_loop_has_an_end(body, message):
@@ -35,3 +38,20 @@ def test_growth_without_a_loop_has_an_end(body, message):
 @pytest.mark.parametrize("body", ["range(20_000)", "[1, 2] * 5000", "2 ** 2047", "x = 2 ** 1000\nx * x", "1.5 ** 500"])
 def test_growth_up_to_the_end(body):
     assert len(run(body)) == 1
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("np.ones((1, 1), int).dot([[2 ** 2000] * 3])", "arrays hold numbers only, not object"),
+        (
+            "[0] * (action.sum() > 1e20).astype(int)",
+            "a list is repeated by a number of NumPy's: make it an array first",
+        ),
+        ("np.argmax(action) * (0, 1)", "a tuple is repeated by a number of NumPy's: make it an array first"),
+    ],
+)
+def test_what_would_become_something_else(body, message):
+    with pytest.raises(TypeError) as error:
+        run(body)
+    assert str(error.value) == message

@@ -31,6 +31,7 @@ DECISION = "a decision depends on values of the batch: use np.where instead of i
 NUMBER = "a value of the batch is turned into one number: keep it an array"
 NO_MATH = f"{NUMBER}, and use np instead of math"
 LIST_INDEX = "a value of the batch is used as an index: use np.where or np.take_along_axis"
+SHAPE = "the shape of an array depends on values of the batch: use np.where, which keeps every row"
 INDEX = "an array is indexed by values of the batch: use np.where or np.take_along_axis"
 
 
@@ -86,11 +87,38 @@ INDEX = "an array is indexed by values of the batch: use np.where or np.take_alo
         ("x[x[:, 0] > 0, 0]", INDEX),
         ("x[np.argmax(x, axis=1)]", INDEX),
         ("x[..., np.argmax(x[0])]", INDEX),
+        *[
+            (call, SHAPE)
+            for call in (
+                "np.zeros((1, 2)).sum(axis=k)",
+                "np.zeros((1, 2)).sum(k)",
+                "np.sum(np.zeros((1, 2)), k)",
+                "np.add.reduce(np.zeros((1, 2)), k)",
+                "np.max(x, keepdims=k)",
+                "np.swapaxes(x, 0, k)",
+                "np.zeros((1, 2)).swapaxes(0, k)",
+                "np.moveaxis(x, k, 0)",
+                "np.transpose(x, [k, 1])",
+                "np.zeros((1, 2)).transpose(k, 1)",
+                "np.expand_dims(x, k)",
+                "np.zeros((1, 1)).squeeze(k)",
+                "np.stack([x, x], axis=k)",
+                "np.concatenate([x, x], k)",
+                "np.diff(x, n=k)",
+                "np.array([1.0], ndmin=k)",
+                "np.tensordot(x, x, axes=k)",
+                "np.linalg.norm(x, ord=k)",
+                "np.quantile(x, 0.5, k)",
+                "np.roll(x, k)",
+                "np.take(x, 0, k)",
+                "np.tril(x, k=k)",
+            )
+        ],
     ],
 )
 def test_who_looks_is_found(expression, message):
     with pytest.raises(Looked) as error:
-        run_hidden(phi(f"x = observation\ny = 1\nreturn [action * ({expression})]"))
+        run_hidden(phi(f"x = observation\nk = (x.sum() > 1e20).astype(int)\nreturn [action * ({expression})]"))
     assert str(error.value) == message
     lines = [frame.lineno for frame in traceback.extract_tb(error.value.__traceback__) if frame.filename == FILE]
     assert lines[-1] == 4

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from lare.credit.decomposition import CreditSettings
 from lare.training.credit_draws import draw_padded_episodes, draw_parts_of_episodes, draw_whole_episodes
 from recipes import recipe, stored
 
@@ -21,6 +22,19 @@ def test_whole_episodes_are_masked_never_padded(key):
         rows = np.asarray(drawn.steps)[np.asarray(drawn.episode) == place]
         np.testing.assert_array_equal(rows, int(drawn.episodes.first[place]) + np.arange(lengths[place]))
     assert set(np.asarray(drawn.episode)) <= {*np.flatnonzero(counts), chosen.credit.steps}
+
+
+def test_as_many_whole_episodes_as_the_steps_are_on_average():
+    """Mean length 8.2: 60 steps are 7 episodes, and the rows hold no more than 60."""
+    chosen = recipe("rd", credit=CreditSettings(hidden=(8,), drawn_steps=4, steps=60))
+    held, found = stored(chosen).replay, []
+    for key in range(8):
+        drawn = draw_whole_episodes(held, jax.random.key(key), chosen)
+        lengths, counts = np.asarray(drawn.episodes.length), np.asarray(drawn.episodes.counts)
+        fits = np.cumsum(lengths)[:7] <= 60
+        np.testing.assert_array_equal(counts, [*fits, *[0] * (60 - 7)])
+        found.append(counts.sum())
+    assert max(found) == 7
 
 
 def test_parts_of_episodes_stay_inside_them():

@@ -101,15 +101,47 @@ def test_a_policy_that_is_nan_is_not_blamed_on_the_environment():
 
 
 def test_evaluations_start_alike_and_pay_the_true_return():
-    def one(seeds=(0, 1)):
-        return evaluate([[make_episodic(toy_spec()) for _ in range(3)] for _ in seeds], lambda o: o[..., :1] / 2, seeds)
+    def one(seeds=(0, 1), first=0, share=0.0):
+        made = [[make_episodic(toy_spec()) for _ in range(3)] for _ in seeds]
+        return evaluate(made, lambda o: share * o[..., :1], seeds, first=first).returns
 
-    first, second = one(), one()
-    assert first.returns.shape == (2, 3)
-    np.testing.assert_array_equal(first.returns, second.returns)
-    np.testing.assert_allclose(first.returns, 0, atol=1e-4)
-    shifted = one((1, 2))
-    assert shifted.returns.shape == (2, 3)
+    returns = one()
+    assert len(set(returns.ravel())) == 6
+    np.testing.assert_array_equal(one(), returns)
+    np.testing.assert_array_equal(one((1, 2))[0], returns[1])
+    np.testing.assert_array_equal(one(first=1)[:, :2], returns[:, 1:])
+    np.testing.assert_allclose(one(share=0.5), 0, atol=1e-4)  # the best policy of the toy
+    environment = make_episodic(toy_spec())
+    for (seed, place), paid in np.ndenumerate(returns):
+        observation, _ = environment.reset(seed=episode_seed(seed, Stream.EVALUATION_EPISODES, place))
+        total = 0.0
+        for _ in range(20):
+            total -= observation[0] ** 2
+            observation, *_ = environment.step(np.zeros(1, np.float32))
+        assert paid == pytest.approx(total, rel=1e-4)
+
+
+def test_what_terminates_is_told_from_what_runs_out_of_time():
+    class Short(gymnasium.Wrapper):
+        def step(self, action):
+            observation, reward, _, truncated, info = self.env.step(action)
+            self.steps += 1
+            return observation, reward, self.steps == 7, truncated, info
+
+        def reset(self, **options):
+            self.steps = 0
+            return self.env.reset(**options)
+
+    lanes = [
+        Lane(0, EpisodicReward(Short(gymnasium.make("toys/Chase-v0", max_episode_steps=length)))) for length in (5, 9)
+    ]
+    for one in lanes:
+        one.begin()
+    steps = collect(lanes, follow, np.zeros((20, 2, 1), np.float32)).steps
+    assert not steps.terminated[0].any()
+    np.testing.assert_array_equal(np.flatnonzero(steps.ended[0]), [4, 9, 14, 19])
+    np.testing.assert_array_equal(np.flatnonzero(steps.terminated[1]), [6, 13])
+    np.testing.assert_array_equal(steps.ended[1], steps.terminated[1])
 
 
 def test_evaluation_of_episodes_of_different_lengths():

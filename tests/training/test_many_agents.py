@@ -46,6 +46,28 @@ def test_every_method_trains(method, small_many, tmp_path):
     assert bool(run.functions) == (row.encoder is Encoder.LATENT)
 
 
+def test_decoders_are_fitted_before_the_first_update_and_then_every_so_often(small_many, tmp_path):
+    """And annealing goes by what is left."""
+    settings = small_many(
+        method="rd", seeds=1, agents={"episodes": 2, "fit_every": 2, "fit_updates": 1, "credit": {"hidden": (8,)}}
+    )
+    session = many_agents.start(lare.train(OF_CHOICE, settings, out=tmp_path / "run", listeners=[]))
+    functions, fits, left = session.functions, [], []
+
+    def fit(*given):
+        fits.append(session.step)
+        return functions.fit(*given)
+
+    def improve(*given):
+        left.append(given[-1])
+        return functions.improve(*given)
+
+    session.functions = functions._replace(fit=fit, improve=improve)
+    for _ in range(4):
+        session.advance()
+    assert (fits, left) == ([0, 100], [1.0, 0.75, 0.5, 0.25])
+
+
 @pytest.mark.parametrize("task", NAMES)
 def test_every_task_trains_with_its_recorded_functions(task, small_many, tmp_path):
     run = lare.train(task, small_many(seeds=2), out=tmp_path / "run", listeners=[])

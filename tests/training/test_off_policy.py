@@ -34,6 +34,28 @@ def test_relabelling_is_by_the_newest_decoder():
     assert losses[0] != pytest.approx(losses[1], rel=1e-2)
 
 
+def test_nothing_is_expected_after_a_termination(monkeypatch):
+    chosen, given, batches = recipe("dense", turn=3), steps_of(0), []
+    given.terminated[given.ended] = [True, False, True, True, False]
+    learner = common.store(common.init(jax.random.key(0), chosen), given, chosen)
+
+    def update(algorithm, batch, key, number, settings):
+        jax.debug.callback(lambda *rows: batches.append(rows), batch.observation, batch.continues)
+        return td3_update(algorithm, batch, key, number, settings)
+
+    td3_update = td3.update
+    monkeypatch.setattr(td3, "update", update)
+    off_policy.improve(learner, jax.random.key(0), jnp.array(0), chosen)
+    jax.effects_barrier()
+    assert len(batches) == 3
+    seen = 0
+    for observation, continues in batches:
+        rows = [int(np.argmin(np.abs(given.observation - one).sum(axis=1))) for one in observation]
+        np.testing.assert_array_equal(continues, 1.0 - given.terminated[rows])
+        seen += given.terminated[rows].sum()
+    assert seen
+
+
 def test_seeds_in_lockstep_are_seeds_alone():
     chosen = recipe("lare-rrdu")
     functions = off_policy.compiled(chosen)

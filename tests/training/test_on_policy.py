@@ -38,6 +38,31 @@ def test_the_rollout_is_the_newest_steps(method):
         assert reward.std() > 0
 
 
+def test_what_terminated_is_told_from_what_ran_out_of_time():
+    """The last two episodes end: the first of them is out of time, the second terminated."""
+    chosen, given = ppo("dense"), steps_of(0)
+    given.terminated[-1] = True
+    learner = common.store(common.init(jax.random.key(0), chosen), given, chosen)
+    taken = on_policy.rollout(learner, chosen)
+    assert taken.ended[:, 0].sum() == 2
+    np.testing.assert_array_equal(taken.continues[:, 0], [1.0] * 19 + [0.0])
+    after = np.where(given.ended[:, None], given.next_observation, np.roll(given.observation, -1, axis=0))
+    np.testing.assert_allclose(taken.next_observation[:, 0], after[-20:], rtol=1e-5)
+
+
+def test_annealing_goes_by_what_is_left(monkeypatch):
+    chosen, left = ppo("dense", steps=100), []
+
+    def update(algorithm, rollout, key, share, settings):
+        left.append(float(share))
+        return algorithm, {}
+
+    monkeypatch.setattr(on_policy.ppo, "update", update)
+    for done in (0, 20, 80):
+        on_policy.improve(stored(chosen), jax.random.key(0), jnp.array(done), chosen)
+    assert left == pytest.approx([1.0, 0.8, 0.2])
+
+
 def test_observations_are_normalised_by_what_was_known_when_acting():
     chosen = ppo("dense")
     learner, given = stored(chosen), steps_of(0)

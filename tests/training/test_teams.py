@@ -78,6 +78,34 @@ def test_each_team_has_a_decoder_and_a_return_of_its_own():
         assert not jax.tree.all(jax.tree.map(jnp.array_equal, before.decoder, after.decoder))
 
 
+@pytest.mark.parametrize("method", ["rd", "stas", "lare-rd"])
+def test_what_decoders_see(method):
+    """RD and AREL what each agent met after the step, STAS what it met before it and did, LaRe the factors."""
+    chosen = recipe(method)
+    _, played = played_by(chosen)
+    z = factors_for(chosen, played)
+    want = {
+        "rd": played.next_observation,
+        "stas": np.concatenate([played.observation, played.action], axis=-1),
+        "lare-rd": z,
+    }[method]
+    np.testing.assert_array_equal(teams.features(played, z, chosen), np.swapaxes(want, 0, 1))
+
+
+def test_a_closed_form_takes_the_mean_over_steps_and_agents():
+    chosen = recipe("lare-linear", "CompetitivePP-6")
+    learner, played = played_by(chosen)
+    z = factors_for(chosen, played)
+    learner = teams.store(learner, played, z, chosen)
+    for credit, team, size in zip(learner.credit, chosen.task.teams, chosen.factors, strict=True):
+        rows = np.asarray(z)[..., team.start : team.stop, :size].mean(axis=(0, 2))
+        paid = np.asarray(played.reward)[..., team.start : team.stop].mean(axis=(0, 2))
+        v = np.concatenate([rows, paid[:, None]], axis=1)
+        np.testing.assert_allclose(credit.totals.mean, v.mean(axis=0), rtol=1e-4, atol=1e-6)
+        centred = v - v.mean(axis=0)
+        np.testing.assert_allclose(credit.totals.products, centred.T @ centred, rtol=1e-3, atol=1e-5)
+
+
 def test_rewards():
     for method in ("dense", "episodic"):
         chosen = recipe(method, "CompetitivePP-6")

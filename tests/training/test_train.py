@@ -22,6 +22,7 @@ from lare.errors import LareError
 from lare.latent.function import verified
 from lare.source import source
 from lare.training import checkpoint, replay, single_agent
+from lare.training.checkpoint import saved_step
 from lare.training.environments import EnvironmentFault
 from lare.training.run import open_run
 from lare.training.settings import RolloutSettings
@@ -327,6 +328,31 @@ def test_training_that_diverges_says_so(small, tmp_path):
     settings = small(method="dense", td3={"learning_rate": 1e30, "batch_size": 8, "hidden": (8,), "warmup": 24})
     with pytest.raises(LareError, match="training diverged: the policy of seed 0 is not finite any more"):
         lare.train(toy_spec(), settings, out=tmp_path / "run", listeners=[])
+
+
+def test_what_has_diverged_is_not_saved_when_it_is_stopped(small, tmp_path, monkeypatch):
+    advance = single_agent.Session.advance
+
+    def spoilt(session):
+        advance(session)
+        if session.step == 84:
+            session.latest["critic/loss"] = np.array([1.0, np.nan])
+
+    monkeypatch.setattr(single_agent.Session, "advance", spoilt)
+    stop = At(84, lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(LareError) as error:
+        lare.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[stop])
+    assert str(error.value) == (
+        "training diverged: critic/loss of seed 1 is not finite at step 84; the last checkpoint is whole"
+    )
+    run = open_run(tmp_path / "run")
+    assert saved_step(run.checkpoint) == run.metrics()[-1]["step"] < 84
+
+
+@pytest.mark.parametrize("choice", [{"draw": 1}, {"candidates": 1}])
+def test_a_function_that_is_given_is_not_chosen_among_recorded_ones(choice, small, phi, tmp_path):
+    with pytest.raises(LareError, match="draw and candidates choose a recorded function, and a function is given"):
+        lare.train(toy_spec(), small(**choice), function=phi, out=tmp_path / "run", listeners=[])
 
 
 @pytest.mark.parametrize("error", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")])

@@ -35,6 +35,7 @@ def train(
     """
     import lare
     from lare.latent.function import CHANGED, load, per_role
+    from lare.training.train import check_given
 
     if resume is not None:
         if (task, function, out, settings) != (None, (), None, DEFAULTS):
@@ -47,10 +48,8 @@ def train(
         plan = decide(settings, spec)
         for in_vain in set_in_vain(plan, spec).values():
             raise LareError(in_vain)
-        if function and (settings.draw, settings.candidates) != (DEFAULTS.draw, DEFAULTS.candidates):
-            raise LareError(
-                "--draw and --candidates choose a recorded function, and --function gives one: leave either out"
-            )
+        if function:
+            check_given(plan)
         functions = [load(file, role) for file, role in per_role(function, spec)] if function else None
         for one in functions or ():
             if one.changed:

@@ -56,7 +56,7 @@ class Totals(NamedTuple):
     farthest: Float[Array, ""]
     """The largest |R/T|."""
     running: Float[Array, " features"]
-    """Sum of the factors since the episode began."""
+    """Mean of the factors since the episode began: of a constant it is that constant, however long the episode is."""
     steps: Float[Array, ""]
     """Steps since then."""
 
@@ -79,8 +79,9 @@ def take_in(
 
     def one(totals: Totals, step: tuple[Float[Array, " features"], Float[Array, ""], Bool[Array, ""]]):
         row, reward, last = step
-        running, steps = totals.running + row, totals.steps + 1
-        v = jnp.append(running / steps, reward)
+        steps = totals.steps + 1
+        running = totals.running + (row - totals.running) / steps
+        v = jnp.append(running, reward)
         count = totals.episodes + 1
         gap = v - totals.mean
         mean = totals.mean + gap / count

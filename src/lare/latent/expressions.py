@@ -2,6 +2,7 @@
 
 import ast
 import difflib
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -23,7 +24,7 @@ from lare.latent.language import (
     STRINGS,
     Signature,
 )
-from lare.latent.syntax import Function, dotted, exists, is_key, is_string, shown
+from lare.latent.syntax import Function, dotted, exists, is_key, is_singleton, is_string, shown
 
 LARGEST = 2**63
 """Of the integers that may stand in a program."""
@@ -310,7 +311,12 @@ class Expressions(ast.NodeVisitor):
     def visit_Compare(self, node: ast.Compare) -> None:
         if isinstance(node.ops[0], ast.In | ast.NotIn):
             self.approve(node.left)
-        self.visit_all([node.left, *node.comparators])
+        sides = [node.left, *node.comparators]
+        for operator, pair in zip(node.ops, itertools.pairwise(sides), strict=True):
+            # NumPy has one True and one False: whoever is one of them would tell a value.
+            if isinstance(operator, ast.Is | ast.IsNot) and not any(map(is_singleton, pair)):
+                self.refuse("E-CONSTRUCT", node, "is and is not stand beside None, True or False only: use ==")
+        self.visit_all(sides)
 
     def visit_IfExp(self, node: ast.IfExp) -> None:
         self.visit_all([node.test, node.body, node.orelse])

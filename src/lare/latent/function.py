@@ -58,14 +58,19 @@ class LatentFunction:
         return self.model.endswith(CHANGED)
 
     @property
+    def readable(self) -> str:
+        """The source, where the gate has passed it: no other is given to a parser in this process."""
+        return self.source if any(check.name == "gate" and check.passed for check in self.checks) else ""
+
+    @property
     def names(self) -> list[str]:
         """A name for each factor."""
-        return names_of(self.source, self.size)
+        return names_of(self.readable, self.size)
 
     @property
     def meanings(self) -> list[str]:
         """What the source's comments say of each factor; empty where they say nothing."""
-        comments = factor_meanings(self.source)
+        comments = factor_meanings(self.readable)
         return [comments.get(name, "") for name in self.names]
 
     @functools.cached_property

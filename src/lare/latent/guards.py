@@ -7,7 +7,7 @@ lead around every other guard.
 
 import builtins
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,8 @@ FUEL = 20_000
 """Turns of loops, and calls, of one call of a program; and entries of what is gone through at once."""
 
 LONGEST_SEQUENCE = 10_000
-LARGEST_BITS = 4096
+LARGEST_BITS, LARGEST_ENTRY = 4096, 64
+"""Bits of an integer, and of one in an array."""
 
 SEQUENCES = (list, tuple, str)
 INTEGERS = (int, np.integer)
@@ -33,10 +34,21 @@ def numbers(value: Any) -> Any:
     return value
 
 
+def check_entries(values: Iterable[Any]) -> None:
+    """NumPy makes arrays of objects of what no array of numbers holds, and reckons with it without end."""
+    for value in values:
+        if isinstance(value, list | tuple):
+            check_entries(value)
+        elif isinstance(value, int) and value.bit_length() > LARGEST_ENTRY:
+            raise TooLarge("an integer that no array holds")
+
+
 def only_numbers(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A NumPy function whose results are numbers."""
+    """A NumPy function of numbers, whose results are numbers."""
 
     def call(*arguments: Any, **keywords: Any) -> Any:
+        check_entries(arguments)
+        check_entries(keywords.values())
         return numbers(function(*arguments, **keywords))
 
     return call
@@ -107,6 +119,8 @@ def check_repeated(left: Any, right: Any) -> None:
     for one, times in ((left, right), (right, left)):
         if isinstance(one, SEQUENCES) and isinstance(times, INTEGERS) and len(one) * int(times) > LONGEST_SEQUENCE:
             raise TooLarge(f"a sequence of {len(one)} entries, {times} times")
+        if isinstance(one, SEQUENCES) and isinstance(times, np.integer):
+            raise TypeError(f"a {type(one).__name__} is repeated by a number of NumPy's: make it an array first")
     if isinstance(left, int) and isinstance(right, int) and left.bit_length() + right.bit_length() > LARGEST_BITS:
         raise TooLarge("a product of huge integers")
 

@@ -157,7 +157,7 @@ def careful(function: Callable[..., Any], shaping: tuple[int, ...] = (), *owners
 
     def call(*arguments: Any, **keywords: Any) -> Any:
         sizes = [argument for place, argument in enumerate(arguments) if place in shaping]
-        if shaping and touched([*sizes, *(keywords[key] for key in keywords.keys() & SIZES)]):
+        if touched([*sizes, *(keywords[key] for key in keywords.keys() & SIZES)]):
             raise Looked("the shape of an array depends on values of the batch: use np.where, which keeps every row")
         result = function(*shown(arguments), **{name: shown(value) for name, value in keywords.items()})
         if not touched([*owners, *arguments, *keywords.values()]):
@@ -175,15 +175,27 @@ TELLING = {"numpy.shape", "numpy.ndim", "numpy.size", "numpy.finfo"}
 
 SHAPING = {
     **dict.fromkeys("zeros ones full identity".split(), (0,)),
-    **dict.fromkeys("repeat tile reshape broadcast_to split pad".split(), (1,)),
+    **dict.fromkeys("tile reshape broadcast_to pad".split(), (1,)),
+    **dict.fromkeys("repeat split".split(), (1, 2)),
     "arange": (0, 1, 2),
     "linspace": (2,),
-    "eye": (0, 1),
+    "eye": (0, 1, 2),
+    **dict.fromkeys("all any amax amin argmax argmin average cumprod cumsum max mean median min nanmax".split(), (1,)),
+    **dict.fromkeys("nanmean nanmin nansum prod ptp sort std sum var".split(), (1,)),
+    **{f"{name}.reduce": (1,) for name in "add multiply maximum minimum logical_and logical_or".split()},
+    **dict.fromkeys("concatenate diff stack transpose tril triu".split(), (1,)),
+    **dict.fromkeys("expand_dims flip squeeze moveaxis swapaxes roll linalg.norm".split(), (1, 2)),
+    **dict.fromkeys("percentile quantile take take_along_axis tensordot".split(), (2,)),
 }
-"""Functions of NumPy some of whose arguments say what shape the result has, and which."""
+"""Functions of NumPy some of whose arguments say what shape the result has, or along which axis it is reckoned, and which."""
 
-SHAPING_METHODS = {"repeat": (0,), "reshape": tuple(range(8))}
-SIZES = {"shape", "num", "N", "M", "repeats", "indices_or_sections", "pad_width"}
+SHAPING_METHODS = {
+    **dict.fromkeys("all any argmax argmin cumprod cumsum max mean min prod squeeze std sum var".split(), (0,)),
+    **dict.fromkeys("reshape transpose".split(), tuple(range(8))),
+    **dict.fromkeys("repeat swapaxes".split(), (0, 1)),
+    "take": (1,),
+}
+SIZES = set("shape num N M k repeats indices_or_sections pad_width axis axes keepdims n ndmin ord shift".split())
 """Keywords that do."""
 
 

@@ -8,7 +8,7 @@ comprehensions and calls burn fuel. Lines stay where they are.
 import ast
 import copy
 
-from lare.latent.language import DTYPES, NAME
+from lare.latent.language import DTYPES, METHODS, NAME
 from lare.latent.syntax import dotted, is_docstring
 
 CALLED_TYPES = frozenset(f"numpy.{name}" for name in DTYPES)
@@ -130,7 +130,7 @@ class Rewrite(ast.NodeTransformer):
         for keyword in node.keywords:
             if keyword.arg == "out":
                 keyword.value = ast.copy_location(called("$array", keyword.value), node)
-        return node
+        return node if method not in METHODS or name is not None else ast.copy_location(called("$numbers", node), node)
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
         name = dotted(node)

@@ -101,6 +101,11 @@ def is_string(node: ast.AST, among: frozenset[str] | set[str]) -> bool:
     return isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in among
 
 
+def is_singleton(node: ast.AST) -> bool:
+    """None, True or False, written out."""
+    return isinstance(node, ast.Constant) and (node.value is None or isinstance(node.value, bool))
+
+
 def is_key(value: object) -> bool:
     return isinstance(value, str) and KEY.fullmatch(value) is not None
 

@@ -81,7 +81,7 @@ class Settings(Checked):
     capacity: Annotated[int, Field(ge=4)] = 1_000_000
     """Single agents: observations that the replay of a seed holds; an episode of T steps takes T + 1."""
     scale_rewards: bool = False
-    """Single agents: divide the rewards that the algorithm sees by the running root mean square of R/T."""
+    """TD3, DDPG, SAC: divide the rewards that the algorithm sees by the running root mean square of R/T."""
     td3: TD3Settings = TD3Settings()
     ddpg: TD3Settings = DDPG
     sac: SACSettings = SACSettings()
@@ -167,7 +167,7 @@ class Plan(Settings):
             case Kind.OFF_POLICY:
                 return (*others, "rollout", "agents")
             case Kind.ON_POLICY:
-                return (*others, "agents", "chunk", "credit.fits")
+                return (*others, "agents", "chunk", "credit.fits", "scale_rewards")
             case Kind.MANY_AGENTS:
                 of_one = ("agents.credit.episodes", "agents.credit.fits")
                 return (*others, "rollout", "credit", "chunk", "capacity", "scale_rewards", *of_one)

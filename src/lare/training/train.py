@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from lare.credit.closed_form import LARGEST_CHOICE
 from lare.credit.methods import Fit, Method, Reward, find_method
 from lare.errors import LareError
-from lare.latent.design import design
+from lare.latent.design import CANDIDATES, design
 from lare.latent.function import LatentFunction, load, per_role
 from lare.tasks.spec import TaskSpec, load_task
 from lare.training import many_agents, single_agent
@@ -74,11 +75,18 @@ def chosen_functions(task: TaskSpec, plan: Plan, given: Given | Sequence[Given] 
         asked = partial(design, kind=method.kind, draw=plan.draw, candidates=plan.candidates)
         functions = [asked(role) for role in task.roles]
     else:
+        check_given(plan)
         each = per_role([given] if isinstance(given, Given) else given, task)
         functions = [one if isinstance(one, LatentFunction) else load(one, role) for one, role in each]
     for function in functions:
         check_size(method, function.size * (2 if (plan.judges or task.judges) == "both" else 1))
     return tuple(functions)
+
+
+def check_given(plan: Plan) -> None:
+    """Raise `LareError` where a recorded function is chosen although another one is given."""
+    if (plan.draw, plan.candidates) != (0, CANDIDATES):
+        raise LareError("draw and candidates choose a recorded function, and a function is given: leave either out")
 
 
 def check_size(method: Method, factors: int) -> None:
@@ -147,12 +155,13 @@ def finish(
                     listener.stepped(session.step)
                 if session.step % settings.evaluate_every == 0 or session.step == settings.steps:
                     lines = session.report(clock.rate(session.step))
-                    check_losses(lines)
+                    check_losses(session)
                     session.metrics_length = run.append(lines)
                     session.save()
                     for listener in told:
                         listener.evaluated(lines)
                 if stop.is_set() and session.step < settings.steps:
+                    check_losses(session)
                     session.save()
                     raise Interrupted(
                         f"stopped at step {session.step} and saved; go on with: lare train --resume {run.directory}"
@@ -181,13 +190,13 @@ def introduce(session: single_agent.Session | many_agents.Session, listener: Lis
     listener.started(f"{run.config.task.name} {settings.method}", session.step, settings.steps)
 
 
-def check_losses(lines: Sequence[dict[str, Any]]) -> None:
-    """Raise `Diverged` where a loss is not finite, which metrics.jsonl writes as null."""
-    for line in lines:
-        for name, value in line.items():
-            if name.startswith(("critic/loss", "credit/loss")) and value is None:
+def check_losses(session: single_agent.Session | many_agents.Session) -> None:
+    """Raise `Diverged` where a loss is not finite: what is saved then is of no use."""
+    for name, values in session.latest.items():
+        for seed, value in zip(session.run.seeds, np.asarray(values), strict=True):
+            if name.startswith(("critic/loss", "credit/loss")) and not np.isfinite(value):
                 raise Diverged(
-                    f"training diverged: {name} of seed {line['seed']} is not finite at step {line['step']}; "
+                    f"training diverged: {name} of seed {seed} is not finite at step {session.step}; "
                     "the last checkpoint is whole"
                 )
 
