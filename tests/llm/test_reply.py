@@ -73,6 +73,8 @@ CODE = "def evaluation_func(observation, action):\n    return [action]"
         (json.dumps(GOOD | {"Functions": f"```python3\n{CODE}\n```"}), "u"),
         (json.dumps(GOOD | {"Functions": CODE}).replace("\\n", "\n"), "u"),
         (f"<think>As {json.dumps(GOOD)}?</think>\n{json.dumps(GOOD | {'Functions': CODE})}", "u"),
+        (f"```\n{GOOD['Functions']}\n```\nNo.</thinking>\n```\n{CODE}\n```", "\n"),
+        (json.dumps(GOOD | {"Understand": "</think>", "Functions": CODE}), "</think>"),
         (f"A draft: {json.dumps(GOOD)}, or better: {json.dumps(GOOD | {'Functions': CODE})}", "u"),
         (f'First {{"Functions": "draft"}}, then {json.dumps(GOOD | {"Functions": CODE})}, {{"Functions": "x"}}', "u"),
         ("{}" * 150 + json.dumps(GOOD | {"Functions": CODE}), "u"),
@@ -110,7 +112,14 @@ def test_what_is_as_asked_for_is_read_unchanged(values):
 
 @pytest.mark.parametrize(
     "text",
-    ["```" + "\t" * 190_000, "[" * 100_000, '{"self": 1}', '{"Understand": "u", "Analyze": "a", "Functions": ""}'],
+    [
+        "```" + "\t" * 190_000,
+        "<think>" * 28_000,
+        '{ "' * 60_000,
+        "[" * 100_000,
+        '{"self": 1}',
+        '{"Understand": "u", "Analyze": "a", "Functions": ""}',
+    ],
 )
 def test_what_once_broke_the_parser(text):
     with pytest.raises(MalformedReply):

@@ -246,9 +246,8 @@ def design(
     if reflect < 0:
         raise LareError(f"reflect = {reflect}: there can be no fewer rounds than none")
     model = model or recorded_model(task.name, kind, draw)
-    random_steps(
-        task
-    )  # what cannot be played is found out before a model is paid, and once, before threads want the steps
+    # What cannot be played is found out before a model is paid; and it is played once, before threads want the steps.
+    random_steps(task)
     recorder = Recorder(task.name, kind, getattr(model, "temperature", None), record)
     conversation = Conversation(task, kind, model, recorder, said)
     try:

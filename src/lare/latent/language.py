@@ -188,7 +188,7 @@ TYPING = frozenset("Any Dict Iterable List NamedTuple Optional Sequence Tuple Un
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_ -]{0,63}")
 """A string that may be a key of a dictionary. Not a format."""
 
-AXES = r"[a-zA-Z]{0,8}(\.\.\.)?[a-zA-Z]{0,8}"
+AXES = r"[a-zA-Z]{0,8}(\.\.\.[a-zA-Z]{0,8})?"
 EINSUM = re.compile(rf"{AXES}(,{AXES}){{0,7}}(->{AXES})?")
 
 STRINGS = {

@@ -33,8 +33,8 @@ class Reply(Checked):
 FENCE = re.compile(r"```[ \t]*+([\w.+-]*+)[ \t]*+\r?\n(.*?)```", re.DOTALL)
 """A fenced block, with its language."""
 
-THOUGHT = re.compile(r"<think(?:ing)?>.*?</think(?:ing)?>", re.DOTALL)
-"""What some models say to themselves, drafts and all, before they answer."""
+THOUGHT = re.compile(r"</think(?:ing)?>")
+"""What ends that which some models say to themselves, drafts and all, before they answer."""
 
 START = re.compile(r'\{\s*"')
 """Where an object may begin."""
@@ -53,7 +53,6 @@ def parse(text: str) -> Reply:
     if len(text) > LONGEST:
         raise MalformedReply(f"the reply has {len(text)} characters; at most {LONGEST} are read")
     check_characters(text)
-    text = THOUGHT.sub("", text) or text
     try:
         values = json.loads(text, strict=False)  # lines may end within a string
     except (ValueError, RecursionError) as error:
@@ -86,6 +85,7 @@ def check_characters(text: str) -> None:
 def embedded(text: str) -> dict[str, Any] | None:
     """The last whole object that stands somewhere in a text, or the function that stands in a fence."""
     decoder, partial = json.JSONDecoder(strict=False), None
+    text = THOUGHT.split(text)[-1]
     for start in [match.start() for match in START.finditer(text)][: -MOST_STARTS - 1 : -1]:
         try:
             value, _ = decoder.raw_decode(text, start)

@@ -20,9 +20,7 @@ class Guarded(gymnasium.Wrapper, RecordConstructorArgs):
     """An environment is foreign code: whatever its `reset` and `step` raise is a `LareError` of one line."""
 
     def __init__(self, env: gymnasium.Env, name: str):
-        RecordConstructorArgs.__init__(
-            self, name=name
-        )  # without which Gymnasium could not make the same environment again
+        RecordConstructorArgs.__init__(self, name=name)  # so that Gymnasium can make the same environment again
         super().__init__(env)
         self.name = name
 
