@@ -68,8 +68,9 @@ def parse(text: str) -> Reply:
     for part in (reply.understand, reply.analyze, reply.functions):
         check_characters(part)
     inner = FENCE.search(reply.functions)
-    fenced = inner is not None and "def " not in reply.functions[: inner.start()]
-    return reply.model_copy(update={"functions": inner[2]}) if fenced else reply
+    if inner is None or "def " in reply.functions[: inner.start()]:
+        return reply
+    return reply.model_copy(update={"functions": inner[2]})
 
 
 def check_characters(text: str) -> None:
