@@ -18,6 +18,7 @@ MODULES = {
 
 MUST_NOT_KNOW = {
     "errors": "tasks llm latent credit networks algorithms training experiments cli",
+    "files": "tasks llm latent credit networks algorithms training experiments cli",
     "source": "tasks llm latent credit networks algorithms training experiments cli",
     "networks": "tasks llm latent credit algorithms training experiments cli",
     "normalise": "tasks llm latent credit networks algorithms training experiments cli",

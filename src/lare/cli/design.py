@@ -3,18 +3,17 @@
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import tyro
 
 from lare.cli.terminal import Kind, Task, free_name, progress, say
 from lare.errors import LareError
+from lare.latent.design import DesignFailed
+from lare.latent.design import design as design_function
 from lare.latent.function import LatentFunction
 from lare.tasks.spec import TaskSpec
-
-if TYPE_CHECKING:
-    from lare.latent.design import DesignFailed
 
 BUDGET, REQUESTS = 400_000, 60
 """Tokens and requests of one design, at most."""
@@ -61,8 +60,6 @@ def design(
         record: a file that takes every exchange, for --model FILE; it must not exist, and not be the .json of --out.
         out: a .py file to write, with the replies and checks in a .json beside it; it must not exist.
     """
-    from lare.latent.design import DesignFailed
-    from lare.latent.design import design as design_function
     from lare.llm.budget import Budget
     from lare.llm.live import LiveModel
     from lare.llm.model import RECORDED, recorded_model
@@ -104,14 +101,13 @@ def design(
         save_function(function, out)
 
 
-def keep_attempts(failed: "DesignFailed", instead: Path) -> None:
+def keep_attempts(failed: DesignFailed, instead: Path) -> None:
     """Keep what was said, in its own file or `instead`; where no file can be written, print it: it was paid for."""
     recorder, model = failed.recorder, failed.model
-    for path in (recorder.path, instead):
+    own = [recorder.path] if recorder.path and recorder.begun else []
+    for path in (*own, instead):
         try:
-            if path is None or (path == recorder.path and not recorder.begun):
-                continue
-            recorder.write(path, model, new=path != recorder.path)
+            recorder.write(path, model, new=path not in own)
         except LareError as error:
             progress(f"lare: {error}")
         else:

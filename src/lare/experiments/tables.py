@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from lare.training.checkpoint import write_atomically
+from lare.files import write_atomically
 from lare.training.run import CONFIG, read_config, read_metrics
 
 KEYS = ("task", "run", "method", "algorithm", "judges", "draw", "seed", "step")

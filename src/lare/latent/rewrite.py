@@ -130,7 +130,9 @@ class Rewrite(ast.NodeTransformer):
         for keyword in node.keywords:
             if keyword.arg == "out":
                 keyword.value = ast.copy_location(called("$array", keyword.value), node)
-        return node if method not in METHODS or name is not None else ast.copy_location(called("$numbers", node), node)
+        if name is None and method in METHODS:
+            return ast.copy_location(called("$numbers", node), node)
+        return node
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
         name = dotted(node)

@@ -192,8 +192,9 @@ class LiveModel:
         """The text of a chat completion. An answer that is none is tried again: something is wrong on the way."""
         try:
             answer = json.loads(body)
-            choice = answer["choices"][0]["message"]
-            text = choice.get("content") or choice.get("refusal") or ""
+            choice = answer["choices"][0]
+            message = choice["message"]
+            text = message.get("content") or message.get("refusal") or ""
             if not isinstance(text, str):
                 raise TypeError("the content is not a text")
             text = text.encode(errors="replace").decode()  # half a character is none
@@ -203,7 +204,7 @@ class LiveModel:
                 self.scrubbed(f"the answer is not a chat completion ({type(error).__name__}: {error})"), again=True
             )
         self.budget.count(answer.get("usage"), messages, text)
-        if answer["choices"][0].get("finish_reason") == "length":
+        if choice.get("finish_reason") == "length":
             self.said(f"{self.name}: a reply was cut off at the {allowed:,} tokens that it was allowed")
         return text
 

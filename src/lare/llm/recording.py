@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from lare.errors import Checked, LareError
+from lare.files import replace
 from lare.llm.prompts import Kind, Message, Stage
 
 SHIPPED = files("lare.llm") / "recordings"
@@ -132,16 +133,14 @@ class Recorder:
 
     def write(self, path: Path, model: str, new: bool = True) -> None:
         """Raises `LareError` where the file cannot be written, or is there and should be `new`."""
-        draft = path.with_name(f"{path.name}.part")
         try:
             if new:
                 path.touch(exist_ok=False)
             try:
-                draft.write_text(self.text(model), encoding="utf-8")
-                draft.replace(path)
+                replace(path, lambda file: file.write(self.text(model).encode()))
             except OSError:
-                for unfinished in (draft, *([path] if new else [])):
-                    unfinished.unlink(missing_ok=True)
+                if new:
+                    path.unlink(missing_ok=True)
                 raise
         except FileExistsError:
             raise LareError(f"{path} exists, and is not overwritten; choose another --record") from None

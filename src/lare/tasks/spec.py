@@ -1,6 +1,7 @@
 """A task: an environment and the texts that describe it, read from TOML and checked against the environment."""
 
 import contextlib
+import functools
 import hashlib
 import tomllib
 from importlib.resources import files
@@ -145,14 +146,15 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
         values = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # TOMLDecodeError is one; a number without end is another
         raise LareError(f"task {task!r} is not valid TOML: {error}") from error
-    for key, kind in (("like", str), ("teams", list)):
-        named = values.get(key, kind())
-        others = [named] if kind is str and key in values else named
-        if not isinstance(named, kind) or not all(
-            isinstance(other, str) and beside(task, other) not in (*seen, task) for other in others
-        ):
-            what = "another task" if kind is str else "a list of other tasks"
-            raise LareError(f"task {task!r}: {key} = {named!r} must be {what}, without a circle")
+    like, teams = values.get("like"), values.get("teams")
+
+    def other(name: Any) -> bool:
+        return isinstance(name, str) and beside(task, name) not in (*seen, task)
+
+    if not (like is None or other(like)):
+        raise LareError(f"task {task!r}: like = {like!r} must be another task, without a circle")
+    if not (teams is None or (isinstance(teams, list) and all(map(other, teams)))):
+        raise LareError(f"task {task!r}: teams = {teams!r} must be a list of other tasks, without a circle")
     if "teams" in values:
         values["teams"] = [read_values(beside(task, team), (*seen, task)) for team in values["teams"]]
     parent = values.pop("like", None)
@@ -226,13 +228,17 @@ def is_discrete(spec: TaskSpec) -> bool:
 
 def time_limit(spec: TaskSpec) -> int:
     """The most steps that an episode can have. Raises `LareError` where neither spec nor environment sets a limit."""
-    if spec.max_episode_steps:
-        return spec.max_episode_steps
-    with contextlib.closing(make(spec.environment)) as environment:
-        limit = environment.spec and environment.spec.max_episode_steps
+    limit = spec.max_episode_steps or limit_of(spec.environment)
     if limit is None:
         raise LareError(
             f"task {spec.name!r}: {spec.environment} has no time limit, so an episode may never pay; "
             "set max_episode_steps in the spec"
         )
     return limit
+
+
+@functools.cache
+def limit_of(environment: str) -> int | None:
+    """The time limit that an environment has of itself. Made once: a run asks more than once."""
+    with contextlib.closing(make(environment)) as made:
+        return made.spec and made.spec.max_episode_steps

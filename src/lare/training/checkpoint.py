@@ -10,10 +10,9 @@ A row file is only ever added; `state.npz` is written beside the old one and ren
 
 import contextlib
 import json
-import os
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -22,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lare.errors import LareError
+from lare.files import write_atomically
 
 STATE = "state.npz"
 
@@ -43,20 +43,6 @@ class Learner(Protocol):
 
 
 Some = TypeVar("Some", bound=Learner)
-
-
-def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
-    """Let `write` fill a new file, and put it in the place of `path` only when it is safe on the disk."""
-    new = path.with_name(path.name + ".new")
-    try:
-        with new.open("wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(path)
-    except OSError as error:
-        new.unlink(missing_ok=True)
-        raise LareError(f"{path} cannot be written ({error.strerror or error}); what was there is as it was") from error
 
 
 @contextlib.contextmanager

@@ -25,11 +25,12 @@ from jaxtyping import Float
 
 from lare.algorithms.table import ALGORITHMS, Kind
 from lare.errors import Checked, LareError
+from lare.files import write_atomically
 from lare.latent.evaluator import LatentRewardError
 from lare.latent.function import LatentFunction, load, per_role
 from lare.source import source
 from lare.tasks.spec import Judges, TaskSpec, is_discrete, time_limit
-from lare.training.checkpoint import STATE, write_atomically
+from lare.training.checkpoint import STATE
 from lare.training.settings import Plan
 
 CONFIG, METRICS, FUNCTION, CHECKPOINT = "config.json", "metrics.jsonl", "latent_function.py", "checkpoint"

@@ -192,9 +192,10 @@ def introduce(session: single_agent.Session | many_agents.Session, listener: Lis
 
 def check_losses(session: single_agent.Session | many_agents.Session) -> None:
     """Raise `Diverged` where a loss is not finite: what is saved then is of no use."""
-    for name, values in session.latest.items():
-        for seed, value in zip(session.run.seeds, np.asarray(values), strict=True):
-            if name.startswith(("critic/loss", "credit/loss")) and not np.isfinite(value):
+    losses = (name for name in session.latest if name.startswith(("critic/loss", "credit/loss")))
+    for name in losses:
+        for seed, value in zip(session.run.seeds, np.asarray(session.latest[name]), strict=True):
+            if not np.isfinite(value):
                 raise Diverged(
                     f"training diverged: {name} of seed {seed} is not finite at step {session.step}; "
                     "the last checkpoint is whole"

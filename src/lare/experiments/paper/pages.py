@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lare.errors import LareError
-from lare.training.checkpoint import write_atomically
+from lare.files import write_atomically
 
 REMARKS = "\n## Remarks\n"
 """The heading of what a person adds."""
