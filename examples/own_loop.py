@@ -16,7 +16,7 @@ import numpy as np
 
 import lare
 from lare.credit import decomposition
-from lare.credit.decomposition import CreditSettings, Episodes
+from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import Fit, find_method
 from lare.tasks.episodic import TRUE_REWARD
 
@@ -38,24 +38,6 @@ def play(environment: gymnasium.Env, phi: lare.LatentFunction) -> tuple[np.ndarr
     return phi.of_steps(before, action, after, TASK.judges), paid, true
 
 
-def together(episodes: list[tuple[np.ndarray, float]]) -> Episodes:
-    """Whole episodes, one behind the other, as the decoder is fitted to them.
-
-    Always as many rows, so that nothing is compiled twice: those behind the last step are of an episode that there is not.
-    """
-    length = np.array([len(z) for z, _ in episodes])
-    returned = np.array([paid for _, paid in episodes], np.float32)
-    padding = BATCH * LONGEST - length.sum()
-    number = np.repeat(np.arange(len(episodes)), length)
-    return Episodes(
-        features=jnp.asarray(np.pad(np.concatenate([z for z, _ in episodes]), ((0, padding), (0, 0)))),
-        episode=jnp.asarray(np.pad(number, (0, padding), constant_values=len(episodes))),
-        length=jnp.asarray(length),
-        mean_reward=jnp.asarray(returned / length),
-        counts=jnp.ones(len(episodes)),
-    )
-
-
 def main(episodes: int = 40, updates: int = 50) -> float:
     """Play, and fit after every episode; the correlation of r_hat with the true rewards of one more."""
     environment = lare.EpisodicReward(gymnasium.make(TASK.environment))  # pays at the end of an episode
@@ -74,8 +56,8 @@ def main(episodes: int = 40, updates: int = 50) -> float:
         credit = decomposition.observe_steps(credit, jnp.asarray(z))
         credit = decomposition.observe_returns(credit, jnp.array([paid / len(z)]), jnp.array([True]))
         for key in jax.random.split(jax.random.key(number), updates):
-            drawn = [stored[one] for one in draw.integers(len(stored), size=BATCH)]
-            credit, _ = fit(credit, together(drawn), key)
+            features, returns = zip(*(stored[one] for one in draw.integers(len(stored), size=BATCH)), strict=True)
+            credit, _ = fit(credit, decomposition.whole_episodes(features, returns, BATCH * LONGEST), key)
         r_hat = reward(credit, jnp.asarray(z))
         # Here your algorithm trains. An on-policy one takes this r_hat for its newest episode; one with a replay buffer keeps z,
         # not r_hat, and asks again for whatever it draws: by the newest decoder, for what the decoder said before is stale.

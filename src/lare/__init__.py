@@ -12,6 +12,8 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from lare.errors import LareError as LareError
+    from lare.experiments.evaluation import evaluate_run as evaluate_run
+    from lare.experiments.evaluation import policy_of as policy_of
     from lare.experiments.report import write_report as write_report
     from lare.latent.design import design as design
     from lare.latent.function import LatentFunction as LatentFunction
@@ -19,12 +21,16 @@ if TYPE_CHECKING:
     from lare.tasks.episodic import EpisodicReward as EpisodicReward
     from lare.tasks.spec import TaskSpec as TaskSpec
     from lare.tasks.spec import load_task as load_task
+    from lare.training.run import Run as Run
+    from lare.training.run import open_run as open_run
     from lare.training.settings import Settings as Settings
     from lare.training.train import resume as resume
     from lare.training.train import train as train
 
 HOMES = {
     "LareError": "lare.errors",
+    "evaluate_run": "lare.experiments.evaluation",
+    "policy_of": "lare.experiments.evaluation",
     "write_report": "lare.experiments.report",
     "design": "lare.latent.design",
     "LatentFunction": "lare.latent.function",
@@ -32,6 +38,8 @@ HOMES = {
     "EpisodicReward": "lare.tasks.episodic",
     "TaskSpec": "lare.tasks.spec",
     "load_task": "lare.tasks.spec",
+    "Run": "lare.training.run",
+    "open_run": "lare.training.run",
     "Settings": "lare.training.settings",
     "resume": "lare.training.train",
     "train": "lare.training.train",

@@ -34,7 +34,7 @@ class Checked(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def with_the_defaults_of_their_places(cls, values: Any) -> Any:
-        """A table within a table changes the default of its place, which need not be that of its class."""
+        """What settings within settings leave open has the default of its place, which need not be that of its class."""
         if not isinstance(values, Mapping):
             return values
         defaults = {name: cls.model_fields[name].default for name in values if name in cls.model_fields}
@@ -48,7 +48,9 @@ class Checked(BaseModel):
 
 
 def completed(default: Any, given: Any) -> Any:
-    """What was given and, where that is a table for settings, whatever of the default it leaves open."""
+    """What was given and, where that is settings or a table for them, whatever of the default it leaves open."""
+    if isinstance(default, Checked) and isinstance(given, type(default)):
+        given = {name: getattr(given, name) for name in given.model_fields_set}
     if not (isinstance(default, Checked) and isinstance(given, Mapping)):
         return given
     usual = {name: getattr(default, name) for name in type(default).model_fields}

@@ -60,7 +60,7 @@ def test_values_are_in_units_of_the_reward_and_targets_in_deviations_of_the_retu
     said = np.asarray(state.online.critic(rollout.observation))[..., 0]
     value = np.asarray(ppo.values(state, rollout.observation))
     np.testing.assert_allclose(value, 7 + 4 * said, rtol=1e-5)
-    batch, returns = ppo.prepare(state, rollout, SETTINGS)
+    batch, returns, explained = ppo.prepare(state, rollout, SETTINGS)
     advantage = ppo.advantages(rollout, jnp.asarray(value), ppo.values(state, rollout.next_observation), SETTINGS)
     want = np.asarray(advantage) + value
     np.testing.assert_allclose(
@@ -68,6 +68,7 @@ def test_values_are_in_units_of_the_reward_and_targets_in_deviations_of_the_retu
     )
     assert float(returns.mean[0]) == pytest.approx((3 + 11 + want.sum()) / 26, rel=1e-4)
     np.testing.assert_allclose(batch.value, said.ravel(), rtol=1e-5)
+    assert float(explained) == pytest.approx(1 - np.var(want - value) / np.var(want), rel=1e-3)
     centred = np.asarray(advantage - advantage.mean()) / np.asarray(advantage).std()
     np.testing.assert_allclose(batch.advantage, centred.ravel(), rtol=1e-4, atol=1e-5)
 
@@ -184,6 +185,23 @@ def test_an_update_against_plain_numpy():
         np.testing.assert_allclose(moved, leaf - step, rtol=1e-4, atol=1e-6)
 
 
+def test_how_far_an_update_moves_the_policy_is_measured():
+    """Schulman's estimate of the divergence, and the share of steps beyond the clip: nothing at first, then what the step did."""
+    settings = PPOSettings(hidden=(16,), minibatch_size=24, epochs=1, learning_rate=0.05)
+    state, rollout = state_of(settings=settings), rollout_of()
+    batch, left = ppo.prepare(state, rollout, settings)[0], jnp.array(1.0)
+    after, first = ppo.update(state, rollout, jax.random.key(1), left, settings)
+    assert float(first["actor/approx_kl"]) == pytest.approx(0, abs=1e-6)
+    assert float(first["actor/clip_fraction"]) == 0
+    twice = settings.model_copy(update={"epochs": 2})
+    _, both = ppo.update(state, rollout, jax.random.key(1), left, twice)
+    log = np.asarray(after.online.actor.log_probability(batch.observation, batch.action) - batch.log_probability)
+    assert float(both["actor/approx_kl"]) == pytest.approx((np.exp(log) - 1 - log).mean() / 2, rel=1e-3)
+    beyond = (np.abs(np.exp(log) - 1) > 0.2).mean()
+    assert 0 < beyond < 1
+    assert float(both["actor/clip_fraction"]) == pytest.approx(beyond / 2)
+
+
 def test_annealing_ends_at_rest():
     settings = PPOSettings(hidden=(16,), minibatch_size=8, epochs=1, anneal=True)
     state = state_of(settings=settings)
@@ -229,7 +247,7 @@ def test_values_may_move_from_what_the_critic_said():
     rows = rng.normal(size=(2, 6, 4, 3)).astype(np.float32)
     action, reward = rng.normal(size=(6, 4, 2)).astype(np.float32), 100 + rng.normal(size=(6, 4)).astype(np.float32)
     rollout = ppo.Rollout(*map(jnp.asarray, (rows[0], action, reward, rows[1], np.ones((6, 4)), np.zeros((6, 4)))))
-    batch, returns = ppo.prepare(state, rollout, settings)
+    batch, returns, _ = ppo.prepare(state, rollout, settings)
     np.testing.assert_allclose(batch.value, state.online.critic(rollout.observation.reshape(-1, 3))[:, 0], rtol=1e-5)
     assert float(returns.mean[0]) > 50
     np.testing.assert_allclose([batch.target.mean(), batch.target.std()], [0, 1], atol=1e-2)

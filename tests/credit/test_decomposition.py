@@ -8,6 +8,7 @@ import pytest
 from lare.credit import decomposition
 from lare.credit.decomposition import CreditSettings, Episodes
 from lare.credit.methods import METHODS, Fit
+from lare.errors import LareError
 
 EPISODES, LENGTH, FEATURES = 64, 10, 3
 KEY = jax.random.key(3)
@@ -120,3 +121,25 @@ def test_a_gradient_in_parts_is_that_of_the_whole(method, sum_form):
     alone, _ = decomposition.update(state, jax.tree.map(lambda leaf: leaf[0], episodes(1)), KEY, row.fit, settings)
     for whole, parts in zip(jax.tree.leaves(one.optimizer), jax.tree.leaves(alone.optimizer), strict=True):
         np.testing.assert_allclose(whole, parts, rtol=1e-4, atol=1e-6)
+
+
+def test_whole_episodes_and_padding():
+    """Mean r_hat of each episode against R/T, whatever stands behind the last step."""
+    rng = np.random.default_rng(0)
+    features = [rng.normal(size=(length, FEATURES)).astype(np.float32) for length in (3, 1, 5)]
+    returns, settings = [6.0, -2.0, 1.0], CreditSettings(hidden=(8,), normalise=False)
+    state = decomposition.init(jax.random.key(0), FEATURES, METHODS["rd"], settings, LENGTH, 1)
+    r_hat = [np.asarray(decomposition.proxy_rewards(state, jnp.asarray(one), settings)) for one in features]
+    want = np.mean([(of_one.mean() - paid / len(of_one)) ** 2 for of_one, paid in zip(r_hat, returns, strict=True)])
+    for rows in (9, 30):
+        episodes = decomposition.whole_episodes(features, returns, rows)
+        assert episodes.features.shape == (rows, FEATURES)
+        _, metrics = decomposition.update(state, episodes, KEY, Fit.ALL_STEPS, settings)
+        assert float(metrics["credit/loss"]) == pytest.approx(want, rel=1e-4)
+
+
+@pytest.mark.parametrize(("lengths", "message"), [((3, 5), "8 steps of 2 episodes"), ((3, 0), "3 steps of 2 episodes")])
+def test_episodes_that_have_no_room(lengths, message):
+    features = [np.zeros((length, FEATURES), np.float32) for length in lengths]
+    with pytest.raises(LareError, match=f"{message}: each has one or more, and all at most 7"):
+        decomposition.whole_episodes(features, [1.0, 1.0], 7)

@@ -4,9 +4,10 @@ import pytest
 import lare
 from lare.errors import LareError
 from lare.experiments import evaluation
-from lare.experiments.evaluation import check_video, evaluate_run, write_video
+from lare.experiments.evaluation import check_video, evaluate_run, load_policy, policy_of, write_video
 from lare.tasks.episodic import EpisodicReward
-from lare.training.environments import make_episodic
+from lare.tasks.spec import read_task
+from lare.training.environments import evaluate, make_episodic, to_bounds
 from toys import toy_spec
 
 
@@ -51,3 +52,30 @@ def test_no_episodes(small, tmp_path):
     run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
     with pytest.raises(LareError, match="episodes = 0: at least one is needed"):
         evaluate_run(run, 0)
+
+
+def test_its_starts_are_those_of_no_evaluation_of_the_run(small, tmp_path):
+    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    environments, policy = [[make_episodic(toy_spec()) for _ in range(4)] for _ in run.seeds], load_policy(run)
+    returns = evaluate(environments, policy, run.seeds).returns
+    np.testing.assert_allclose(
+        returns[:, :2].mean(axis=1), [line["evaluation/return"] for line in run.metrics()[-2:]], rtol=1e-5
+    )
+    np.testing.assert_allclose(evaluate_run(run, 2)["Chase"], returns[:, 2:], rtol=1e-5)
+
+
+def test_the_policy_of_each_seed(small, tmp_path):
+    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    observation = np.ones(toy_spec().observation_size, np.float32)
+    together, space = load_policy(run)(np.stack([observation, observation])), make_episodic(toy_spec()).action_space
+    for place, seed in enumerate(run.seeds):
+        np.testing.assert_allclose(policy_of(run, seed)(observation), to_bounds(together[place], space), rtol=1e-5)
+    np.testing.assert_array_equal(policy_of(run)(observation), policy_of(run, 0)(observation))
+    with pytest.raises(LareError, match=r"run has no seed 7: there are 0, 1$"):
+        policy_of(run, 7)
+
+
+def test_many_agents_have_no_single_policy(small_many, tmp_path):
+    run = lare.train(read_task("TriangleArea"), small_many(method="dense", seeds=1, steps=100), out=tmp_path / "run")
+    with pytest.raises(LareError, match="run is a run of TriangleArea: many agents have no single policy"):
+        policy_of(run)

@@ -7,6 +7,7 @@ import pytest
 
 from lare.experiments import figures
 from lare.experiments.figures import window
+from lare.experiments.statistics import Band
 
 
 @pytest.mark.parametrize(
@@ -19,7 +20,7 @@ def test_as_many_steps_as_can_be_told_apart(steps, first, end):
 def test_a_long_legend_makes_the_picture_higher_not_its_curves_smaller():
     def size(labels):
         x = np.arange(3.0)
-        drawn = figures.bands(dict.fromkeys(labels, (x, x, x, x)), "x", "y")
+        drawn = figures.bands(dict.fromkeys(labels, Band(x, x, x, x)), "x", "y")
         return [float(found) for found in re.search(r'viewBox="0 0 (\S+) (\S+)"', drawn).groups()]
 
     short, long = (

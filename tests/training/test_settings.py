@@ -2,6 +2,7 @@
 
 import pytest
 
+from lare.algorithms.ppo import PPOSettings
 from lare.algorithms.table import IPPO
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import TABLE
@@ -37,19 +38,23 @@ NESTED = [(Settings, name) for name in ("td3", "ddpg", "sac", "ppo", "ippo", "ro
 
 
 @pytest.mark.parametrize(("model", "name"), [*NESTED, (AgentSettings, "credit")])
-def test_a_table_changes_the_default_of_its_place(model, name):
+def test_what_is_left_open_has_the_default_of_its_place(model, name):
     """Which need not be the default of its class: DDPG is TD3 of other figures, IPPO is PPO."""
     usual = getattr(model(), name)
-    for field, value in usual.model_dump().items():
-        if field not in ("anneal", "hidden"):
-            assert getattr(model(**{name: {field: value}}), name) == usual
-    assert getattr(model(**{name: {}}), name) == usual
+    for field, value in usual:
+        assert getattr(model(**{name: {field: value}}), name) == usual
+        assert getattr(model(**{name: type(usual)(**{field: value})}), name) == usual
+    assert getattr(model(**{name: {}}), name) == getattr(model(**{name: type(usual)()}), name) == usual
 
 
 def test_tables_within_tables():
     found = Settings(agents={"credit": {"steps": 800}}, ippo={"gae_lambda": 1.0}, method="dense")
     assert found.agents.credit == AgentSettings().credit.model_copy(update={"steps": 800})
     assert found.ippo == IPPO.model_copy(update={"gae_lambda": 1.0})
+    same = Settings(
+        agents=AgentSettings(credit=CreditSettings(steps=800)), ippo=PPOSettings(gae_lambda=1.0), method="dense"
+    )
+    assert same == found
     with pytest.raises(LareError, match="there is no key 'step'"):
         Settings(agents={"credit": {"step": 800}})
 
@@ -67,8 +72,18 @@ def test_tables_within_tables():
         ("Reacher-v4", {"method": "vib-rd", "credit": {"bottleneck": 3}}, []),
         (
             "Reacher-v4",
-            {"method": "diaster", "algorithm": "ppo", "credit": {"fits": 3, "episodes": 4}},
-            ["credit.fits"],
+            {
+                "method": "diaster",
+                "algorithm": "ppo",
+                "credit": {"fits": 3, "episodes": 4},
+                "rollout": {"fit_updates": 9},
+            },
+            ["rollout.fit_updates"],
+        ),
+        (
+            "Reacher-v4",
+            {"method": "rd", "algorithm": "ppo", "credit": {"fits": 3}, "chunk": 5},
+            ["chunk", "credit.fits"],
         ),
         ("Reacher-v4", {"method": "ircr", "algorithm": "ppo", "rollout": {"fit_updates": 3}}, ["rollout.fit_updates"]),
     ],
@@ -113,3 +128,12 @@ def test_what_does_not_go_together_is_refused(task, settings, message):
     with pytest.raises(LareError) as error:
         decide(Settings(**settings), read_task(task))
     assert str(error.value) == message
+
+
+def test_how_often_ppo_fits_its_decoder():
+    """Once for each chunk of steps where a fit is as dear as diaster's."""
+    usual = {"algorithm": "ppo", "chunk": 50, "rollout": {"steps": 2000, "fit_updates": 500}}
+    reacher = read_task("Reacher-v4")
+    assert decide(Settings(method="rd", **usual), reacher).fit_updates == 500
+    assert decide(Settings(method="diaster", credit={"fits": 3}, **usual), reacher).fit_updates == 120
+    assert decide(Settings(method="diaster", **(usual | {"chunk": 5000})), reacher).fit_updates == 1

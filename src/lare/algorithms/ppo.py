@@ -209,17 +209,24 @@ def update(
 
     `left` is the share of the run that is still to come, for annealing.
     """
-    batch, returns = prepare(state, rollout, settings)
+    batch, returns, explained = prepare(state, rollout, settings)
     share = left if settings.anneal else 1.0
     rate, clip = settings.learning_rate * share, settings.clip * share
 
     def loss_of(online: Networks, rows: Minibatch) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-        ratio = jnp.exp(online.actor.log_probability(rows.observation, rows.action) - rows.log_probability)
+        log_ratio = online.actor.log_probability(rows.observation, rows.action) - rows.log_probability
+        ratio = jnp.exp(log_ratio)
         gain = policy_objective(ratio, rows.advantage, clip)
         loss = value_loss(online.critic(rows.observation)[:, 0], rows.value, rows.target, settings)
         entropy = jnp.mean(online.actor.entropy(rows.observation))
         total = -gain + settings.value_coef * loss - settings.entropy_coef * entropy
-        return total, {"actor/objective": gain, "critic/loss": loss, "actor/entropy": entropy}
+        return total, {
+            "actor/objective": gain,
+            "actor/entropy": entropy,
+            "actor/approx_kl": jnp.mean(ratio - 1 - log_ratio),
+            "actor/clip_fraction": jnp.mean(jnp.abs(ratio - 1) > clip),
+            "critic/loss": loss,
+        }
 
     def one(carry: tuple[Networks, optax.OptState], rows: Int[Array, " batch"]):
         online, optimizer = carry
@@ -231,13 +238,17 @@ def update(
 
     order = minibatches(key, len(batch.target), settings)
     (online, optimizer), measured = jax.lax.scan(one, (state.online, state.optimizer), order)
-    return PPO(online, optimizer, returns), jax.tree.map(jnp.mean, measured)
+    measured = jax.tree.map(jnp.mean, measured) | {"critic/explained_variance": explained}
+    return PPO(online, optimizer, returns), measured
 
 
-def prepare(state: PPO, rollout: Rollout, settings: PPOSettings) -> tuple[Minibatch, Moments]:
-    """All steps of all agents as one batch, and the statistics of their returns taken in."""
+def prepare(state: PPO, rollout: Rollout, settings: PPOSettings) -> tuple[Minibatch, Moments, Float[Array, ""]]:
+    """All steps of all agents as one batch; the statistics of their returns, these taken in; the share of the returns' variance
+    that the critic knew.
+    """
     value, next_value = values(state, rollout.observation), values(state, rollout.next_observation)
     advantage = advantages(rollout, value, next_value, settings)
+    explained = 1 - jnp.var(advantage) / jnp.var(advantage + value)
     target = (advantage + value).reshape(-1)
     returns = observe(state.returns, target[:, None])
     centred = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
@@ -245,7 +256,7 @@ def prepare(state: PPO, rollout: Rollout, settings: PPOSettings) -> tuple[Miniba
     log_probability = state.online.actor.log_probability(observation, action)
     said = state.online.critic(observation)[:, 0]
     target = (target - returns.mean) / unit(returns)
-    return Minibatch(observation, action, log_probability, centred.reshape(-1), said, target), returns
+    return Minibatch(observation, action, log_probability, centred.reshape(-1), said, target), returns, explained
 
 
 def minibatches(key: PRNGKeyArray, steps: int, settings: PPOSettings) -> Int[Array, "updates batch"]:

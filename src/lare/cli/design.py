@@ -142,8 +142,12 @@ def acting(run: Path | None, spec: TaskSpec) -> Callable[[np.ndarray], np.ndarra
     if run is None:
         return None
     from lare.experiments.evaluation import policy_of
+    from lare.training.run import open_run
 
-    return policy_of(run, spec)
+    opened = open_run(run)
+    if opened.config.task.environment != spec.environment:
+        raise LareError(f"{run} is a run of {opened.config.task.name}: its policy cannot play {spec.name}")
+    return policy_of(opened)
 
 
 def check_design(

@@ -1,6 +1,11 @@
 """What there is: tasks, methods, algorithms."""
 
+from typing import TYPE_CHECKING
+
 from lare.cli.terminal import show
+
+if TYPE_CHECKING:
+    from lare.credit.methods import Method
 
 
 def tasks() -> None:
@@ -29,8 +34,13 @@ def methods() -> None:
 
     show(
         ("method", "what the algorithm is trained on", "source"),
-        ((row.name, row.summary + (" (many agents)" if row.for_many_only else ""), row.source) for row in TABLE),
+        ((row.name, row.summary + for_whom(row), row.source) for row in TABLE),
     )
+
+
+def for_whom(method: "Method") -> str:
+    """Who a method is for, where it is not for all."""
+    return " (many agents)" if method.for_many_only else " (one agent)" if method.for_one_only else ""
 
 
 def algorithms() -> None:

@@ -61,7 +61,7 @@ def train(
 
 
 def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -> None:
-    """Evaluate the policy of a run by its true return.
+    """Evaluate the policy of a run by its true return, from starts that no evaluation of the run has used.
 
     Args:
         run: a run directory.

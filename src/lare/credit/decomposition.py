@@ -15,11 +15,13 @@ but the scale of r_hat. `normalise = false` is the published form: raw features,
 """
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from pydantic import Field
@@ -31,7 +33,7 @@ from lare.credit.decoders import Bottleneck, Decoded, StepDecoder
 from lare.credit.diaster import Diaster
 from lare.credit.methods import Decoder, Fit, Method
 from lare.credit.stas import STAS
-from lare.errors import Checked
+from lare.errors import Checked, LareError
 from lare.networks import descend, start_adam
 from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe, observe_scale, standardise
 
@@ -60,7 +62,7 @@ class CreditSettings(Checked):
     episodes: Annotated[int, Field(ge=1)] = 8
     """diaster (single agents): whole episodes in one update of its decoder."""
     fits: Annotated[int, Field(ge=1)] = 1
-    """diaster (single agents): updates of its decoder before each chunk of those of an off-policy algorithm."""
+    """diaster (single agents): updates of its decoder for each chunk of steps."""
     ridge: Annotated[float, Field(gt=0)] = 1.0
     """Strength of the ridge penalty (lambda), in episodes."""
     encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
@@ -100,10 +102,47 @@ class Decomposition(NamedTuple):
     """For a decoder that is fitted in closed form."""
 
 
+def whole_episodes(
+    features: Sequence[Float[np.ndarray, "_ features"]], returns: Sequence[float], rows: int
+) -> Episodes:
+    """Whole episodes of a single agent, one behind the other, as `update` takes them for `Fit.ALL_STEPS`.
+
+    Args:
+        features: of each episode, what the decoder sees of its steps.
+        returns: of each episode, the sum of its rewards.
+        rows: as many come out, padding behind the last step included: where that and the number of episodes are always the
+            same, a jitted `update` is compiled once.
+
+    Raises:
+        LareError: the episodes have more steps than that, or one has none.
+    """
+    length = np.array([len(steps) for steps in features])
+    padding = rows - length.sum()
+    if padding < 0 or not length.all():
+        raise LareError(f"{length.sum()} steps of {len(length)} episodes: each has one or more, and all at most {rows}")
+    number = np.repeat(np.arange(len(length)), length)
+    return Episodes(
+        features=jnp.asarray(np.pad(np.concatenate(features), ((0, padding), (0, 0)))),
+        episode=jnp.asarray(np.pad(number, (0, padding), constant_values=len(length))),
+        length=jnp.asarray(length),
+        mean_reward=jnp.asarray(np.asarray(returns, np.float32) / length),
+        counts=jnp.ones(len(length)),
+    )
+
+
 def init(
     key: PRNGKeyArray, features: int, method: Method, settings: CreditSettings, steps: int, agents: int
 ) -> Decomposition:
-    """An untrained decoder of the method's kind, for episodes of `steps` steps of `agents` agents."""
+    """An untrained decoder of the method's kind.
+
+    Args:
+        key: what its weights are drawn by.
+        features: size of what it sees of a step.
+        method: a row of the table.
+        settings: of the decoder and its fit; the same ones go to every other function of this file.
+        steps: of the longest episode.
+        agents: 1, or how many a step has.
+    """
     gain = 1.0 if agents == 1 else math.sqrt(steps * agents)
     match method.decoder:
         case Decoder.STEP:
@@ -125,14 +164,14 @@ def init(
 
 
 def observe_steps(state: Decomposition, features: Float[Array, "*batch features"]) -> Decomposition:
-    """Take newly stored steps into the statistics."""
+    """Take new steps into the statistics that `normalise` goes by: every step once, when it is met."""
     return state._replace(moments=observe(state.moments, features.reshape(-1, features.shape[-1])))
 
 
 def observe_returns(
     state: Decomposition, mean_reward: Float[Array, " batch"], finished: Bool[Array, " batch"]
 ) -> Decomposition:
-    """Take R/T of newly finished episodes into the statistics; places where `finished` is false are passed over."""
+    """Take R/T of newly finished episodes into `scale`: every episode once. Places where `finished` is false are passed over."""
     return state._replace(scale=observe_scale(state.scale, mean_reward, finished))
 
 
@@ -182,7 +221,7 @@ def decode(
 def proxy_rewards(
     state: Decomposition, features: Float[Array, "rows *agents features"], settings: CreditSettings
 ) -> Float[Array, "rows *agents"]:
-    """r_hat of some steps, by the decoder as it stands."""
+    """r_hat of some steps, in the unit of the true rewards, by the decoder as it stands (also before its first update)."""
     r_hat = decode(state.decoder, state, features, settings).r_hat
     return magnitude(state.scale) * r_hat if normalised(state, settings) else r_hat
 
@@ -235,7 +274,10 @@ def loss_of_pieces(
 def update(
     state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """One step of gradient descent."""
+    """One step of gradient descent on a batch of episodes; returns the new state, and `credit/loss`.
+
+    The loss is in squared units of `scale`, or of the reward where `normalise` is off.
+    """
     return step(state, *loss_and_gradient(state, episodes, key, fit, settings), settings)
 
 

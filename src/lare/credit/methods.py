@@ -46,7 +46,7 @@ class Fit(StrEnum):
 
     @property
     def apart(self) -> bool:
-        """Whether it is too expensive to go with every update of an off-policy algorithm, and goes between chunks of them."""
+        """Whether it is too expensive to go with every update of the algorithm, and goes between chunks of them."""
         return self is Fit.SUBTRAJECTORIES
 
 

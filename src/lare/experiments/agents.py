@@ -18,9 +18,9 @@ from lare.tasks.particles.table import find_particle_task
 from lare.tasks.particles.task import Team
 from lare.training import teams
 from lare.training.environments import Stream
-from lare.training.many_agents import Session, load_learner, restore
+from lare.training.many_agents import Session, keys_of, load_learner, restore
 from lare.training.run import Run
-from lare.training.seeds import of_seed, seed_keys
+from lare.training.seeds import of_seed
 from lare.training.teams import Played
 
 SAMPLED = 40
@@ -62,9 +62,9 @@ class Sample:
 
 
 def returns(run: Run, episodes: int) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
-    """The sum over its agents of the true rewards, for each team, by its name."""
+    """The sum over its agents of the true rewards, for each team, by its name; from starts that no evaluation has used."""
     recipe, learner, _, _ = load_learner(run)
-    keys = seed_keys(jnp.asarray(run.seeds), Stream.EVALUATION_EPISODES + 1)  # from the starts of its evaluations
+    keys = keys_of(run, Stream.EVALUATION_EPISODES, 1)
     played = teams.compiled(recipe).play(learner.algorithm.online.actor, keys, episodes)
     return {
         role.name: np.asarray(teams.returns(played.reward, team))

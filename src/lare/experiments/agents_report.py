@@ -11,7 +11,7 @@ from jaxtyping import Float
 from lare.experiments import figures
 from lare.experiments.agents import Sample, Watched, sample, watch
 from lare.experiments.credit import correlations, factor_labels
-from lare.experiments.html import function_text, note, table
+from lare.experiments.html import factor_table, function_text, note
 from lare.tasks.particles.drawing import film
 from lare.tasks.particles.table import find_particle_task
 from lare.training.run import Run
@@ -52,11 +52,7 @@ def of_team(run: Run, place: int, taken: Sample) -> Iterable[str]:
     name, function = run.config.task.roles[place].name, run.functions[place]
     yield f"<h3>The factors of {escape(name)}</h3>"
     of_factors, of_observation = taken.correlations, correlations(taken.observation, taken.reward)
-    rows = [
-        (factor, meaning, "-" if np.isnan(value) else f"{value:.2f}")
-        for (factor, meaning), value in zip(factor_labels(run, place), of_factors, strict=True)
-    ]
-    yield table(("factor", "meaning, in the model's words", "correlation with the true reward"), rows, (2,))
+    yield factor_table(factor_labels(run, place), of_factors)
     raw, latent = (np.nanmean(np.abs(values)) for values in (of_observation, of_factors))
     yield note(
         f"Absolute correlation with the true reward, mean over dimensions: {raw:.2f} of the {taken.observation.shape[1]} "

@@ -86,6 +86,4 @@ def body(title: str, comparison: Comparison) -> Iterable[str]:
 
 def figure(title: str, bands: Mapping[str, Band], across: str, up: str, *, steps: bool = False) -> Iterable[str]:
     yield f"<h2>{title}</h2>"
-    yield figures.bands(
-        {label: (one.x, one.value, one.low, one.high) for label, one in bands.items()}, across, up, steps
-    )
+    yield figures.bands(bands, across, up, steps)

@@ -6,7 +6,6 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 from jaxtyping import Float
 
@@ -14,9 +13,9 @@ from lare.errors import LareError
 from lare.experiments import agents
 from lare.tasks.episodic import EpisodicReward
 from lare.tasks.particles.drawing import FRAMES_PER_SECOND
-from lare.tasks.spec import TaskSpec, check_against_environment
+from lare.tasks.spec import check_against_environment
 from lare.training.environments import Policy, Stream, episode_seed, evaluate, make_episodic, to_bounds
-from lare.training.run import Run, open_run
+from lare.training.run import Run
 from lare.training.single_agent import compiled, load_learner
 
 FRAME = {"width": 320, "height": 320}
@@ -34,26 +33,23 @@ def load_policy(run: Run) -> Policy:
     return lambda observation: np.asarray(functions.act(actor, observation))
 
 
-def policy_of(directory: str | Path, task: TaskSpec) -> Callable[[np.ndarray], np.ndarray]:
-    """The deterministic policy of a run's first seed, from one observation to one action of the environment.
+def policy_of(run: Run, seed: int | None = None) -> Callable[[np.ndarray], np.ndarray]:
+    """The deterministic policy of a seed (the first, unless given), from one observation to one action of the environment.
 
     Raises:
-        LareError: the directory is no run, or one of another environment.
+        LareError: it is a run of many agents, or has no such seed, or no checkpoint.
     """
-    run = open_run(directory)
-    if run.config.task.environment != task.environment or task.particles:
-        raise LareError(f"{directory} is a run of {run.config.task.name}: its policy cannot play {task.name}")
-    with closing(make_episodic(task)) as environment:
-        return first_seed(run, environment.action_space)
-
-
-def first_seed(run: Run, space: gymnasium.Space) -> Callable[[np.ndarray], np.ndarray]:
-    """The deterministic policy of the first seed, from one observation to one action within the space."""
-    policy = load_policy(run)
+    if run.config.task.particles:
+        raise LareError(f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy")
+    if seed is not None and seed not in run.seeds:
+        raise LareError(f"{run.directory} has no seed {seed}: there are {', '.join(map(str, run.seeds))}")
+    place, policy = 0 if seed is None else run.seeds.index(seed), load_policy(run)
+    with closing(make_episodic(run.config.task)) as environment:
+        space = environment.action_space
 
     def act(observation: np.ndarray) -> np.ndarray:
         everyone = np.broadcast_to(np.asarray(observation, np.float32), (len(run.seeds), len(observation)))
-        return to_bounds(policy(everyone)[0], space)
+        return to_bounds(policy(everyone)[place], space)
 
     return act
 
@@ -61,8 +57,8 @@ def first_seed(run: Run, space: gymnasium.Space) -> Callable[[np.ndarray], np.nd
 def evaluate_run(run: Run, episodes: int = 10) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
     """True returns by team; the only team of most tasks is called by the task's name.
 
-    A single agent acts without noise. Agents of particle tasks draw their actions, as they do in training; a team's
-    return is the sum over its agents.
+    From starts that no evaluation of the run has used. A single agent acts without noise. Agents of particle tasks draw
+    their actions, as they do in training; a team's return is the sum over its agents.
 
     Raises:
         LareError: there is nothing to evaluate, or the task's environment has changed.
@@ -79,9 +75,10 @@ def evaluate_run(run: Run, episodes: int = 10) -> dict[str, Float[np.ndarray, "s
             [opened.enter_context(closing(make_episodic(task))) for _ in range(min(episodes, AT_A_TIME))]
             for _ in run.seeds
         ]
-        for first in range(0, episodes, AT_A_TIME):
-            some = [row[: episodes - first] for row in environments]
-            parts.append(evaluate(some, policy, run.seeds, first=first).returns)
+        used = run.config.settings.evaluation_episodes
+        for done in range(0, episodes, AT_A_TIME):
+            some = [row[: episodes - done] for row in environments]
+            parts.append(evaluate(some, policy, run.seeds, first=used + done).returns)
     return {task.name: np.concatenate(parts, axis=1)}
 
 
@@ -108,7 +105,7 @@ def record_video(run: Run, path: str | Path) -> None:
 
 def drawn(run: Run, environment: EpisodicReward, every: int) -> Iterator[np.ndarray]:
     """Pictures of every so many steps of an episode. Raises `LareError` where this machine draws none."""
-    act = first_seed(run, environment.action_space)
+    act = policy_of(run)
     observation, _ = environment.reset(seed=episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
     ended, step = False, 0
     while not ended:

@@ -14,6 +14,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from lare.experiments.statistics import Band
+
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
 """Okabe and Ito's colours, which the colour-blind can tell apart."""
 
@@ -87,17 +89,14 @@ def in_thousands(x: float, _: Any) -> str:
     return f"{x / 1e6:g}M" if x >= 1e6 else f"{x / 1e3:g}k" if x else "0"
 
 
-Points = Float[np.ndarray, " points"]
-
-
 def bands(
-    by_name: Mapping[str, tuple[Points, Points, Points, Points]],
+    by_name: Mapping[str, Band],
     across: str,
     up: str,
     steps: bool = False,
     decades: bool = False,
 ) -> str:
-    """Curves (x, y), each with an interval (low, high) at every point. Where x counts no `steps`, y is a share: stairs.
+    """Curves, each with an interval at every point. Where x counts no `steps`, what it shows is a share: stairs.
 
     With `decades`, y goes by its logarithm.
     """

@@ -1,5 +1,6 @@
 """Pieces of a page, and the page."""
 
+import math
 from collections.abc import Iterable, Sequence
 from html import escape
 from importlib.resources import files
@@ -42,6 +43,15 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[
 
     body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
     return f'<div class="wide"><table><tr>{cells("th", head)}</tr>\n{body}\n</table></div>'
+
+
+def factor_table(labels: Iterable[tuple[str, str]], correlations: Iterable[float]) -> str:
+    """Names and meanings of factors, and how each goes with the true reward."""
+    rows = [
+        (name, meaning, "-" if math.isnan(value) else f"{value:.2f}")
+        for (name, meaning), value in zip(labels, correlations, strict=True)
+    ]
+    return table(("factor", "meaning, in the model's words", "correlation with the true reward"), rows, (2,))
 
 
 def note(text: str) -> str:

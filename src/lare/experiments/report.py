@@ -13,7 +13,7 @@ from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
 from lare.experiments.credit import DELTA, credit_of, factor_labels
-from lare.experiments.html import function_text, note, table, write_page
+from lare.experiments.html import factor_table, function_text, note, table, write_page
 from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN
 from lare.source import source
 from lare.tasks.spec import TaskSpec
@@ -187,11 +187,7 @@ def factors(run: Run, credit: Any) -> Iterable[str]:
     named = factor_labels(run)
     yield "<h3>The factors</h3>"
     correlations = credit.correlations if credit is not None else [np.nan] * len(named)
-    rows = [
-        (name, meaning, "-" if np.isnan(value) else f"{value:.2f}")
-        for (name, meaning), value in zip(named, correlations, strict=True)
-    ]
-    yield table(("factor", "meaning, in the model's words", "correlation with the true reward"), rows, (2,))
+    yield factor_table(named, correlations)
     if credit is not None:
         yield figures.courses(credit.factors, [name for name, _ in named])
     yield note(f"phi judges the observation {judged(run)} the step.")

@@ -11,6 +11,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -80,8 +81,7 @@ class Row:
     """Probability that a run of it scores more than one of the first method; None for the first, and of single seeds."""
 
 
-@dataclass(frozen=True)
-class Band:
+class Band(NamedTuple):
     """A curve with an interval at each of its points."""
 
     x: Float[np.ndarray, " points"]

@@ -25,7 +25,7 @@ def rows_of(directories: Iterable[Path]) -> list[dict[str, Any]]:
             "run": directory.name,
             "method": plan.method,
             "algorithm": plan.algorithm,
-            "judges": plan.judges or config.task.judges,
+            "judges": plan.judged_by(config.task),
             "draw": plan.draw,
         }
         rows += [run | line for line in read_metrics(directory)]

@@ -114,6 +114,10 @@ class LatentFunction:
         judged = {"before": [before], "after": [after], "both": [before, after]}[judges]
         return np.concatenate([self(observation, action) for observation in judged], axis=1)
 
+    def size_by(self, judges: Judges) -> int:
+        """How many factors `of_steps` gives."""
+        return 2 * self.size if judges == "both" else self.size
+
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: everything but the workers, which start there anew."""
         return {name: value for name, value in self.__dict__.items() if name != "evaluators"}

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
 
 from lare.errors import Checked, LareError
 from lare.files import replace
@@ -27,7 +26,7 @@ class Recording(Checked):
     """One complete sample of a model: its candidates and their combination (and corrections, if there were any)."""
 
     task: str
-    kind: Literal["factors", "reward"]
+    kind: Kind
     draw: int
     model: str
     recorded: str

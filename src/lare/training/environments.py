@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lare.errors import LareError
 from lare.tasks.environment import make
@@ -161,6 +161,8 @@ class Evaluation:
     """What episodes of the deterministic policy gave."""
 
     returns: Float[np.ndarray, "seeds episodes"]
+    lengths: Int[np.ndarray, "seeds episodes"]
+    """In steps."""
     measures: dict[str, Float[np.ndarray, "seeds episodes"]]
     """What the task asks to be taken from the last step's `info`."""
 
@@ -188,7 +190,7 @@ def evaluate(
             for seed, row in zip(seeds, environments, strict=True)
         ]
     )
-    returns = np.full(shape, np.nan)
+    returns, lengths = np.full(shape, np.nan), np.zeros(shape, int)
     found = {name: np.full(shape, np.nan) for name in measures}
     while np.isnan(returns).any():
         actions = policy(observation)
@@ -201,13 +203,14 @@ def evaluate(
                 to_bounds(actions[place], environment.action_space)
             )
             observation[place] = after
+            lengths[place] += 1
             if terminated or truncated:
                 if not np.isfinite(paid):
                     raise EnvironmentFault(f"the environment paid {paid} in an evaluation of seed {seeds[place[0]]}")
                 returns[place] = paid
                 for name in measures:
                     found[name][place] = measured(info, name)
-    return Evaluation(returns, found)
+    return Evaluation(returns, lengths, found)
 
 
 def measured(info: dict, name: str) -> float:

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from lare.credit.methods import find_method
 from lare.tasks.particles.table import find_particle_task
@@ -40,7 +40,7 @@ class Session:
 
     def keys(self, stream: Stream, number: int) -> Array:
         """A key for each seed, by what it is for and the number of the update."""
-        return seed_keys(jnp.asarray(self.run.seeds), number * len(Stream) + stream + 1)
+        return keys_of(self.run, stream, number)
 
     def advance(self) -> None:
         """One update: play, factors, replay, sometimes the decoder, the policy."""
@@ -91,16 +91,20 @@ class Session:
         """There is nothing to close."""
 
 
+def keys_of(run: Run, stream: Stream, number: int) -> Key[Array, " seeds"]:
+    """A key for each seed. Evaluations of the run have number 0, updates count from 0."""
+    return seed_keys(jnp.asarray(run.seeds), number * len(Stream) + stream + 1)
+
+
 def recipe_for(run: Run) -> Recipe:
     plan, name = run.config.settings, run.config.task.particles
     assert name is not None
-    sizes = (function.size for function in run.functions)
     return Recipe(
         task=find_particle_task(name),
         method=find_method(plan.method),
         ppo=plan.ippo,
         agents=plan.agents.model_copy(update={"capacity": plan.episodes}),
-        factors=tuple(2 * size if run.judges == "both" else size for size in sizes),
+        factors=tuple(function.size_by(run.judges) for function in run.functions),
     )
 
 

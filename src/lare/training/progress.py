@@ -17,13 +17,22 @@ Metrics = Sequence[Mapping[str, Any]]
 
 @runtime_checkable
 class Listener(Protocol):
-    """Whoever wants to know how a run is going."""
+    """Whoever wants to know how a run is going. Steps are environment steps of each seed."""
 
-    def started(self, name: str, step: int, steps: int) -> None: ...
-    def stepped(self, step: int) -> None: ...
-    def evaluated(self, metrics: Metrics) -> None: ...
-    def said(self, message: str) -> None: ...
-    def stopped(self) -> None: ...
+    def started(self, name: str, step: int, steps: int) -> None:
+        """Training begins at a step (above 0 when a run is resumed), and is to go to `steps`."""
+
+    def stepped(self, step: int) -> None:
+        """A turn has been made: a chunk of steps with its updates, or a rollout with its own."""
+
+    def evaluated(self, metrics: Metrics) -> None:
+        """New lines of metrics.jsonl, one for each seed; they and the checkpoint have been written."""
+
+    def said(self, message: str) -> None:
+        """Something that the user should read, in a line."""
+
+    def stopped(self) -> None:
+        """The run has ended, in one way or another: called always, and once."""
 
 
 def mean(metrics: Metrics, key: str) -> float | None:

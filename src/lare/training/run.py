@@ -135,7 +135,7 @@ class Run:
     @property
     def judges(self) -> Judges:
         """Which observation the factors judge a step by."""
-        return self.config.settings.judges or self.config.task.judges
+        return self.config.settings.judged_by(self.config.task)
 
     def has_checkpoint(self) -> bool:
         """Whether it came as far as its first checkpoint."""

@@ -48,7 +48,7 @@ class RolloutSettings(Checked):
     steps: Annotated[int, Field(ge=1)] = 2000
     """Environment steps that are collected."""
     fit_updates: Annotated[int, Field(ge=1)] = 500
-    """Gradient steps of the decoder."""
+    """Gradient steps of the decoder; diaster's, which cost far more, are as many as `credit.fits` says."""
 
 
 class Settings(Checked):
@@ -72,7 +72,8 @@ class Settings(Checked):
     candidates: Annotated[int, Field(ge=1)] = CANDIDATES
     """How many candidates phi is made of; 1: without self-prompting. The shipped recordings hold 1 and 5."""
     chunk: Annotated[int, Field(ge=1)] = 50
-    """Off-policy: environment steps, and then as many updates, between two calls of the compiled training step."""
+    """Off-policy: environment steps, and then as many updates, between two calls of the compiled training step.
+    ppo with diaster: only what `credit.fits` says of it."""
     evaluate_every: Annotated[int | None, Field(ge=1)] = None
     """Environment steps between two evaluations; a checkpoint is written at each: 5000 off-policy, 10 updates for
     ippo, 5 for ppo."""
@@ -160,6 +161,17 @@ class Plan(Settings):
         return getattr(self, self.algorithm)
 
     @property
+    def apart(self) -> bool:
+        """Whether the decoder is too expensive to be fitted often: `credit.fits` times for each `chunk` of steps."""
+        fit = find_method(self.method).fit
+        return fit is not None and fit.apart
+
+    @property
+    def fit_updates(self) -> int:
+        """ppo: gradient steps of the decoder before each update of the policy."""
+        return max(1, self.credit.fits * self.rollout.steps // self.chunk) if self.apart else self.rollout.fit_updates
+
+    @property
     def idle(self) -> tuple[str, ...]:
         """Settings, and groups of them, that make no difference to this algorithm, by dotted names."""
         others = tuple(name for name in ALGORITHMS if name != self.algorithm)
@@ -167,7 +179,7 @@ class Plan(Settings):
             case Kind.OFF_POLICY:
                 return (*others, "rollout", "agents")
             case Kind.ON_POLICY:
-                return (*others, "agents", "chunk", "credit.fits", "scale_rewards")
+                return (*others, "agents", "scale_rewards", *(("rollout.fit_updates",) if self.apart else ("chunk",)))
             case Kind.MANY_AGENTS:
                 of_one = ("agents.credit.episodes", "agents.credit.fits")
                 return (*others, "rollout", "credit", "chunk", "capacity", "scale_rewards", *of_one)
@@ -183,6 +195,10 @@ class Plan(Settings):
         if not method.latent:
             found += ["judges", "draw", "candidates"]
         return tuple(found)
+
+    def judged_by(self, task: TaskSpec) -> Judges:
+        """Which observation the factors judge a step by."""
+        return self.judges or task.judges
 
     def in_force(self, task: TaskSpec) -> dict[str, Any]:
         """All that matters here, by dotted names as on the command line."""
@@ -257,8 +273,7 @@ def decide(settings: Settings, task: TaskSpec) -> Plan:
     given = {name: getattr(settings, name) for name in type(settings).model_fields}
     plan = Plan(**usual | {name: value for name, value in given.items() if value is not None})
     method = find_method(plan.method)
-    judges = plan.judges or task.judges
-    if method.reward is Reward.DESIGNED and judges == "both":
+    if method.reward is Reward.DESIGNED and plan.judged_by(task) == "both":
         raise LareError(f"{method.name} is one reward a step: it judges the observation before or after, not both")
     if plan.scale_rewards and method.has_proxy and not method.in_units:
         raise LareError(

@@ -90,7 +90,10 @@ class Session:
         """Evaluate; one line of metrics.jsonl for each seed."""
         config = self.run.config
         evaluation = evaluate(self.evaluation, self.policy, self.run.seeds, config.task.measures)
-        measured = {"evaluation/return": evaluation.returns.mean(axis=1)}
+        measured = {
+            "evaluation/return": evaluation.returns.mean(axis=1),
+            "evaluation/length": evaluation.lengths.mean(axis=1),
+        }
         measured |= {f"evaluation/{name}": values.mean(axis=1) for name, values in evaluation.measures.items()}
         measured |= self.functions.assess(self.learner) | self.latest
         return lines(self.run.seeds, self.step, measured, rate)
@@ -154,7 +157,6 @@ def compiled(recipe: Recipe) -> Compiled:
 
 def recipe_for(run: Run) -> Recipe:
     task, settings = run.config.task, run.config.settings
-    factors = run.function.size if run.function else 0
     return Recipe(
         method=find_method(settings.method),
         algorithm=settings.of_algorithm,
@@ -163,12 +165,12 @@ def recipe_for(run: Run) -> Recipe:
         observation_size=task.observation_size,
         action_size=task.action_size,
         discrete=run.config.discrete,
-        factors=2 * factors if run.judges == "both" else factors,
+        factors=run.function.size_by(run.judges) if run.function else 0,
         longest_episode=run.config.longest_episode,
         capacity=settings.rows,
         steps=settings.steps,
         turn=settings.turn,
-        fit_updates=settings.rollout.fit_updates,
+        fit_updates=settings.fit_updates,
     )
 
 

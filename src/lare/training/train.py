@@ -50,6 +50,7 @@ def train(
         function: `phi`, or the path of its file, for the methods that need one; one for each team where several learn. Without
             it, it is designed from the shipped recordings.
         out: the run directory, which must not exist; `runs/...` unless given.
+        tensorboard: also write every number of metrics.jsonl as TensorBoard events, with the extra `lare-rl[tensorboard]`.
         listeners: who is told of the progress; the terminal, unless given.
 
     Raises:
@@ -79,7 +80,7 @@ def chosen_functions(task: TaskSpec, plan: Plan, given: Given | Sequence[Given] 
         each = per_role([given] if isinstance(given, Given) else given, task)
         functions = [one if isinstance(one, LatentFunction) else load(one, role) for one, role in each]
     for function in functions:
-        check_size(method, function.size * (2 if (plan.judges or task.judges) == "both" else 1))
+        check_size(method, function.size_by(plan.judged_by(task)))
     return tuple(functions)
 
 

@@ -9,10 +9,9 @@ from jaxtyping import Float, PRNGKeyArray
 
 from lare import theory
 from lare.experiments import figures
-from lare.experiments.figures import Points
 from lare.experiments.paper.budgets import Budget
 from lare.experiments.paper.pages import Page, items, table
-from lare.experiments.statistics import plus_minus
+from lare.experiments.statistics import Band, plus_minus
 from lare.theory import History, Table
 
 TITLE = "Regret with a latent table, and with a raw one"
@@ -115,10 +114,10 @@ def label(redundant: int) -> str:
     return "1 (latent)" if redundant == 1 else f"{redundant}"
 
 
-def band(history: History) -> tuple[Points, Points, Points, Points]:
+def band(history: History) -> Band:
     """Episodes, mean regret, and a standard deviation on both sides."""
     regret = np.asarray(history.regret)
     every = max(1, regret.shape[1] // 200)
     shown = regret[:, ::every]
     mean, deviation = shown.mean(axis=0), shown.std(axis=0, ddof=1)
-    return np.arange(1, regret.shape[1] + 1, every, dtype=float), mean, mean - deviation, mean + deviation
+    return Band(np.arange(1, regret.shape[1] + 1, every, dtype=float), mean, mean - deviation, mean + deviation)

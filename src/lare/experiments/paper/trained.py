@@ -185,8 +185,7 @@ def meaning(key: str) -> str:
 
 
 def picture(found: Comparison, key: str) -> str:
-    lines = {label: (one.x, one.value, one.low, one.high) for label, one in found.curves.items()}
-    return figures.bands(lines, "environment steps", f"{meaning(key)}, IQM", steps=True, decades=key == ERROR)
+    return figures.bands(found.curves, "environment steps", f"{meaning(key)}, IQM", steps=True, decades=key == ERROR)
 
 
 def pairs(claims: Iterable[Claim]) -> Iterator[tuple[Claim, str]]:
