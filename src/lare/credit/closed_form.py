@@ -36,7 +36,7 @@ LARGEST_CHOICE = 16
 """Factors whose signs are searched through, all 2^d of them."""
 
 
-class Linear(eqx.Module):
+class LinearDecoder(eqx.Module):
     """r_hat = w . z + b, on the factors as they are."""
 
     weight: Float[Array, " features"]
@@ -116,21 +116,21 @@ def design_matrix(totals: Totals, ridge: float) -> Float[Array, "features featur
     return totals.products[:-1, :-1] / jnp.outer(unit, unit) + ridge * jnp.eye(len(unit))
 
 
-def ridge_regression(totals: Totals, ridge: float) -> Linear:
+def ridge_regression(totals: Totals, ridge: float) -> LinearDecoder:
     """The regularised least-squares estimate of the rewards."""
     unit, mean = spread(totals), totals.mean
     weight = jnp.linalg.solve(design_matrix(totals, ridge), totals.products[:-1, -1] / unit) / unit
-    return Linear(weight, mean[-1] - weight @ mean[:-1])
+    return LinearDecoder(weight, mean[-1] - weight @ mean[:-1])
 
 
-def best_signs(totals: Totals) -> Linear:
+def best_signs(totals: Totals) -> LinearDecoder:
     """The signs for which the sum of the factors comes nearest to the returns; the first of them where some are equal."""
     count, mean = totals.episodes, totals.mean
     signs = jnp.asarray(np.array(list(itertools.product((1.0, -1.0), repeat=len(mean) - 1)), np.float32))
     # Of v = (z, R/T) times (w, -1): the sum of the squares is that about the mean and k times that of the mean.
     v = jnp.concatenate([signs, -jnp.ones((len(signs), 1))], axis=1)
     error = jnp.sum((v @ totals.products) * v, axis=1) + count * (v @ mean) ** 2
-    return Linear(signs[jnp.argmin(error)], jnp.zeros(()))
+    return LinearDecoder(signs[jnp.argmin(error)], jnp.zeros(()))
 
 
 def uncertainty(

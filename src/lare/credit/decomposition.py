@@ -28,7 +28,15 @@ from pydantic import Field
 
 from lare.credit import losses
 from lare.credit.arel import AREL
-from lare.credit.closed_form import Linear, Totals, best_signs, forget_running, no_totals, ridge_regression, take_in
+from lare.credit.closed_form import (
+    LinearDecoder,
+    Totals,
+    best_signs,
+    forget_running,
+    no_totals,
+    ridge_regression,
+    take_in,
+)
 from lare.credit.decoders import Bottleneck, Decoded, StepDecoder
 from lare.credit.diaster import Diaster
 from lare.credit.methods import Decoder, Fit, Method
@@ -37,7 +45,7 @@ from lare.errors import Checked, LareError
 from lare.networks import descend, start_adam
 from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe, observe_scale, standardise
 
-Network = StepDecoder | Bottleneck | AREL | STAS | Diaster | Linear
+Network = StepDecoder | Bottleneck | AREL | STAS | Diaster | LinearDecoder
 """A decoder of any kind."""
 
 
@@ -157,7 +165,7 @@ def init(
         case Decoder.DIASTER:
             decoder = Diaster(features, settings.hidden, key=key)
         case Decoder.LINEAR:
-            decoder = Linear(jnp.zeros(features), jnp.zeros(()))
+            decoder = LinearDecoder(jnp.zeros(features), jnp.zeros(()))
             return Decomposition(decoder, (), no_moments(features), no_scale(), no_totals(features))
     optimizer = start_adam(decoder, settings.learning_rate)
     return Decomposition(decoder, optimizer, no_moments(features), no_scale(), None)

@@ -15,6 +15,7 @@ from lare.experiments.agents_report import agents_details
 from lare.experiments.credit import DELTA, credit_of, factor_labels
 from lare.experiments.html import factor_table, function_text, note, table, write_page
 from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN
+from lare.experiments.statistics import mean_and_deviation, plus_minus
 from lare.source import source
 from lare.tasks.spec import TaskSpec
 from lare.training.run import Run, open_run
@@ -76,13 +77,10 @@ def curve(run: Run, key: str) -> figures.Curve | None:
     return np.array(steps, float), np.array(values, float)
 
 
-def spread(run: Run, key: str, form: str) -> str:
+def at_the_end(run: Run, key: str) -> str:
     """The last value: its mean over the seeds, and their standard deviation."""
     found = curve(run, key)
-    if found is None:
-        return "-"
-    last = found[1][:, -1]
-    return f"{last.mean():{form}}" + (f" ± {last.std(ddof=1):{form}}" if len(last) > 1 else "")
+    return "-" if found is None else plus_minus(*mean_and_deviation(found[1][:, -1]))
 
 
 def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
@@ -93,9 +91,7 @@ def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
             name,
             str(len(run.seeds)),
             f"{run.metrics()[-1]['step']:,}",
-            spread(run, RETURN, ".1f"),
-            spread(run, ERROR, ".3g"),
-            spread(run, CORRELATION, ".3f"),
+            *(at_the_end(run, key) for key in (RETURN, ERROR, CORRELATION)),
         )
         for name, run in zip(names, runs, strict=True)
     ]

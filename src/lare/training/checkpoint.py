@@ -30,7 +30,7 @@ DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.err
 
 
 @runtime_checkable
-class Learner(Protocol):
+class WithReplay(Protocol):
     """Any training state with a replay: arrays with a seed axis first and, if they are saved by row, rows behind it.
 
     `replay.next_row` is the number of rows ever written; they stand at their number modulo the capacity.
@@ -42,7 +42,7 @@ class Learner(Protocol):
     def _replace(self, **changes: Any) -> Any: ...
 
 
-Some = TypeVar("Some", bound=Learner)
+Some = TypeVar("Some", bound=WithReplay)
 
 
 @contextlib.contextmanager
@@ -66,7 +66,7 @@ def take(buffer: jax.Array, index: jax.Array) -> jax.Array:
 
 def save(
     directory: Path,
-    learner: Learner,
+    learner: WithReplay,
     by_row: Sequence[str],
     host: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
