@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from lare.errors import LareError
 
@@ -18,7 +19,7 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
 
 def replace(path: Path, write: Callable[[Any], object]) -> None:
     """Let `write` fill a new file, and put it in the place of `path` only when it is safe on the disk. Raises `OSError`."""
-    new = path.with_name(path.name + ".new")
+    new = path.with_name(f"{path.name}.{uuid4().hex}.new")  # of its own: another process may be writing the same file
     try:
         with new.open("wb") as file:
             write(file)

@@ -35,6 +35,13 @@ def test_figures_by_hand(made):
     np.testing.assert_allclose(profile.value, [np.mean(np.array(values) > x) for x in profile.x])
 
 
+def test_the_curve_of_interquartile_means_is_rliables():
+    scores = np.random.default_rng(0).normal(size=(3, 2, 7))
+    _, metrics = statistics.rliable()
+    want = [metrics.aggregate_iqm(scores[..., step]) for step in range(7)]
+    np.testing.assert_allclose(statistics.curve_of_iqm(scores), want)
+
+
 def test_mann_and_whitneys_test_by_hand():
     """By the tables of Mann and Whitney: of 3 against 3, all nine pairs 1 in 20, eight or more 2 in 20."""
     low, high = np.array([1.0, 2, 3]), np.array([4.0, 5, 6])
@@ -88,7 +95,7 @@ def test_something_else_than_the_return_is_compared(made):
 
 
 def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):
-    made("a", [1.0]), made("b", [2.0], method="rd")
+    made("a", [1.0]), made("b", [2.0], method="rd"), made(".c.0123.new", [3.0])
     found = find_runs([tmp_path / "runs"])
     assert [run.config.settings.method for run in found] == ["dense", "rd"]
     assert find_runs([tmp_path / "runs" / "Chase" / "a"])[0].directory == found[0].directory

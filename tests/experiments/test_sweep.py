@@ -219,8 +219,8 @@ def test_a_process_that_fails_says_why(file, tmp_path):
     )
 
 
-def test_a_process_that_is_killed_is_named_by_the_signal(file, monkeypatch):
-    """Not by the last line of its log, which is about how well it was going."""
+def test_how_a_process_ended(file, monkeypatch):
+    """One that was killed by the signal, not by the last line of its log, which is about how well it was going."""
     _, jobs = read_sweep(file)
     log = jobs[0].directory.with_name("dense-td3.log")
     log.parent.mkdir(parents=True)
@@ -233,6 +233,16 @@ def test_a_process_that_is_killed_is_named_by_the_signal(file, monkeypatch):
     killed.chmod(0o755)
     monkeypatch.setattr(processes.sys, "executable", str(killed))
     assert processes.in_a_process(jobs[0], [], running) == f"it was ended by SIGKILL ({log})"
+    early = log.with_name("early.sh")  # an environment that ends the process, and says that all is well
+    early.write_text("#!/bin/sh\nexit 0\n")
+    early.chmod(0o755)
+    monkeypatch.setattr(processes.sys, "executable", str(early))
+    assert processes.in_a_process(jobs[0], [], running) == f"it ended at step 0 of 200 ({log})"
+    full = log.with_name("full.sh")  # whose log has no room for it
+    full.write_text("#!/bin/sh\necho no space is left\nexit 2\n")
+    full.chmod(0o755)
+    monkeypatch.setattr(processes.sys, "executable", str(full))
+    assert processes.in_a_process(jobs[0], [], running) == f"no space is left ({log})"
     running.stop()
     assert processes.in_a_process(jobs[0], [], running) == "it was not begun: the others were being stopped"
 
@@ -342,6 +352,10 @@ def test_metrics_that_make_no_sense(file, in_this_process):
     path.write_text('{"step": 1\n')
     with pytest.raises(LareError, match=r"metrics\.jsonl is damaged: Expecting ',' delimiter"):
         jobs[0].step()
+    for line in ("5", "{}", "null", '{"step": 1}', '{"step": "1", "seed": 0}'):
+        path.write_text(f'{{"step": 1, "seed": 0}}\n{line}\n')
+        with pytest.raises(LareError, match=r"metrics\.jsonl is damaged: line 2 is no evaluation"):
+            jobs[0].step()
     path.write_bytes(b"\xff\n")
     with pytest.raises(LareError, match=r"metrics\.jsonl is damaged: 'utf-8' codec can't decode byte 0xff"):
         jobs[0].step()

@@ -24,12 +24,16 @@ class Falters(Chase):
     def step(self, action):
         if self.where == "step":
             raise ZeroDivisionError
+        if self.where == "window":
+            raise SystemExit(0)
+        if self.where == "reward":
+            return (*super().step(action)[:1], None, False, False, {})
         if self.where == "itself":
             raise LareError("the battery is empty")
         return super().step(action)
 
 
-for where in ("reset", "step", "itself"):
+for where in ("reset", "step", "itself", "window", "reward"):
     gymnasium.register(f"misfits/{where}-v0", entry_point=Falters, kwargs={"where": where}, max_episode_steps=20)
 
 
@@ -39,8 +43,11 @@ for where in ("reset", "step", "itself"):
         ("reset", "environment 'misfits/reset-v0' failed in reset: no asset"),
         ("step", "environment 'misfits/step-v0' failed in step: ZeroDivisionError"),
         ("itself", "the battery is empty"),
+        ("window", "environment 'misfits/window-v0' failed in step: 0"),
+        ("reward", "environment 'misfits/reward-v0' gave the reward None, which is no number"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:.*The reward returned by")  # Gymnasium has seen it too
 def test_a_failure_is_one_line(where, message):
     with pytest.raises(LareError) as error:
         steps_in(f"misfits/{where}-v0", None, 1, 0)

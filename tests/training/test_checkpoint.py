@@ -74,3 +74,21 @@ def test_a_segment_from_before_a_dropped_episode_outlives_a_newer_one(tmp_path):
         tmp_path / "checkpoint", Learner(Held(jnp.zeros((1, 100)), jnp.zeros(1, int))), ("reward",)
     )
     np.testing.assert_array_equal(found.replay.reward[0, 25:], buffer[25:].astype(np.float32))
+
+
+def test_a_bit_that_makes_another_compression_of_it(tmp_path):
+    directory = tmp_path / "checkpoint"
+    save(directory, np.zeros(ROWS), 3)
+    content = bytearray((directory / "state.npz").read_bytes())
+    content[content.index(b"PK\x01\x02") + 10] ^= 64
+    (directory / "state.npz").write_bytes(content)
+    with pytest.raises(LareError, match=r"state\.npz cannot be read: That compression method is not supported"):
+        checkpoint.load(directory, Learner(Held(jnp.zeros((1, ROWS)), jnp.zeros(1, int))), ("reward",))
+
+
+def test_what_a_killed_process_left_makes_room(tmp_path):
+    directory = tmp_path / "checkpoint"
+    save(directory, np.zeros(ROWS), 3)
+    (directory / "rows-1.npz.0123.new").write_bytes(b"half")
+    save(directory, np.zeros(ROWS), 5)
+    assert {path.name for path in directory.iterdir()} == {"rows-0.npz", "rows-1.npz", "state.npz"}

@@ -2,6 +2,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from lare.errors import LareError
 from lare.tasks.episodic import EpisodicReward
 from lare.training import environments
 from lare.training.environments import Lane, Stream, collect, episode_seed, evaluate, make_episodic, to_bounds
@@ -177,3 +178,54 @@ def test_a_payment_that_is_not_finite_stops_an_evaluation():
     bad = EpisodicReward(Pays(gymnasium.make("toys/Chase-v0")))
     with pytest.raises(environments.EnvironmentFault, match="the environment paid nan in an evaluation of seed 5"):
         evaluate([[bad]], lambda observation: observation[..., :1], [5])
+
+
+class Gives(gymnasium.Wrapper):
+    """Something else than an observation after the third step, in episodes of some seeds."""
+
+    def __init__(self, given, seeds=range(2**31)):
+        super().__init__(gymnasium.make("toys/Chase-v0"))
+        self.given, self.seeds = given, seeds
+
+    def reset(self, *, seed=None, options=None):
+        self.spoilt, self.steps = seed in self.seeds, 0
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        self.steps += 1
+        return (self.given if self.spoilt and self.steps == 3 else observation), *rest
+
+
+BAD = [
+    (np.array([0.0, np.nan]), "the environment gave nan in its observation, "),
+    (np.zeros(3), r"the environment gave its observation in shape \(3,\), not \(2,\), "),
+    (None, r"the environment gave its observation in shape \(\), not \(2,\), "),
+    ("left", "the environment gave 'left' for its observation, "),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), BAD)
+def test_an_observation_that_is_none_is_not_learned_from(given, message):
+    one = Lane(4, EpisodicReward(Gives(given)))
+    one.begin()
+    with pytest.raises(environments.EnvironmentFault, match=f"^{message}at step 3 of episode 0 of seed 4$"):
+        collect([one], follow, np.zeros((20, 1, 1), np.float32))
+
+
+@pytest.mark.parametrize(("given", "message"), BAD)
+def test_nor_is_a_policy_asked_about_it_in_an_evaluation(given, message):
+    """A choice of the largest of NaNs is a choice: nobody would know."""
+    spoilt = episode_seed(1, Stream.EVALUATION_EPISODES, 2)
+    made = [[EpisodicReward(Gives(given, {spoilt})) for _ in range(2)] for _ in range(2)]
+    evaluate(made, lambda observation: np.zeros((2, 2, 1)), (0, 1))
+    with pytest.raises(environments.EnvironmentFault, match=f"^{message}in an evaluation of seed 1$"):
+        evaluate(made, lambda observation: np.zeros((2, 2, 1)), (0, 1), first=1)
+
+
+def test_a_measure_that_is_no_number():
+    assert environments.measured({"left": np.float32(2)}, "left") == 2
+    with pytest.raises(
+        LareError, match="the task measures 'left', and the last step's info has None, which is no number"
+    ):
+        environments.measured({"left": None}, "left")

@@ -192,6 +192,24 @@ def test_resuming_before_the_first_checkpoint_starts_anew(small, tmp_path):
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == before
 
 
+def test_metrics_that_are_older_than_the_checkpoint_are_not_made_up(small, tmp_path):
+    """As when a run is copied while it trains, its metrics first."""
+    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    path = run.directory / "metrics.jsonl"
+    whole = path.read_text()
+    first = whole.splitlines(keepends=True)[0]
+    message = (
+        f"has {len(first)} bytes, and the checkpoint comes after {len(whole)}: was the run copied while it was training"
+    )
+    path.write_text(first)
+    with pytest.raises(LareError, match=message):
+        lare.resume(run.directory, listeners=[])
+    assert path.read_text() == first
+    path.unlink()
+    with pytest.raises(LareError, match="has 0 bytes"):
+        lare.resume(run.directory, listeners=[])
+
+
 def test_an_episode_that_cannot_be_restored_is_dropped_and_said(small, tmp_path):
     spec = toy_spec(environment="toys/Forgetful-v0")
     stop = At(108, lambda: signal.raise_signal(signal.SIGINT))

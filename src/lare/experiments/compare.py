@@ -24,7 +24,8 @@ def find_runs(places: Sequence[Path]) -> list[Run]:
         raise LareError("say which runs to compare")
     runs = []
     for place in places:
-        found = sorted(path.parent for depth in ("", "*/", "*/*/") for path in place.glob(depth + CONFIG))
+        # Not those whose name begins with a dot: a run that was killed before it was made.
+        found = sorted(path.parent for depth in ("", "[!.]*/", "[!.]*/[!.]*/") for path in place.glob(depth + CONFIG))
         if not found:
             raise LareError(f"{place} is no run, and there is none in it")
         runs += map(read_measured, found)

@@ -196,7 +196,7 @@ def legend_above(axes: Axes) -> None:
     """Names in two columns, in one where they are long: a legend that is wider than the picture squeezes the curves."""
     handles, labels = axes.get_legend_handles_labels()
     labels = [textwrap.fill(label, 66) for label in labels]
-    columns = 2 if max(map(len, labels)) <= 30 else 1
+    columns = 2 if max(map(len, labels)) <= 34 else 1
     lines = sum(label.count("\n") + 1 for label in labels) / columns
     if isinstance(figure := axes.figure, Figure):
         figure.set_figheight(figure.get_figheight() + 0.22 * max(0, lines - 2))

@@ -109,23 +109,28 @@ def in_a_process(job: Job, cores: list[int], running: Running) -> str | None:
         command = [sys.executable, "-m", "lare.experiments.processes"]
         # In a session of its own, so that Ctrl-C reaches it once, through us.
         process = running.start(
-            command, stdin=subprocess.PIPE, stdout=file, stderr=file, text=True, start_new_session=True
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file, text=True, start_new_session=True
         )
         if process is None:
             return "it was not begun: the others were being stopped"
         assert process.stdin is not None
+        assert process.stdout is not None
+        last_word = ""
         try:
             with contextlib.suppress(BrokenPipeError), process.stdin:  # which stays open as long as this process lives
                 process.stdin.write(order + "\n")
                 process.stdin.flush()
-                process.wait()
+                last_word = process.stdout.read().strip()
             process.wait()
         finally:
+            process.stdout.close()
             running.ended(process)
     if process.returncode == 0:
-        return None
+        return None if job.done else f"it ended at step {job.step()} of {job.plan.steps} ({log})"
     if process.returncode < 0:  # there is no last word of a process that was killed, for memory as it may be
         return f"it was ended by {signal.Signals(-process.returncode).name} ({log})"
+    if last_word:  # not from the log, which a full disk may have cut short
+        return f"{last_word} ({log})"
     with log.open("rb") as file:
         file.seek(said_before)
         lines = file.read().decode(errors="replace").splitlines() or [f"exit status {process.returncode}"]
@@ -133,7 +138,12 @@ def in_a_process(job: Job, cores: list[int], running: Running) -> str | None:
 
 
 def main() -> None:
-    """What `in_a_process` starts: one run, told in the first line of standard input. The end of it is that of who asked."""
+    """What `in_a_process` starts: one run, told in the first line of standard input. The end of it is that of who asked.
+
+    What went wrong goes to standard output too. Whatever else is printed there belongs to the log.
+    """
+    answer = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     order = json.loads(sys.stdin.readline())
     threading.Thread(target=end_with_the_input, daemon=True).start()
     if order["cores"]:
@@ -141,7 +151,10 @@ def main() -> None:
     try:
         patiently(order["job"])
     except LareError as error:
-        sys.stderr.write(f"{error}\n")
+        answer.write(f"{error}\n")
+        answer.close()
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"{error}\n")
         sys.exit(2)
 
 

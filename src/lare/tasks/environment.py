@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
-from lare.errors import LareError
+from lare.errors import LareError, shortened
 from lare.tasks import mujoco, particles
 from lare.tasks.spaces import as_rows
 
@@ -17,7 +17,11 @@ particles.register()
 
 
 class Guarded(gymnasium.Wrapper, RecordConstructorArgs):
-    """An environment is foreign code: whatever its `reset` and `step` raise is a `LareError` of one line."""
+    """An environment is foreign code: whatever its `reset` and `step` raise is a `LareError` of one line.
+
+    So is `sys.exit`, by which a window that is closed ends some programs: a run that has not come to its end must not look as if
+    it had.
+    """
 
     def __init__(self, env: gymnasium.Env, name: str):
         RecordConstructorArgs.__init__(self, name=name)  # so that Gymnasium can make the same environment again
@@ -27,14 +31,23 @@ class Guarded(gymnasium.Wrapper, RecordConstructorArgs):
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         try:
             return self.env.reset(**options)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise fault(f"environment {self.name!r} failed in reset", error) from error
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         try:
-            return self.env.step(action)
-        except Exception as error:
+            observation, reward, terminated, truncated, info = self.env.step(action)
+        except (Exception, SystemExit) as error:
             raise fault(f"environment {self.name!r} failed in step", error) from error
+        return observation, number(reward, f"environment {self.name!r} gave the reward"), terminated, truncated, info
+
+
+def number(value: Any, what: str) -> float:
+    """A number that came out of foreign code. Raises `LareError` where it is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise LareError(f"{what} {shortened(value)}, which is no number") from None
 
 
 def fault(what: str, error: BaseException, hint: str = "") -> LareError:

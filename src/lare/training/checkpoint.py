@@ -25,7 +25,7 @@ from lare.files import write_atomically
 
 STATE = "state.npz"
 
-DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
+DAMAGED = (OSError, ValueError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """What reading a file that is not whole may raise."""
 
 
@@ -79,6 +79,8 @@ def save(
         arrays: the same, as arrays.
     """
     directory.mkdir(exist_ok=True)
+    for left in directory.glob("*.new"):  # by a process that was killed while it wrote
+        left.unlink(missing_ok=True)
     held, rows = learner.replay, learner.replay.reward.shape[1]
     end = np.asarray(held.next_row)
     start, segments = np.zeros_like(end), []

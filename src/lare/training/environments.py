@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium.spaces import Box
 from jaxtyping import Float, Int
 
-from lare.errors import LareError
-from lare.tasks.environment import make
+from lare.errors import LareError, shortened
+from lare.tasks.environment import make, number
 from lare.tasks.episodic import TRUE_REWARD, EpisodicReward
 from lare.tasks.spaces import Choice
 from lare.tasks.spec import TaskSpec
@@ -83,26 +83,23 @@ class Lane:
         self.actions = []
         seed = episode_seed(self.seed, Stream.TRAINING_EPISODES, self.episode)
         observation, _ = self.environment.reset(seed=seed)
-        self.observation = self.checked(observation, "observation")
+        self.observation = self.checked(observation)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, bool, bool]:
         """One step; returns observation, action, true reward, next observation, terminated, ended."""
         before, taken = self.observation, to_bounds(action, self.environment.action_space)
         after, _, terminated, truncated, info = self.environment.step(taken)
         self.actions.append(taken)
-        reward = float(self.checked(info[TRUE_REWARD], "reward"))
-        self.observation = self.checked(after, "observation")
+        reward = float(row(info[TRUE_REWARD], "reward", (), self.place))
+        self.observation = self.checked(after)
         return before, taken, reward, self.observation, bool(terminated), bool(terminated or truncated)
 
-    def checked(self, value: object, what: str) -> np.ndarray:
-        array = np.array(value, np.float32)  # a copy: the environment may write the next one into the same memory
-        if not np.isfinite(array).all():
-            bad = array[~np.isfinite(array)][0]
-            raise EnvironmentFault(
-                f"the environment gave {bad} in its {what}, at step {len(self.actions)} of episode {self.episode} "
-                f"of seed {self.seed}"
-            )
-        return array
+    @property
+    def place(self) -> str:
+        return f"at step {len(self.actions)} of episode {self.episode} of seed {self.seed}"
+
+    def checked(self, observation: object) -> Float[np.ndarray, " observation"]:
+        return row(observation, "observation", self.environment.observation_space.shape, self.place)
 
     def replay(self, actions: Sequence[np.ndarray], observation: np.ndarray) -> bool:
         """Get into the middle of the current episode again, by its seed and actions.
@@ -115,9 +112,22 @@ class Lane:
         for action in actions:
             after, _, terminated, truncated, _ = self.environment.step(action)
             self.actions.append(action)
-            self.observation = np.array(after, np.float32)  # a copy, as in `checked`
+            self.observation = self.checked(after)
             ended = terminated or truncated
         return not ended and np.array_equal(self.observation, observation)
+
+
+def row(value: object, what: str, shape: tuple[int, ...] | None, where: str) -> np.ndarray:
+    """What an environment gave, as a row of its own. Raises `EnvironmentFault` where nothing can be learned from it."""
+    try:
+        array = np.array(value, np.float32)  # a copy: the environment may write the next one into the same memory
+    except (TypeError, ValueError):
+        raise EnvironmentFault(f"the environment gave {shortened(value)} for its {what}, {where}") from None
+    if array.shape != shape:
+        raise EnvironmentFault(f"the environment gave its {what} in shape {array.shape}, not {shape}, {where}")
+    if not np.isfinite(array).all():
+        raise EnvironmentFault(f"the environment gave {array[~np.isfinite(array)][0]} in its {what}, {where}")
+    return array
 
 
 def check_finite(actions: Float[np.ndarray, "seeds *episodes action"], seeds: Sequence[int]) -> None:
@@ -181,13 +191,18 @@ def evaluate(
     """
     shape = (len(environments), len(environments[0]))
     places = list(np.ndindex(shape))
+
+    def checked(observation: object, seed: int, environment: EpisodicReward) -> Float[np.ndarray, " observation"]:
+        return row(observation, "observation", environment.observation_space.shape, f"in an evaluation of seed {seed}")
+
+    def begun(environment: EpisodicReward, seed: int, number: int) -> Float[np.ndarray, " observation"]:
+        start = episode_seed(seed, Stream.EVALUATION_EPISODES, number)
+        return checked(environment.reset(seed=start)[0], seed, environment)
+
     observation = np.stack(
         [
-            [
-                np.asarray(environment.reset(seed=episode_seed(seed, Stream.EVALUATION_EPISODES, place))[0], np.float32)
-                for place, environment in enumerate(row, start=first)
-            ]
-            for seed, row in zip(seeds, environments, strict=True)
+            [begun(environment, seed, number) for number, environment in enumerate(of_seed, start=first)]
+            for seed, of_seed in zip(seeds, environments, strict=True)
         ]
     )
     returns, lengths = np.full(shape, np.nan), np.zeros(shape, int)
@@ -202,7 +217,7 @@ def evaluate(
             after, paid, terminated, truncated, info = environment.step(
                 to_bounds(actions[place], environment.action_space)
             )
-            observation[place] = after
+            observation[place] = checked(after, seeds[place[0]], environment)
             lengths[place] += 1
             if terminated or truncated:
                 if not np.isfinite(paid):
@@ -216,4 +231,4 @@ def evaluate(
 def measured(info: dict, name: str) -> float:
     if name not in info:
         raise LareError(f"the task measures {name!r}, but the last step's info has only {', '.join(sorted(info))}")
-    return float(info[name])
+    return number(info[name], f"the task measures {name!r}, and the last step's info has")

@@ -8,7 +8,6 @@ failed_batch.npz     what the latent function was given, if it failed
 """
 
 import contextlib
-import errno
 import json
 import os
 import platform
@@ -18,6 +17,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import jax
 import numpy as np
@@ -180,11 +180,19 @@ class Run:
         return path
 
     def truncate(self, length: int) -> None:
-        """Take back the lines that were written after a checkpoint; they come again."""
+        """Take back the lines that were written after a checkpoint; they come again.
+
+        Raises:
+            LareError: lines from before it are missing.
+        """
         path = self.directory / METRICS
-        if path.exists():
-            with path.open("r+b") as file:
-                file.truncate(length)
+        size = path.stat().st_size if path.exists() else 0
+        if size < length:
+            raise LareError(
+                f"{path} has {size} bytes, and the checkpoint comes after {length}: was the run copied while it was training?"
+            )
+        if size > length:
+            os.truncate(path, length)
 
 
 def create(directory: Path, task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) -> Run:
@@ -195,7 +203,7 @@ def create(directory: Path, task: TaskSpec, plan: Plan, functions: Sequence[Late
     )
     if directory.exists() or directory.is_symlink():
         raise taken
-    new = directory.with_name(f".{directory.name}.{os.getpid()}.new")  # renamed when it is whole
+    new = directory.with_name(f".{directory.name}.{uuid4().hex}.new")  # renamed when it is whole
     try:
         new.mkdir(parents=True)
         for function, role in per_role(functions, task) if functions else ():
@@ -204,7 +212,7 @@ def create(directory: Path, task: TaskSpec, plan: Plan, functions: Sequence[Late
         write_atomically(new / CONFIG, lambda file: file.write(text.encode()))
         new.rename(directory)
     except OSError as error:
-        if isinstance(error, FileExistsError) or error.errno == errno.ENOTEMPTY:  # since a moment ago
+        if directory.exists():  # since a moment ago
             raise taken from None
         raise LareError(f"the run directory {directory} cannot be made: {error.strerror}") from error
     finally:
@@ -240,9 +248,13 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
     path = directory / METRICS
     try:
         lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
-        return [json.loads(line) for line in lines if line.endswith("\n")]
+        found = [json.loads(line) for line in lines if line.endswith("\n")]
     except (OSError, ValueError) as error:
         raise LareError(f"{path} is damaged: {error}") from error
+    for place, line in enumerate(found, start=1):
+        if not (isinstance(line, dict) and isinstance(line.get("step"), int) and isinstance(line.get("seed"), int)):
+            raise LareError(f"{path} is damaged: line {place} is no evaluation")
+    return found
 
 
 def read_measured(directory: Path) -> Run:
@@ -280,6 +292,8 @@ def locked(run: Run) -> Iterator[None]:
     with (run.directory / "lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             raise Busy(f"another process is training in {run.directory}") from None
+        except OSError:  # some network file systems lock nothing
+            pass
         yield
