@@ -361,6 +361,21 @@ def test_metrics_that_make_no_sense(file, in_this_process):
         jobs[0].step()
 
 
+def test_a_damaged_run_does_not_keep_the_others_from_going_on(file, monkeypatch):
+    wanted, jobs = read_sweep(file)
+    trained = []
+    monkeypatch.setattr(processes, "in_a_process", lambda job, cores, running: trained.append(job.name))
+    jobs[0].directory.mkdir(parents=True)
+    (jobs[0].directory / "config.json").write_text("{}")
+    (jobs[0].directory / "metrics.jsonl").write_text("5\n")
+    said = []
+    assert run_sweep(wanted, jobs, said.append) == jobs[:1]
+    assert sorted(trained) == sorted(job.name for job in jobs[1:])
+    assert any(
+        "dense-td3 failed: " in line and "metrics.jsonl is damaged: line 1 is no evaluation" in line for line in said
+    )
+
+
 def test_more_cores_than_there_are():
     with pytest.raises(LareError, match=r"^processes = 1000 of cores = 3 are 3000 cores, and this machine lends \d+$"):
         shares(1000, 3)

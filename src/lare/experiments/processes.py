@@ -38,9 +38,11 @@ def in_processes(
 
     def train(job: Job) -> str | None:
         share = slots.get()
-        said(f"{job.name} begins" + (f" again at step {job.step()}" if job.begun else ""))
         try:
+            said(f"{job.name} begins" + (f" again at step {job.step()}" if job.begun else ""))
             return in_a_process(job, share, running)
+        except (LareError, OSError) as error:  # of this run alone: the others go on
+            return str(error)
         finally:
             slots.put(share)
 
@@ -118,10 +120,11 @@ def in_a_process(job: Job, cores: list[int], running: Running) -> str | None:
         last_word = ""
         try:
             with contextlib.suppress(BrokenPipeError), process.stdin:  # which stays open as long as this process lives
-                process.stdin.write(order + "\n")
-                process.stdin.flush()
+                with contextlib.suppress(BrokenPipeError):
+                    process.stdin.write(order + "\n")
+                    process.stdin.flush()
                 last_word = process.stdout.read().strip()
-            process.wait()
+                process.wait()
         finally:
             process.stdout.close()
             running.ended(process)
@@ -151,10 +154,10 @@ def main() -> None:
     try:
         patiently(order["job"])
     except LareError as error:
-        answer.write(f"{error}\n")
-        answer.close()
-        with contextlib.suppress(OSError):
-            sys.stderr.write(f"{error}\n")
+        for place in (sys.stderr, answer):  # where the disk is full, or nobody is there any more, the other may do
+            with contextlib.suppress(OSError):
+                place.write(f"{error}\n")
+                place.flush()
         sys.exit(2)
 
 

@@ -182,7 +182,7 @@ def mann_whitney_u(ours: Float[np.ndarray, " ours"], theirs: Float[np.ndarray, "
 
 
 def curve_of_iqm(scores: Scores) -> Float[np.ndarray, " steps"]:
-    """rliable's `aggregate_iqm` of every step, all at once: a bootstrap asks for it thousands of times."""
+    """The `aggregate_iqm` of rliable at every step, all at once: a bootstrap asks for it thousands of times."""
     return trim_mean(scores.reshape(-1, scores.shape[-1]), 0.25, axis=0)
 
 

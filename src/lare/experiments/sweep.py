@@ -104,6 +104,14 @@ def jobs_of(sweep: Sweep, path: Path) -> Iterator[Job]:
             yield job_of(root, task, settings, functions)
 
 
+def is_done(job: Job) -> bool:
+    """Not one that is damaged: what is wrong with it is said when its turn comes."""
+    try:
+        return job.done
+    except LareError:
+        return False
+
+
 def run_sweep(share: Share, jobs: Sequence[Job], said: Callable[[str], None], ray: str | None = None) -> list[Job]:
     """Train what is not done, on this machine or on a Ray cluster; returns what failed.
 
@@ -111,7 +119,7 @@ def run_sweep(share: Share, jobs: Sequence[Job], said: Callable[[str], None], ra
         Interrupted: the user stopped it.
         LareError: there are not as many cores, or Ray cannot be had.
     """
-    missing = [job for job in jobs if not job.done]
+    missing = [job for job in jobs if not is_done(job)]
     done = len(jobs) - len(missing)
     said(f"{len(jobs)} runs, {done} of them done")
     if not missing:

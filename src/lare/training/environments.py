@@ -195,13 +195,13 @@ def evaluate(
     def checked(observation: object, seed: int, environment: EpisodicReward) -> Float[np.ndarray, " observation"]:
         return row(observation, "observation", environment.observation_space.shape, f"in an evaluation of seed {seed}")
 
-    def begun(environment: EpisodicReward, seed: int, number: int) -> Float[np.ndarray, " observation"]:
-        start = episode_seed(seed, Stream.EVALUATION_EPISODES, number)
+    def begun(environment: EpisodicReward, seed: int, place: int) -> Float[np.ndarray, " observation"]:
+        start = episode_seed(seed, Stream.EVALUATION_EPISODES, place)
         return checked(environment.reset(seed=start)[0], seed, environment)
 
     observation = np.stack(
         [
-            [begun(environment, seed, number) for number, environment in enumerate(of_seed, start=first)]
+            [begun(environment, seed, place) for place, environment in enumerate(of_seed, start=first)]
             for seed, of_seed in zip(seeds, environments, strict=True)
         ]
     )
