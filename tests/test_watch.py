@@ -18,7 +18,7 @@ def job_at(directory, step):
     directory.mkdir(parents=True)
     if step:
         (directory / "config.json").write_text("{}")
-        (directory / "metrics.jsonl").write_text(json.dumps({"step": step}) + "\n")
+        (directory / "metrics.jsonl").write_text(json.dumps({"step": step, "seed": 0}) + "\n")
     return Job(directory, toy_spec(), Plan(steps=100, evaluate_every=50))
 
 
@@ -28,7 +28,7 @@ def test_bars_follow_the_runs(monkeypatch, tmp_path):
     ended = threading.Event()
 
     def second_look():
-        (ends.directory / "metrics.jsonl").write_text('{"step": 100}\n')
+        (ends.directory / "metrics.jsonl").write_text('{"step": 100, "seed": 0}\n')
         return False
 
     looks = iter([lambda: False, second_look, lambda: True])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lare.algorithms.ppo import PPOSettings
-from lare.credit.closed_form import Linear
+from lare.credit.closed_form import LinearDecoder
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import METHODS, Encoder
 from lare.tasks.particles.table import find_particle_task
@@ -129,7 +129,7 @@ def numbered():
     learner, played = played_by(chosen)
     numbers = jnp.arange(played.reward.size, dtype=jnp.float32).reshape(played.reward.shape)
     credit = tuple(
-        one._replace(decoder=Linear(jnp.array([sign]), jnp.zeros(())))
+        one._replace(decoder=LinearDecoder(jnp.array([sign]), jnp.zeros(())))
         for one, sign in zip(learner.credit, (1.0, -1.0), strict=True)
     )
     own = np.asarray(numbers) * np.repeat([1.0, -1.0], [6, 2])
