@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from jaxtyping import Float
-from measure import write
+from measure import apart, correlation, write
 
 from lare.experiments.agents import proxy_rewards
 from lare.training import teams
@@ -36,17 +36,10 @@ def judged(session: Session, place: int) -> tuple[Rewards, Rewards]:
 
 
 def figures(true: Rewards, proxy: Rewards) -> Mapping[str, float]:
-    def apart(rewards: Rewards) -> Rewards:
-        """From their episode's mean."""
-        return rewards - rewards.mean(1, keepdims=True)
-
-    def together(one: np.ndarray, other: np.ndarray) -> float:
-        return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
-
     sums = proxy.sum(1)
     return {
-        "correlation within an episode": together(apart(true), apart(proxy)),
-        "correlation of returns": together(true.mean((1, 2)), proxy.mean((1, 2))),
+        "correlation within an episode": correlation(apart(true), apart(proxy)),
+        "correlation of returns": correlation(true.mean((1, 2)), proxy.mean((1, 2))),
         "deviation of a step among agents": float(proxy.std(2).mean()),
         "deviation of an agent's sum among agents": float(sums.std(1).mean()),
         "deviation of the mean sum among episodes": float(sums.mean(1).std()),

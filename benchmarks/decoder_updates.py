@@ -12,11 +12,12 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from measure import write
+from measure import apart, correlation, write
 
 from lare.credit import arel
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
+from lare.experiments.agents import indifferent
 from lare.tasks.particles.table import find_particle_task
 from lare.tasks.particles.task import STEPS
 from lare.training import teams
@@ -34,8 +35,8 @@ def no_factors(episodes: int) -> jax.Array:
 
 
 def random_episodes(learner: Learner, key: int, count: int, recipe: Recipe) -> Played:
-    policy = jax.tree.map(jnp.zeros_like, learner.algorithm.online.actor)  # a network of zeros prefers nothing
-    return jax.jit(partial(teams.play, count=count, recipe=recipe))(policy, jax.random.key(key))
+    play = jax.jit(partial(teams.play, count=count, recipe=recipe))
+    return play(indifferent(learner.algorithm.online.actor), jax.random.key(key))
 
 
 def judged(learner: Learner, played: Played, recipe: Recipe) -> tuple[float, float]:
@@ -44,12 +45,8 @@ def judged(learner: Learner, played: Played, recipe: Recipe) -> tuple[float, flo
     rows = teams.features(played, no_factors(JUDGED), recipe)
     r_hat = teams.rewards(learner, rows, true, recipe)
     one, other = np.asarray(true).mean(2), np.asarray(r_hat).mean(2)
-
-    def together(one: np.ndarray, other: np.ndarray) -> float:
-        return round(float(np.corrcoef(one.ravel(), other.ravel())[0, 1]), 3)
-
-    apart = (values - values.mean(1, keepdims=True) for values in (one, other))
-    return together(*apart), together(one.sum(1), other.sum(1))
+    within = correlation(apart(one), apart(other))
+    return round(within, 3), round(correlation(one.sum(1), other.sum(1)), 3)
 
 
 def curve(name: str, updates: int) -> Iterator[tuple[int, tuple[float, float]]]:

@@ -12,6 +12,8 @@ from statistics import median
 from typing import Any
 
 import jax
+import numpy as np
+from jaxtyping import Float
 
 import lare
 from lare.source import source
@@ -46,6 +48,16 @@ TD3 = {
     "policy_kwargs": {"net_arch": [256, 256]},
 }
 """Hyperparameters of the paper's TD3, as Stable-Baselines3 and SBX call them."""
+
+
+def apart(rewards: Float[np.ndarray, "episodes steps *agents"]) -> Float[np.ndarray, "episodes steps *agents"]:
+    """Rewards as deviations from their episode's mean."""
+    return rewards - rewards.mean(1, keepdims=True)
+
+
+def correlation(one: np.ndarray, other: np.ndarray) -> float:
+    """Pearson's, over all entries."""
+    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
 
 
 def interleave(contenders: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:

@@ -31,3 +31,12 @@ def test_two_at_a_time_do_not_meet(tmp_path):
 
     write_atomically(path, while_another)
     assert [(one.name, one.read_bytes()) for one in tmp_path.iterdir()] == [("table.csv", b"first and whole")]
+
+
+def test_who_is_interrupted_leaves_nothing_behind(tmp_path):
+    def interrupted(file):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(tmp_path / "table.csv", interrupted)
+    assert not list(tmp_path.iterdir())

@@ -59,7 +59,7 @@ def completed(default: Any, given: Any) -> Any:
 
 def shortened(value: Any) -> str:
     """How a value is written, as far as it fits into a line."""
-    text = repr(value)
+    text = " ".join(map(str.strip, repr(value).splitlines()))  # arrays take several
     return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]}..."
 
 

@@ -26,6 +26,6 @@ def replace(path: Path, write: Callable[[Any], object]) -> None:
             file.flush()
             os.fsync(file.fileno())
         new.replace(path)
-    except OSError:
+    except BaseException:  # nobody else would know its name
         new.unlink(missing_ok=True)
         raise

@@ -1,11 +1,12 @@
 """Environments that fail, in one line."""
 
 import gymnasium
+import numpy as np
 import pytest
 
 from lare.errors import LareError
 from lare.latent.verify import steps_in
-from lare.tasks.environment import make
+from lare.tasks.environment import make, number
 from toys import Chase
 
 
@@ -58,3 +59,10 @@ def test_gymnasium_can_make_it_again():
     environment = make("toys/Chase-v0")
     assert environment.spec is not None
     assert gymnasium.make(environment.spec).reset(seed=0)[0] == pytest.approx(environment.reset(seed=0)[0])
+
+
+def test_many_numbers_for_one_are_a_line_too():
+    with pytest.raises(LareError) as error:
+        number(np.zeros(40), "the reward")
+    assert "\n" not in str(error.value)
+    assert str(error.value).endswith("..., which is no number")

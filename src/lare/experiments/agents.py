@@ -103,12 +103,17 @@ def factors_of(session: Session, played: Played) -> Float[np.ndarray, "steps epi
     return session.factors(jax.tree.map(lambda leaf: leaf[None], played))[0]
 
 
+def indifferent(policy: Policy) -> Policy:
+    """Of a policy's form, but with random actions: a network of zeros prefers nothing."""
+    return jax.tree.map(jnp.zeros_like, policy)
+
+
 def sample(run: Run, random: bool = False) -> list[Sample]:
     """Steps of each team, under the first seed's policy, or under random actions."""
     session, _ = restore(run)
     recipe, policy = session.recipe, of_seed(session.learner).algorithm.online.actor
-    if random:  # a network of zeros prefers nothing
-        policy = jax.tree.map(jnp.zeros_like, policy)
+    if random:
+        policy = indifferent(policy)
     played = jax.jit(partial(teams.play, count=SAMPLED, recipe=recipe))(policy, jax.random.key(1))
     factors, found = factors_of(session, played), []
     for place, team in enumerate(recipe.task.teams):

@@ -6,6 +6,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 from jaxtyping import Float
 
@@ -43,9 +44,13 @@ def policy_of(run: Run, seed: int | None = None) -> Callable[[np.ndarray], np.nd
         raise LareError(f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy")
     if seed is not None and seed not in run.seeds:
         raise LareError(f"{run.directory} has no seed {seed}: there are {', '.join(map(str, run.seeds))}")
-    place, policy = 0 if seed is None else run.seeds.index(seed), load_policy(run)
     with closing(make_episodic(run.config.task)) as environment:
-        space = environment.action_space
+        return acting(run, environment.action_space, 0 if seed is None else run.seeds.index(seed))
+
+
+def acting(run: Run, space: gymnasium.Space, place: int = 0) -> Callable[[np.ndarray], np.ndarray]:
+    """The deterministic policy of one of the seeds, from one observation to one action within the space."""
+    policy = load_policy(run)
 
     def act(observation: np.ndarray) -> np.ndarray:
         everyone = np.broadcast_to(np.asarray(observation, np.float32), (len(run.seeds), len(observation)))
@@ -105,7 +110,7 @@ def record_video(run: Run, path: str | Path) -> None:
 
 def drawn(run: Run, environment: EpisodicReward, every: int) -> Iterator[np.ndarray]:
     """Pictures of every so many steps of an episode. Raises `LareError` where this machine draws none."""
-    act = policy_of(run)
+    act = acting(run, environment.action_space)
     observation, _ = environment.reset(seed=episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
     ended, step = False, 0
     while not ended:
