@@ -16,13 +16,14 @@ import numpy as np
 from measure import write
 
 from lare.credit import accuracy, decomposition
+from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Fit
 from lare.normalise import Scale
 from lare.training import learner as common
 from lare.training import replay
 from lare.training.credit_draws import CreditDraws, draw_parts_of_episodes
-from lare.training.learner import RECENT, Learner
+from lare.training.learner import Learner
 from lare.training.recipe import Recipe
 from lare.training.run import open_run
 from lare.training.single_agent import load_learner

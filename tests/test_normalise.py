@@ -64,7 +64,7 @@ def test_scale_is_one_as_long_as_every_return_was_zero():
 def test_the_range_of_what_counted():
     scale = normalise.observe_scale(normalise.no_scale(), jnp.array([3.0, 9.0, -5.0]), jnp.array([True, False, False]))
     assert (float(scale.lowest), float(scale.highest)) == (3, 3)
-    np.testing.assert_array_equal(normalise.within_range(scale, jnp.array([3.0, 4.0])), [0, 0])
+    np.testing.assert_array_equal(normalise.within_range(scale, jnp.array([3.0, 4.0])), [0.5, 0.5])
     scale = normalise.observe_scale(scale, jnp.array([1.0, 5.0, 99.0]), jnp.array([True, True, False]))
     np.testing.assert_array_equal(normalise.within_range(scale, jnp.array([1.0, 2.0, 5.0])), [0, 0.25, 1])
     untouched = normalise.observe_scale(normalise.no_scale(), jnp.array([3.0]), jnp.array([False]))

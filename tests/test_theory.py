@@ -58,7 +58,7 @@ def test_optimism_against_trying_every_policy(mdp):
     for row in counts:
         state = theory.take_in(state, jnp.asarray(row), jnp.asarray(row.sum() / 2))
     choices = theory.policies(CORES, ACTIONS)
-    expected = jnp.stack([theory.spread(theory.visits(mdp, policy, HORIZON), table) for policy in choices])
+    expected = jnp.stack([theory.shared_out(theory.visits(mdp, policy, HORIZON), table) for policy in choices])
     inverse = np.linalg.inv(np.asarray(state.design, np.float64))
     values = [h @ inverse @ np.asarray(state.products) + 3.0 * np.sqrt(h @ inverse @ h) for h in np.asarray(expected)]
     assert int(theory.optimistic(state, expected, jnp.array(3.0))) == int(np.argmax(values))
@@ -71,7 +71,7 @@ def test_an_episode_meets_what_it_says(mdp):
     counts, totals = play(jax.random.split(jax.random.key(1), 20_000))
     expected = theory.visits(mdp, policy, HORIZON)
     assert set(np.asarray(counts.sum(axis=1))) == {HORIZON}
-    np.testing.assert_allclose(counts.mean(axis=0), theory.spread(expected, table), atol=0.03)
+    np.testing.assert_allclose(counts.mean(axis=0), theory.shared_out(expected, table), atol=0.03)
     assert float(totals.mean()) == pytest.approx(float(jnp.sum(expected * mdp.reward)), abs=0.03)
 
 

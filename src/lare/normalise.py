@@ -76,9 +76,9 @@ def observe_scale(scale: Scale, values: Float[Array, " batch"], counts: Bool[Arr
 
 
 def within_range(scale: Scale, values: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """(x - lowest) / (highest - lowest); 0 as long as they are the same."""
+    """(x - lowest) / (highest - lowest); 0.5 as long as they are the same: which is good is not known."""
     width = scale.highest - scale.lowest
-    return jnp.where(width > 0, (values - scale.lowest) / jnp.where(width > 0, width, 1), 0)
+    return jnp.where(width > 0, (values - scale.lowest) / jnp.where(width > 0, width, 1), 0.5)
 
 
 def magnitude(scale: Scale) -> Float[Array, ""]:

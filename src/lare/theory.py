@@ -86,7 +86,7 @@ def visits(mdp: MDP, policy: Int[Array, " cores"], horizon: int) -> Float[Array,
     return jnp.sum(chances, axis=0)[:, None] * jax.nn.one_hot(policy, actions)
 
 
-def spread(of_core: Float[Array, "*batch cores actions"], table: Table) -> Float[Array, "*batch size"]:
+def shared_out(of_core: Float[Array, "*batch cores actions"], table: Table) -> Float[Array, "*batch size"]:
     """A table of the core's entries, each shared out evenly over the redundant ones."""
     share = jnp.repeat(of_core[..., :, None, :] / table.redundant, table.redundant, axis=-2)
     return share.reshape(*of_core.shape[:-2], table.size)
@@ -147,9 +147,9 @@ def oful(key: PRNGKeyArray, mdp: MDP, redundant: int, horizon: int, episodes: in
     table, ridge = Table(cores, redundant, actions), float(horizon)
     choices = policies(cores, actions)
     of_core = jax.vmap(lambda policy: visits(mdp, policy, horizon))(choices)
-    expected = spread(of_core, table)
+    expected = shared_out(of_core, table)
     value = jnp.sum(of_core * mdp.reward, axis=(1, 2))
-    true = spread(mdp.reward * redundant, table)
+    true = shared_out(mdp.reward * redundant, table)
 
     def one(carry: tuple[Estimator, Float[Array, ""]], turn: tuple[PRNGKeyArray, Float[Array, ""]]):
         (state, regret), (key, number) = carry, turn

@@ -13,7 +13,8 @@ from lare.algorithms import ppo
 from lare.algorithms.ppo import PPOSettings
 from lare.errors import LareError
 from lare.experiments import agents
-from lare.experiments.evaluation import evaluate_run, record_video
+from lare.experiments.evaluation import evaluate_run
+from lare.experiments.video import record_video
 from lare.training import teams
 from lare.training.many_agents import load_learner
 from lare.training.seeds import of_seed

@@ -1,10 +1,12 @@
+import gymnasium
 import numpy as np
 import pytest
 
 import lare
 from lare.errors import LareError
 from lare.experiments import evaluation
-from lare.experiments.evaluation import check_video, evaluate_run, load_policy, policy_of, write_video
+from lare.experiments.evaluation import evaluate_run, load_policy, policy_of
+from lare.experiments.video import check_video, write_video
 from lare.tasks.episodic import EpisodicReward
 from lare.tasks.spec import read_task
 from lare.training.environments import evaluate, make_episodic, to_bounds
@@ -73,6 +75,15 @@ def test_the_policy_of_each_seed(small, tmp_path):
     np.testing.assert_array_equal(policy_of(run)(observation), policy_of(run, 0)(observation))
     with pytest.raises(LareError, match=r"run has no seed 7: there are 0, 1$"):
         policy_of(run, 7)
+
+
+def test_the_policy_of_a_choice_gives_what_the_environment_takes(small, tmp_path):
+    spec = toy_spec(environment="toys/Pick-v0", observation_size=4, action_size=4)
+    run = lare.train(spec, small(method="dense", algorithm="ppo"), out=tmp_path / "run", listeners=[])
+    policy, observation = policy_of(run), np.eye(4, dtype=np.float32)[2]
+    assert gymnasium.make("toys/Pick-v0").action_space.contains(np.int64(policy(observation)))
+    row = load_policy(run)(np.stack([observation, observation]))[0]
+    assert policy(observation) == int(np.argmax(row))
 
 
 def test_many_agents_have_no_single_policy(small_many, tmp_path):

@@ -271,6 +271,11 @@ def test_how_a_process_ended(file, monkeypatch):
             "sac.gamma makes no difference to td3 on Reacher-v4; it has td3.gamma",
         ),
         (("[settings]", "[settings]\ncredit = { sum_form = true }"), "credit.sum_form makes no difference to dense"),
+        ((', "lare-linear"', ""), "draws are given, and none of the methods needs a latent function"),
+        (
+            ("[settings]", '[functions]\nReacher-v4 = ["phi.py"]\n[settings]'),
+            "draws choose recorded functions, and every task is given functions of its own: leave either out",
+        ),
     ],
 )
 def test_a_file_that_lies(change, message, file):
@@ -285,9 +290,9 @@ def test_a_file_that_lies(change, message, file):
     [
         (("draws = [0, 3]", "draws = [7]"), "no recording of factors has draw 7; the draws are 0, 1, 2, 3, 4"),
         (("chunk = 50", "candidates = 3"), "no recorded reply fits this request for task 'Reacher-v4' (reply 1): "),
-        (("chunk = 50", "capacity = 40"), "capacity = 40 is too small: an episode of Reacher-v4 takes up to 51"),
+        (("chunk = 50", "capacity = 40"), "capacity = 40 is too small: a chunk of Reacher-v4 takes up to 150"),
         (
-            ("[settings]", '[functions]\nReacher-v4 = ["phi.py"]\n[settings]'),
+            ("draws = [0, 3]", '[functions]\nReacher-v4 = ["phi.py"]'),
             "the function file {}/phi.py is not there",
         ),
     ],
@@ -300,9 +305,9 @@ def test_a_run_that_could_not_be_trained_is_found_before_any_is(change, message,
 
 
 def test_a_function_of_ones_own(file, tmp_path, in_this_process):
-    """It takes the place of all draws, and a run with another one is not taken for it."""
+    """It takes the place of the draws, and a run with another one is not taken for it."""
     lare.design(lare.load_task("Reacher-v4"), draw=2).save(tmp_path / "phi.py")
-    file.write_text(FILE.replace("[settings]", '[functions]\nReacher-v4 = ["phi.py"]\n\n[settings]'))
+    file.write_text(FILE.replace("draws = [0, 3]", '[functions]\nReacher-v4 = ["phi.py"]'))
     wanted, jobs = read_sweep(file)
     assert [job.directory.name for job in jobs] == ["dense-td3", "lare-linear-td3"]
     assert run_sweep(wanted, jobs, lambda _: None) == []

@@ -48,6 +48,10 @@ def test_an_algorithms_output_becomes_the_choice_of_its_largest_number():
     np.testing.assert_array_equal(to_bounds(np.array([-1, 0.5, 0.4], np.float32), Choice(3)), [0, 1, 0])
 
 
+def test_the_number_of_a_choice_counts_from_the_environments_first():
+    assert Choice(3, start=5).number(np.array([0.2, 0.1, 0.9], np.float32)) == 7
+
+
 def test_what_is_a_row_already_stays_as_it_is():
     assert not isinstance(make("Pendulum-v1").unwrapped, ChoiceAction)
     assert make("Pendulum-v1").observation_space.shape == (3,)

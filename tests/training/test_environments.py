@@ -1,6 +1,8 @@
 import gymnasium
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lare.errors import LareError
 from lare.tasks.episodic import EpisodicReward
@@ -25,6 +27,16 @@ def test_actions_are_rescaled():
     np.testing.assert_allclose(to_bounds(np.float32([-1, 1]), space), [-0.4, 10])
     np.testing.assert_allclose(to_bounds(np.float32([0, 0]), space), [0, 5])
     np.testing.assert_allclose(to_bounds(np.float32([-3, 1.5]), space), [-0.4, 10])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@given(low=st.lists(st.floats(-1e3, 1e3, width=32), min_size=1, max_size=3), width=st.floats(0.125, 1e3, width=32))
+def test_actions_are_within_their_space_to_the_last_digit(dtype, low, width):
+    """Rounding leads beyond a bound that a sum of others should come to, and a coarser number is not the bound."""
+    bounds = np.array(low, dtype) / dtype(3), np.array(low, dtype) / dtype(3) + dtype(width)
+    space = gymnasium.spaces.Box(*bounds, dtype=dtype)
+    for action in (-1, -0.3, 0.99999994, 1):
+        assert space.contains(to_bounds(np.full(len(low), action, np.float32), space))
 
 
 def test_streams_of_random_numbers_are_apart():
@@ -61,6 +73,30 @@ def test_replaying_actions_leads_back():
     again = [collect([one], follow, np.zeros((5, 1, 1), np.float32)).steps for one in (first, second)]
     np.testing.assert_array_equal(again[0].next_observation, again[1].next_observation)
     assert not second.replay(first.actions[:3], first.observation)
+
+
+def test_an_environment_that_ends_sooner_when_it_is_played_again_does_not_lead_back():
+    """And is not stepped after its end, which some refuse."""
+
+    class Chancy(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-99, 99, (1,), np.float32)
+        action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+        lives = iter((9, 2))
+
+        def reset(self, *, seed=None, options=None):
+            self.left = next(self.lives)
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            assert self.left, "step after the end"
+            self.left -= 1
+            return np.zeros(1, np.float32), 0.0, not self.left, False, {}
+
+    one = Lane(0, EpisodicReward(Chancy()))
+    one.begin()
+    for _ in range(5):
+        one.step(np.zeros(1, np.float32))
+    assert not one.replay(one.actions, one.observation)
 
 
 def test_an_environment_that_writes_into_one_array_is_stored_as_it_was_then():

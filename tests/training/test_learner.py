@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lare.credit.accuracy import RECENT
 from lare.credit.closed_form import LinearDecoder
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import TABLE, Fit, Reward
@@ -162,7 +163,7 @@ def test_accuracy_is_of_the_newest_steps():
     given.factors[:, 0] = given.reward + np.where(np.arange(len(given.reward)) < len(given.reward) - 10, 7.0, 0.5)
     learner = common.store(common.init(jax.random.key(0), chosen), given, chosen)
     learner = learner._replace(credit=learner.credit._replace(decoder=LinearDecoder(jnp.ones(1), jnp.zeros(()))))
-    newest, every = (common.assess(learner, count, chosen) for count in (10, common.RECENT))
+    newest, every = (common.assess(learner, count, chosen) for count in (10, RECENT))
     assert float(newest["credit/error"]) == pytest.approx(0.5, rel=1e-5)
     assert float(newest["credit/correlation"]) == pytest.approx(1, rel=1e-4)
     assert float(every["credit/error"]) == pytest.approx(

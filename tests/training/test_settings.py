@@ -4,6 +4,7 @@ import pytest
 
 from lare.algorithms.ppo import PPOSettings
 from lare.algorithms.table import IPPO
+from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import TABLE
 from lare.errors import LareError
@@ -85,6 +86,14 @@ def test_tables_within_tables():
             {"method": "rd", "algorithm": "ppo", "credit": {"fits": 3}, "chunk": 5},
             ["chunk", "credit.fits"],
         ),
+        ("Reacher-v4", {"method": "diaster", "credit": {"sum_form": True}}, ["credit.sum_form"]),
+        ("Reacher-v4", {"algorithm": "ddpg", "ddpg": {"noise_clip": 0.2}}, ["ddpg.noise_clip"]),
+        ("Reacher-v4", {"algorithm": "ddpg", "ddpg": {"noise_clip": 0.2, "policy_noise": 0.1}}, []),
+        ("Reacher-v4", {"method": "dense", "algorithm": "ppo", "capacity": 10_000}, ["capacity"]),
+        ("Reacher-v4", {"method": "rrdu", "algorithm": "ppo", "capacity": 10_000}, []),
+        ("Reacher-v4", {"method": "dense", "capacity": 10_000}, []),
+        ("CN-6", {"method": "lare-linear", "agents": {"capacity": 100}}, ["agents.capacity"]),
+        ("CN-6", {"method": "ircr", "agents": {"capacity": 100}}, []),
         ("Reacher-v4", {"method": "ircr", "algorithm": "ppo", "rollout": {"fit_updates": 3}}, ["rollout.fit_updates"]),
     ],
 )
@@ -121,6 +130,16 @@ def test_every_setting_of_the_decoder_matters_to_some_method():
             {"steps": 5000},
             "steps = 5000 is not a multiple of 2050 (agents.episodes = 82, of 25 steps each): take 4100",
         ),
+        (
+            "Reacher-v4",
+            {"method": "rrd", "credit": {"steps": 16}},
+            "credit.steps = 16 is less than credit.drawn_steps = 64, of one episode",
+        ),
+        (
+            "Reacher-v4",
+            {"method": "diaster", "credit": {"hidden": ()}},
+            "credit.hidden is empty, and diaster needs a hidden layer",
+        ),
         ("Reacher-v4", {"steps": 1001}, "steps = 1001 is not a multiple of chunk = 50: take 1000"),
     ],
 )
@@ -128,6 +147,23 @@ def test_what_does_not_go_together_is_refused(task, settings, message):
     with pytest.raises(LareError) as error:
         decide(Settings(**settings), read_task(task))
     assert str(error.value) == message
+
+
+def test_who_acts_within_bounds_cannot_choose():
+    spec = toy_spec(environment="toys/Pick-v0", observation_size=4, action_size=4)
+    with pytest.raises(
+        LareError, match=r"^sac acts by numbers within bounds, and Chase offers a choice: ppo can choose$"
+    ):
+        decide(Settings(algorithm="sac"), spec)
+
+
+def test_room_is_made_for_what_is_read_again():
+    reacher, figures = read_task("Reacher-v4"), {"algorithm": "ppo", "steps": 100_000, "rollout": {"steps": 2000}}
+    assert decide(Settings(method="rrdu", **figures), reacher).rows(longest=50) == 200_002
+    assert decide(Settings(method="dense", **figures), reacher).rows(longest=50) == 2 * 2000 + 50 + RECENT
+    assert decide(Settings(method="dense", **(figures | {"steps": 2000})), reacher).rows(longest=50) == 4002
+    assert decide(Settings(method="rrdu"), read_task("CN-6")).episodes == 15_000
+    assert decide(Settings(method="dense"), read_task("CN-6")).episodes == 82
 
 
 def test_how_often_ppo_fits_its_decoder():

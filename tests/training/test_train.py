@@ -33,11 +33,16 @@ OF_ONE = [method.name for method in METHODS.values() if not method.for_many_only
 ONE_AGENT = [row.name for row in ALGORITHMS.values() if row.kind is not Kind.MANY_AGENTS]
 
 
+def needed(method, function):
+    """The function, where the method takes one."""
+    return function if METHODS[method].latent else None
+
+
 @pytest.mark.parametrize("algorithm", ONE_AGENT)
 @pytest.mark.parametrize("method", OF_ONE)
 def test_every_method_trains_and_reports(method, algorithm, small, phi, reward, tmp_path):
     settings, row = small(method=method, algorithm=algorithm), METHODS[method]
-    function = reward if row.kind == "reward" else phi
+    function = needed(method, reward if row.kind == "reward" else phi)
     run = lare.train(toy_spec(), settings, function=function, out=tmp_path / "run", listeners=[])
     lines = run.metrics()
     assert [(line["step"], line["seed"]) for line in lines] == [
@@ -76,10 +81,13 @@ def test_a_run_says_what_is_random_and_what_is_done_already(small, tmp_path):
     heard = At(-1, None)
     lare.train(toy_spec(), small(steps=180, method="dense"), out=tmp_path / "run", listeners=[heard])
     warmup = small().td3.warmup
-    assert heard.messages == [f"the first {warmup:,} steps are random: nothing is learned from them yet"]
+    assert heard.messages == [f"the first {warmup:,} steps are random (td3.warmup): nothing is learned from them yet"]
     heard = At(-1, None)
     lare.resume(tmp_path / "run", listeners=[heard])
     assert heard.messages == ["nothing is left to do: it had come to its end"]
+    heard = At(-1, None)
+    lare.train(toy_spec(), small(steps=24, evaluate_every=24, method="dense"), out=tmp_path / "few", listeners=[heard])
+    assert heard.messages == ["all 24 steps are random (td3.warmup): nothing is learned from them yet"]
 
 
 def test_a_run_says_what_was_set_in_vain(small, tmp_path):
@@ -151,8 +159,10 @@ def test_judges(judges, small, phi, tmp_path):
 def test_a_killed_run_resumes_bit_for_bit(algorithm, method, small, phi, tmp_path):
     """SIGKILL in a process of its own, in the middle of an episode and between two checkpoints."""
     settings = small(method=method, algorithm=algorithm, rollout=RolloutSettings(steps=12, fit_updates=2))
-    whole = lare.train(toy_spec(), settings, function=phi, out=tmp_path / "whole", listeners=[])
-    phi.save(tmp_path / "phi")
+    given = needed(method, phi)
+    whole = lare.train(toy_spec(), settings, function=given, out=tmp_path / "whole", listeners=[])
+    if given:
+        given.save(tmp_path / "phi")
     (tmp_path / "settings.json").write_text(settings.model_dump_json())
     script = """
 import json, os, signal, sys
@@ -161,7 +171,8 @@ import lare
 spec = toy_spec()
 kill = At(156, lambda: os.kill(os.getpid(), signal.SIGKILL))
 settings = lare.Settings(**json.load(open("settings.json")))
-lare.train(spec, settings, function=lare.load_function("phi.py", spec), out="killed", listeners=[kill])
+given = lare.load_function("phi.py", spec) if os.path.exists("phi.py") else None
+lare.train(spec, settings, function=given, out="killed", listeners=[kill])
 """
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
     died = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True)
@@ -373,6 +384,11 @@ def test_a_function_that_is_given_is_not_chosen_among_recorded_ones(choice, smal
         lare.train(toy_spec(), small(**choice), function=phi, out=tmp_path / "run", listeners=[])
 
 
+def test_a_function_that_nobody_needs(phi, small, tmp_path):
+    with pytest.raises(LareError, match=r"^rrdu needs no latent function, and one is given: leave it out$"):
+        lare.train(toy_spec(), small(method="rrdu"), function=phi, out=tmp_path / "run", listeners=[])
+
+
 @pytest.mark.parametrize("error", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")])
 def test_a_replay_that_the_memory_does_not_hold(error, small, tmp_path, monkeypatch):
     def full(run):
@@ -387,17 +403,17 @@ def test_a_replay_that_the_memory_does_not_hold(error, small, tmp_path, monkeypa
 
 
 def test_a_replay_too_small_for_an_episode_is_refused(small, tmp_path):
-    with pytest.raises(LareError, match="capacity = 20 is too small: an episode of Chase takes up to 21"):
+    with pytest.raises(LareError, match="capacity = 20 is too small: a chunk of Chase takes up to 44"):
         lare.train(toy_spec(), small(method="dense", capacity=20), out=tmp_path / "run", listeners=[])
     with pytest.raises(
         LareError,
         match="steps = 400 are too few: an episode of HalfCheetah-v4 takes up to 1000",
     ):
         lare.train("HalfCheetah-v4", small(steps=400, chunk=4), out=tmp_path / "few")
-    with pytest.raises(LareError, match="capacity = 40 is too small: a chunk takes up to 44"):
-        lare.train(toy_spec(), small(method="dense", capacity=40), out=tmp_path / "run", listeners=[])
-    with pytest.raises(LareError, match="capacity = 100 is too small: a rollout takes up to 140"):
-        lare.train(toy_spec(), small(algorithm="ppo", method="dense", capacity=100), out=tmp_path / "run", listeners=[])
+    with pytest.raises(LareError, match="capacity = 43 is too small: a chunk of Chase takes up to 44"):
+        lare.train(toy_spec(), small(method="dense", capacity=43), out=tmp_path / "run", listeners=[])
+    with pytest.raises(LareError, match="capacity = 100 is too small: a rollout of Chase takes up to 140"):
+        lare.train(toy_spec(), small(algorithm="ppo", method="rrdu", capacity=100), out=tmp_path / "run", listeners=[])
     assert not (tmp_path / "run").exists()
 
 
@@ -457,7 +473,7 @@ def test_must_learn_the_toy(algorithm, method, phi, tmp_path):
         **{algorithm: ALGORITHMS[algorithm].settings.model_copy(update=small)},
         credit=lare.training.settings.CreditSettings(hidden=(32, 32), learning_rate=3e-3, drawn_steps=8, steps=64),
     )
-    run = lare.train(toy_spec(), settings, function=phi, out=tmp_path / "run", listeners=[])
+    run = lare.train(toy_spec(), settings, function=needed(method, phi), out=tmp_path / "run", listeners=[])
     assert run.metrics()[-1]["evaluation/return"] > -3
 
 
@@ -472,7 +488,7 @@ def test_ppo_must_learn_the_toy(method, phi, tmp_path):
         rollout=RolloutSettings(steps=200, fit_updates=50),
         credit=lare.training.settings.CreditSettings(hidden=(32, 32), learning_rate=3e-3, drawn_steps=8, steps=64),
     )
-    run = lare.train(toy_spec(), settings, function=phi, out=tmp_path / "run", listeners=[])
+    run = lare.train(toy_spec(), settings, function=needed(method, phi), out=tmp_path / "run", listeners=[])
     assert run.metrics()[-1]["evaluation/return"] > -3
 
 
@@ -490,6 +506,6 @@ def test_ppo_must_learn_to_choose(method, tmp_path):
         rollout=RolloutSettings(steps=200, fit_updates=50),
         credit=lare.training.settings.CreditSettings(hidden=(32,), learning_rate=3e-3, drawn_steps=8, steps=64),
     )
-    run = lare.train(spec, settings, function=function, out=tmp_path / "run", listeners=[])
+    run = lare.train(spec, settings, function=needed(method, function), out=tmp_path / "run", listeners=[])
     assert run.config.discrete
     assert run.metrics()[-1]["evaluation/return"] > 17

@@ -84,7 +84,7 @@ def design(
             candidates=candidates,
             reflect=reflect,
             pre_verification=pre_verification,
-            policy=acting(policy, spec),
+            policy=policy_that_plays(policy, spec),
             record=record,
             said=progress,
         )
@@ -137,17 +137,17 @@ def save_function(function: LatentFunction, out: Path) -> None:
     say(f"wrote {out.with_suffix('.py')}: {function.size} factors ({', '.join(function.names)})")
 
 
-def acting(run: Path | None, spec: TaskSpec) -> Callable[[np.ndarray], np.ndarray] | None:
+def policy_that_plays(run: Path | None, spec: TaskSpec) -> Callable[[np.ndarray], np.ndarray] | None:
     """The policy of a run, if there is one."""
     if run is None:
         return None
-    from lare.experiments.evaluation import policy_of
+    from lare.experiments.evaluation import acting, action_space
     from lare.training.run import open_run
 
     opened = open_run(run)
     if opened.config.task.environment != spec.environment:
         raise LareError(f"{run} is a run of {opened.config.task.name}: its policy cannot play {spec.name}")
-    return policy_of(opened)
+    return acting(opened, action_space(opened))
 
 
 def check_design(

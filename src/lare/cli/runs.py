@@ -68,8 +68,9 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
         episodes: episodes for each seed. A single agent acts without noise, agents of particle tasks as in training.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
-    from lare.experiments.evaluation import check_video, evaluate_run, record_video
+    from lare.experiments.evaluation import evaluate_run
     from lare.experiments.statistics import mean_and_deviation, plus_minus
+    from lare.experiments.video import check_video, record_video
     from lare.training.run import open_run
 
     opened = open_run(run)
@@ -77,7 +78,7 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
         check_video(video)
         if not opened.config.task.particles:
             if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
-                os.environ.setdefault("MUJOCO_GL", "egl")  # which needs no screen; it is read when MuJoCo is imported
+                os.environ.setdefault("MUJOCO_GL", "egl")  # which needs no screen
             progress("filming an episode; without a graphics card that may take minutes")
         record_video(opened, video)
         say(f"wrote {video}")

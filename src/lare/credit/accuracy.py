@@ -3,6 +3,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+RECENT = 5000
+"""Steps over which a single agent's are compared: the newest."""
+
 
 def metrics(
     r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], counts: Bool[Array, " steps"], in_units: bool

@@ -104,7 +104,7 @@ def forget_running(totals: Totals) -> Totals:
     return totals._replace(running=jnp.zeros_like(totals.running), steps=jnp.zeros_like(totals.steps))
 
 
-def spread(totals: Totals) -> Float[Array, " features"]:
+def deviations(totals: Totals) -> Float[Array, " features"]:
     """S: the deviations of the episodes' mean factors; 1 for one that never varied."""
     of_each = jnp.sqrt(jnp.diagonal(totals.products)[:-1] / jnp.maximum(totals.episodes, 1))
     return jnp.where(of_each > 1e-6 * jnp.abs(totals.mean[:-1]), of_each, 1)
@@ -112,13 +112,13 @@ def spread(totals: Totals) -> Float[Array, " features"]:
 
 def design_matrix(totals: Totals, ridge: float) -> Float[Array, "features features"]:
     """A."""
-    unit = spread(totals)
+    unit = deviations(totals)
     return totals.products[:-1, :-1] / jnp.outer(unit, unit) + ridge * jnp.eye(len(unit))
 
 
 def ridge_regression(totals: Totals, ridge: float) -> LinearDecoder:
     """The regularised least-squares estimate of the rewards."""
-    unit, mean = spread(totals), totals.mean
+    unit, mean = deviations(totals), totals.mean
     weight = jnp.linalg.solve(design_matrix(totals, ridge), totals.products[:-1, -1] / unit) / unit
     return LinearDecoder(weight, mean[-1] - weight @ mean[:-1])
 
@@ -137,7 +137,7 @@ def uncertainty(
     totals: Totals, features: Float[Array, "rows features"], ridge: float, delta: float
 ) -> Float[Array, " rows"]:
     """l_k |x|_{A^-1}: how far r_hat may be from the true reward of each row, in the rewards' units."""
-    x = (features - totals.mean[:-1]) / spread(totals)
+    x = (features - totals.mean[:-1]) / deviations(totals)
     inverse = jnp.linalg.inv(design_matrix(totals, ridge))
     length = 1 / jnp.maximum(totals.episodes, 1) + jnp.sum((x @ inverse) * x, axis=1)
     return radius(totals, ridge, delta) * jnp.sqrt(length)

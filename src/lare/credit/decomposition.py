@@ -274,9 +274,9 @@ def loss_of_pieces(
 ) -> Float[Array, ""]:
     """Diaster."""
     assert isinstance(decoder, Diaster)
-    target, weight = targets(state, episodes, settings)
+    target, _ = targets(state, episodes, settings)
     whole = episodes.features.reshape(len(target), -1, episodes.features.shape[-1])
-    return decoder.loss(inputs(state, whole, settings), episodes.length, target, weight, key)
+    return decoder.loss(inputs(state, whole, settings), episodes.length, target, episodes.counts, key)
 
 
 def update(

@@ -136,7 +136,7 @@ class Method:
         return self.decoder is Decoder.DIASTER
 
 
-DESCENT = frozenset({"learning_rate", "weight_decay", "normalise", "sum_form"})
+DESCENT = frozenset({"learning_rate", "weight_decay", "normalise"})
 OF_FIT: dict[Fit, frozenset[str]] = {
     Fit.ALL_STEPS: frozenset({"steps"}),
     Fit.DRAWN_STEPS: frozenset({"steps", "drawn_steps"}),
@@ -146,10 +146,10 @@ OF_FIT: dict[Fit, frozenset[str]] = {
     Fit.SIGNS: frozenset(),
 }
 OF_DECODER: dict[Decoder, frozenset[str]] = {
-    Decoder.STEP: frozenset({"hidden"}),
-    Decoder.BOTTLENECK: frozenset({"hidden", "encoder", "bottleneck", "divergence"}),
-    Decoder.AREL: frozenset(),
-    Decoder.STAS: frozenset(),
+    Decoder.STEP: frozenset({"sum_form", "hidden"}),
+    Decoder.BOTTLENECK: frozenset({"sum_form", "hidden", "encoder", "bottleneck", "divergence"}),
+    Decoder.AREL: frozenset({"sum_form"}),
+    Decoder.STAS: frozenset({"sum_form"}),
     Decoder.DIASTER: frozenset({"hidden"}),
 }
 """Settings, by what reads them: whatever descends a gradient, each fit, each decoder."""

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.credit import closed_form
+from lare.credit.accuracy import RECENT
 from lare.credit.methods import Fit
 from lare.training import replay
-from lare.training.learner import RECENT, Learner, features, proxy_rewards
+from lare.training.learner import Learner, features, proxy_rewards
 from lare.training.recipe import Recipe
 from lare.training.run import Run
 from lare.training.seeds import of_seed

@@ -96,6 +96,14 @@ def jobs_of(sweep: Sweep, path: Path) -> Iterator[Job]:
         raise LareError(
             f"functions of {unknown[0]}, which is none of the tasks {', '.join(task.name for task in tasks)}"
         )
+    if not any(find_method(method).latent for method in sweep.methods):
+        for name, given in (("functions", bool(sweep.functions)), ("draws", sweep.draws != (0,))):
+            if given:
+                raise LareError(f"{name} are given, and none of the methods needs a latent function")
+    if sweep.draws != (0,) and all(task.name in sweep.functions for task in tasks):
+        raise LareError(
+            "draws choose recorded functions, and every task is given functions of its own: leave either out"
+        )
     for task, method, algorithm in product(tasks, sweep.methods, sweep.algorithms or (None,)):
         functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
         draws = sweep.draws if find_method(method).latent and not functions else (0,)

@@ -13,8 +13,10 @@ from jaxtyping import Float
 class Choice(Box):
     """One of n actions, as a row with a single 1. Other rows stand for the action at their largest number."""
 
-    def __init__(self, n: int, seed: int | np.random.Generator | None = None):
+    def __init__(self, n: int, start: int = 0, seed: int | np.random.Generator | None = None):
         super().__init__(0, 1, (n,), np.float32, seed)
+        self.start = start
+        """The number of the first action."""
 
     def sample(self, *args: Any, **kwargs: Any) -> Float[np.ndarray, " n"]:
         return self.chosen(super().sample(*args, **kwargs))
@@ -22,6 +24,10 @@ class Choice(Box):
     def chosen(self, row: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """The row with a single 1 that a row stands for."""
         return np.eye(len(row), dtype=np.float32)[int(np.argmax(row))]
+
+    def number(self, row: Float[np.ndarray, " n"]) -> int:
+        """The action that a row stands for, as the environment counts them."""
+        return self.start + int(np.argmax(row))
 
 
 class ChoiceAction(gymnasium.ActionWrapper, RecordConstructorArgs):
@@ -31,11 +37,11 @@ class ChoiceAction(gymnasium.ActionWrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self)  # without which Gymnasium could not make the same environment again
         super().__init__(env)
         assert isinstance(env.action_space, Discrete)
-        self.start = int(env.action_space.start)
-        self.action_space = Choice(int(env.action_space.n))
+        self.choice = Choice(int(env.action_space.n), int(env.action_space.start))
+        self.action_space = self.choice
 
     def action(self, action: Float[np.ndarray, " n"]) -> int:
-        return self.start + int(np.argmax(action))
+        return self.choice.number(action)
 
 
 def as_rows(environment: gymnasium.Env) -> gymnasium.Env:

@@ -62,8 +62,9 @@ def to_bounds(action: Float[np.ndarray, " action"], space: gymnasium.Space) -> F
     assert isinstance(space, Box)
     if isinstance(space, Choice):
         return space.chosen(action)
-    action = np.clip(action, -1, 1)
-    return np.asarray(space.low + (action + 1) / 2 * (space.high - space.low), np.float32)
+    scaled = space.low + (np.clip(action, -1, 1) + 1) / 2 * (space.high - space.low)
+    precise = np.result_type(space.dtype, np.float32)
+    return np.clip(scaled, space.low, space.high, dtype=precise)  # rounding may have led beyond the bounds
 
 
 @dataclass
@@ -108,13 +109,13 @@ class Lane:
         """
         self.episode -= 1
         self.begin()
-        ended = False
         for action in actions:
             after, _, terminated, truncated, _ = self.environment.step(action)
             self.actions.append(action)
             self.observation = self.checked(after)
-            ended = terminated or truncated
-        return not ended and np.array_equal(self.observation, observation)
+            if terminated or truncated:
+                return False
+        return np.array_equal(self.observation, observation)
 
 
 def row(value: object, what: str, shape: tuple[int, ...] | None, where: str) -> np.ndarray:

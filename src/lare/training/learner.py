@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare.algorithms import ppo, sac, td3
 from lare.credit import accuracy, decomposition
+from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Encoder, Method, Reward
 from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe_scale, within_range
@@ -25,9 +26,6 @@ from lare.training import replay
 from lare.training.credit_draws import CreditDraws, draw_credit
 from lare.training.recipe import Recipe
 from lare.training.replay import Draw, Replay, Step
-
-RECENT = 5000
-"""Steps over which proxy rewards are compared with the true ones."""
 
 
 class Learner(NamedTuple):

@@ -78,22 +78,21 @@ def describe(task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) ->
 
 
 def check_room(task: TaskSpec, plan: Plan) -> None:
-    """Raise `LareError` where the replay could not hold a single episode, or a rollout."""
-    longest = time_limit(task)
-    kind = ALGORITHMS[plan.algorithm].kind
-    if kind is not Kind.MANY_AGENTS and plan.rows < longest + 2:
-        if plan.rows < plan.capacity:
+    """Raise `LareError` where the replay could not hold what a turn stores, or a run is too short."""
+    if ALGORITHMS[plan.algorithm].kind is Kind.MANY_AGENTS:
+        if plan.rereads and plan.agents.capacity < plan.agents.episodes:
             raise LareError(
-                f"steps = {plan.steps} are too few: an episode of {task.name} takes up to {longest}, and a run at least half of one"
+                f"agents.capacity = {plan.agents.capacity} is less than the {plan.agents.episodes} episodes of an update"
             )
-        raise LareError(f"capacity = {plan.rows} is too small: an episode of {task.name} takes up to {longest + 1}")
-    if kind is not Kind.MANY_AGENTS and plan.capacity < 2 * plan.turn + longest:
-        what = "a rollout" if kind is Kind.ON_POLICY else "a chunk"
-        raise LareError(f"capacity = {plan.capacity} is too small: {what} takes up to {2 * plan.turn + longest}")
-    if kind is Kind.MANY_AGENTS and plan.agents.capacity < plan.agents.episodes:
+        return
+    longest = time_limit(task)
+    if 2 * plan.steps < longest:
         raise LareError(
-            f"agents.capacity = {plan.agents.capacity} is less than the {plan.agents.episodes} episodes of an update"
+            f"steps = {plan.steps} are too few: an episode of {task.name} takes up to {longest}, and a run at least half of one"
         )
+    if plan.rereads and plan.capacity < (needed := plan.rows_of_a_turn(longest)):
+        what = "a rollout" if ALGORITHMS[plan.algorithm].kind is Kind.ON_POLICY else "a chunk"
+        raise LareError(f"capacity = {plan.capacity} is too small: {what} of {task.name} takes up to {needed}")
 
 
 def isolation(task: TaskSpec, function: LatentFunction) -> str:

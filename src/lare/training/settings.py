@@ -9,8 +9,9 @@ from lare.algorithms.ppo import PPOSettings
 from lare.algorithms.sac import SACSettings
 from lare.algorithms.table import ALGORITHMS, DDPG, IPPO, PPO, AlgorithmSettings, Kind, Name
 from lare.algorithms.td3 import TD3Settings
+from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import CreditSettings
-from lare.credit.methods import Reward, find_method
+from lare.credit.methods import Decoder, Reward, find_method
 from lare.errors import Checked, LareError
 from lare.latent.design import CANDIDATES
 from lare.tasks.particles.task import STEPS
@@ -172,12 +173,25 @@ class Plan(Settings):
         return max(1, self.credit.fits * self.rollout.steps // self.chunk) if self.apart else self.rollout.fit_updates
 
     @property
+    def rereads(self) -> bool:
+        """Whether steps are read again when the policy has learned from them."""
+        method = find_method(self.method)
+        match ALGORITHMS[self.algorithm].kind:
+            case Kind.OFF_POLICY:
+                return True
+            case Kind.ON_POLICY:
+                return method.descends
+            case Kind.MANY_AGENTS:
+                return method.descends or method.reward is Reward.UNIFORM
+
+    @property
     def idle(self) -> tuple[str, ...]:
         """Settings, and groups of them, that make no difference to this algorithm, by dotted names."""
         others = tuple(name for name in ALGORITHMS if name != self.algorithm)
         match ALGORITHMS[self.algorithm].kind:
             case Kind.OFF_POLICY:
-                return (*others, "rollout", "agents")
+                unclipped = isinstance(self.of_algorithm, TD3Settings) and not self.of_algorithm.policy_noise
+                return (*others, "rollout", "agents", *([f"{self.algorithm}.noise_clip"] if unclipped else []))
             case Kind.ON_POLICY:
                 return (*others, "agents", "scale_rewards", *(("rollout.fit_updates",) if self.apart else ("chunk",)))
             case Kind.MANY_AGENTS:
@@ -194,6 +208,8 @@ class Plan(Settings):
             found += ["agents.fit_every", "agents.fit_updates", "rollout.fit_updates"]
         if not method.latent:
             found += ["judges", "draw", "candidates"]
+        if not self.rereads:
+            found += ["capacity", "agents.capacity"]
         return tuple(found)
 
     def judged_by(self, task: TaskSpec) -> Judges:
@@ -209,13 +225,17 @@ class Plan(Settings):
 
     @property
     def episodes(self) -> int:
-        """Episodes of many agents to make room for: no more than the run can fill, and at least those of an update."""
-        return min(self.agents.capacity, self.steps // STEPS)
+        """Episodes of many agents to make room for: no more than are read again, and at least those of an update."""
+        return min(self.agents.capacity, self.steps // STEPS) if self.rereads else self.agents.episodes
 
-    @property
-    def rows(self) -> int:
-        """Observations to make room for: no more than the run can fill."""
-        return min(self.capacity, 2 * self.steps + 2)
+    def rows(self, longest: int) -> int:
+        """Observations of a single agent to make room for, where an episode has up to `longest` steps: likewise."""
+        room = self.capacity if self.rereads else self.rows_of_a_turn(longest) + RECENT
+        return min(room, 2 * self.steps + 2)
+
+    def rows_of_a_turn(self, longest: int) -> int:
+        """The most observations that a turn can need, with the episode that was under way before it."""
+        return 2 * self.turn + longest
 
 
 def set_in_vain(plan: Plan, task: TaskSpec) -> dict[str, str]:
@@ -256,13 +276,16 @@ def decide(settings: Settings, task: TaskSpec) -> Plan:
     if task.whole is not None:
         raise LareError(f"{task.name} is one team of {task.whole}: train that")
     many = task.particles is not None
-    algorithm = settings.algorithm or ("ippo" if many else "ppo" if is_discrete(task) else "td3")
+    discrete = not many and is_discrete(task)
+    algorithm = settings.algorithm or ("ippo" if many else "ppo" if discrete else "td3")
     kind = ALGORITHMS[algorithm].kind
     if many != (kind is Kind.MANY_AGENTS):
         raise LareError(
             f"{algorithm} is for {'a single agent' if many else 'many agents'}, and {task.name} is a task "
             f"of {'many' if many else 'one'}"
         )
+    if kind is Kind.OFF_POLICY and discrete:
+        raise LareError(f"{algorithm} acts by numbers within bounds, and {task.name} offers a choice: ppo can choose")
     usual: dict[str, Any] = {"algorithm": algorithm}
     if kind is Kind.ON_POLICY:
         turn = settings.rollout.steps
@@ -283,4 +306,17 @@ def decide(settings: Settings, task: TaskSpec) -> Plan:
         raise LareError(f"{method.name} assigns credit to a single agent, and {task.name} is a task of many")
     if method.for_many_only and not many:
         raise LareError(f"{method.name} assigns credit among agents, and {task.name} is a task of one")
+    if not many:
+        check_credit(plan)
     return plan
+
+
+def check_credit(plan: Plan) -> None:
+    """Raise `LareError` where a single agent's decoder cannot be what is asked for."""
+    method, credit = find_method(plan.method), plan.credit
+    if "drawn_steps" in method.settings and credit.steps < credit.drawn_steps:
+        raise LareError(
+            f"credit.steps = {credit.steps} is less than credit.drawn_steps = {credit.drawn_steps}, of one episode"
+        )
+    if method.decoder is Decoder.DIASTER and not credit.hidden:
+        raise LareError(f"credit.hidden is empty, and {method.name} needs a hidden layer")

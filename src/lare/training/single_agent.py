@@ -167,7 +167,7 @@ def recipe_for(run: Run) -> Recipe:
         discrete=run.config.discrete,
         factors=run.function.size_by(run.judges) if run.function else 0,
         longest_episode=run.config.longest_episode,
-        capacity=settings.rows,
+        capacity=settings.rows(run.config.longest_episode),
         steps=settings.steps,
         turn=settings.turn,
         fit_updates=settings.fit_updates,

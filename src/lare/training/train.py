@@ -1,14 +1,10 @@
 """Training from start to end, and from a checkpoint to the end: Algorithm 1 of the LaRe paper around the fused step."""
 
-import contextlib
-import signal
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from lare.credit.closed_form import LARGEST_CHOICE
@@ -19,6 +15,7 @@ from lare.latent.function import LatentFunction, load, per_role
 from lare.tasks.spec import TaskSpec, load_task
 from lare.training import many_agents, single_agent
 from lare.training.environments import Diverged
+from lare.training.process import enough_memory, stop_requests
 from lare.training.progress import Clock, Listener, TensorBoard, Terminal, summary_writer
 from lare.training.run import Run, create, default_directory, isolation, locked, open_run
 from lare.training.settings import Plan, Settings, decide, set_in_vain
@@ -71,6 +68,8 @@ def chosen_functions(task: TaskSpec, plan: Plan, given: Given | Sequence[Given] 
     """One for each role of the task, designed where none was given; none for a method that needs none."""
     method = find_method(plan.method)
     if not method.latent:
+        if given is not None:
+            raise LareError(f"{method.name} needs no latent function, and one is given: leave it out")
         return ()
     if given is None:
         asked = partial(design, kind=method.kind, draw=plan.draw, candidates=plan.candidates)
@@ -185,7 +184,8 @@ def introduce(session: single_agent.Session | many_agents.Session, listener: Lis
     if run.function is not None:
         listener.said(f"the latent function runs in {isolation(run.config.task, run.function)}")
     if session.step < settings.warmup:
-        listener.said(f"the first {settings.warmup:,} steps are random: nothing is learned from them yet")
+        which = f"the first {settings.warmup:,}" if settings.warmup < settings.steps else f"all {settings.steps:,}"
+        listener.said(f"{which} steps are random ({settings.algorithm}.warmup): nothing is learned from them yet")
     if session.step >= settings.steps:
         listener.said("nothing is left to do: it had come to its end")
     listener.started(f"{run.config.task.name} {settings.method}", session.step, settings.steps)
@@ -201,41 +201,3 @@ def check_losses(session: single_agent.Session | many_agents.Session) -> None:
                     f"training diverged: {name} of seed {seed} is not finite at step {session.step}; "
                     "the last checkpoint is whole"
                 )
-
-
-@contextlib.contextmanager
-def enough_memory(run: Run) -> Iterator[None]:
-    """Raise `LareError` where memory runs out."""
-    try:
-        yield
-    except (MemoryError, jax.errors.JaxRuntimeError) as error:
-        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
-            plan = run.config.settings
-            holds = f"{plan.episodes:,} episodes" if run.config.task.particles else f"{plan.rows:,} observations"
-            option = "agents.capacity" if run.config.task.particles else "capacity"
-            raise LareError(
-                f"the memory is full: {plan.seeds} seeds with a replay of {holds} each; fewer seeds or a smaller {option} "
-                "need less"
-            ) from error
-        raise
-
-
-@contextlib.contextmanager
-def stop_requests() -> Iterator[threading.Event]:
-    """An event that Ctrl-C or a polite kill sets, once; a second one ends the process at once."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop  # only the main thread may say what a signal does
-        return
-
-    def handle(number: int, frame: object) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

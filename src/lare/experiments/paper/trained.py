@@ -158,7 +158,7 @@ def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], 
         if printed:
             cells.append(printed.get(row.label, "-"))
         elif key != ERROR:
-            cells += [spread(runs[row.label], of_credit, step) for of_credit in (ERROR, CORRELATION)]
+            cells += [mean_and_spread(runs[row.label], of_credit, step) for of_credit in (ERROR, CORRELATION)]
         rows.append(cells)
     yield table(head, rows)
     fewest = min(row.seeds for row in found.rows)
@@ -169,7 +169,7 @@ def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], 
     )
 
 
-def spread(runs: Sequence[Run], key: str, step: int) -> str:
+def mean_and_spread(runs: Sequence[Run], key: str, step: int) -> str:
     """Mean and standard deviation over the seeds at a step, each seed a mean over its draws; a dash where there is none."""
     by_seed: dict[int, list[float]] = {}
     for line in (line for run in runs for line in run.metrics()):

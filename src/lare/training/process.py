@@ -1,0 +1,51 @@
+"""What can befall the process that trains: memory that runs out, and somebody who asks it to stop."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+
+import jax
+
+from lare.errors import LareError
+from lare.training.run import Run
+
+
+@contextlib.contextmanager
+def enough_memory(run: Run) -> Iterator[None]:
+    """Raise `LareError` where memory runs out."""
+    try:
+        yield
+    except (MemoryError, jax.errors.JaxRuntimeError) as error:
+        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+            plan = run.config.settings
+            if run.config.task.particles:
+                holds, option = f"{plan.episodes:,} episodes", "agents.capacity"
+            else:
+                holds, option = f"{plan.rows(run.config.longest_episode):,} observations", "capacity"
+            raise LareError(
+                f"the memory is full: {plan.seeds} seeds with a replay of {holds} each; fewer seeds or a smaller {option} "
+                "need less"
+            ) from error
+        raise
+
+
+@contextlib.contextmanager
+def stop_requests() -> Iterator[threading.Event]:
+    """An event that Ctrl-C or a polite kill sets, once; a second one ends the process at once."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop  # only the main thread may say what a signal does
+        return
+
+    def handle(number: int, frame: object) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
