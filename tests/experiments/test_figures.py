@@ -29,3 +29,11 @@ def test_a_long_legend_makes_the_picture_higher_not_its_curves_smaller():
     )
     assert long[0] == pytest.approx(short[0], rel=0.05)
     assert long[1] > short[1] + 100
+
+
+def test_panels_share_their_names_and_have_their_titles():
+    x = np.arange(3.0)
+    panels = {title: {"one": Band(x, x, x, x), "other": Band(x, 2 * x, x, 3 * x)} for title in ("td3", "sac", "ppo")}
+    drawn = figures.bands_side_by_side(panels, "environment steps", "true return")
+    for text in (*panels, "one", "other", "environment steps", "true return"):
+        assert drawn.count(f">{text}</text>") == 1, text

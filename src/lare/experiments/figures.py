@@ -1,6 +1,7 @@
 """Figures as SVG text, each from plain arrays, drawn to be read on a phone and on paper."""
 
 import io
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import cycle, product
@@ -101,16 +102,39 @@ def bands(
     With `decades`, y goes by its logarithm.
     """
     figure, (axes,) = new_figure()
-    for (line, colour), (name, (x, y, low, high)) in zip(cycle(LINES), by_name.items(), strict=False):
-        axes.plot(x, y, color=colour, linestyle=line, label=name, drawstyle="default" if steps else "steps-post")
-        axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if steps else "post")
+    draw_bands(axes, by_name, steps)
     axes.set(xlabel=across, ylabel=up)
     if decades:
         axes.set_yscale("log")
-    if steps:
-        axes.xaxis.set_major_formatter(in_thousands)
     legend_above(axes)
     return svg(figure)
+
+
+def bands_side_by_side(panels: Mapping[str, Mapping[str, Band]], across: str, up: str) -> str:
+    """Panels of curves over steps, by title, two in a row. They share their axes, and what a colour stands for."""
+    with matplotlib.rc_context(STYLE):
+        rows = math.ceil(len(panels) / 2)
+        figure = Figure(figsize=(6.4, 0.6 + 2.2 * rows), layout="constrained")
+        every = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
+    for axes in every.ravel()[len(panels) :]:
+        axes.set_visible(False)
+    for axes, (title, by_name) in zip(every.ravel(), panels.items(), strict=False):
+        draw_bands(axes, by_name, steps=True)
+        axes.set_title(title, fontsize=11, loc="left")
+    figure.supxlabel(across, fontsize=11)
+    figure.supylabel(up, fontsize=11)
+    figure.legend(
+        *every[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4, fontsize=10, frameon=False
+    )
+    return svg(figure)
+
+
+def draw_bands(axes: Axes, by_name: Mapping[str, Band], steps: bool) -> None:
+    for (line, colour), (name, (x, y, low, high)) in zip(cycle(LINES), by_name.items(), strict=False):
+        axes.plot(x, y, color=colour, linestyle=line, label=name, drawstyle="default" if steps else "steps-post")
+        axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if steps else "post")
+    if steps:
+        axes.xaxis.set_major_formatter(in_thousands)
 
 
 WINDOW = 100

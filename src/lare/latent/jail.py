@@ -3,7 +3,7 @@
     no_new_privs   nothing that is started later gains rights back
     rlimits        address space, no files written, no open files, no processes, no core
     Landlock       no file system, no TCP, no signals and no abstract sockets beyond this process
-    seccomp        two dozen system calls on memory, clocks and the two open pipes; all others fail
+    seccomp        some twenty system calls on memory, clocks and the two open pipes; all others fail
 
 What a kernel does not have is left out and named: `enter` returns what is in force. Layers stand on each other's
 ground on purpose; seccomp alone would hold.

@@ -15,6 +15,7 @@ from lare.experiments.paper.pages import Page, items, table
 from lare.experiments.scores import CORRELATION, ERROR, RETURN, Group
 from lare.experiments.statistics import (
     REPETITIONS,
+    Band,
     Comparison,
     compare,
     mann_whitney_p,
@@ -88,7 +89,9 @@ def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
     every = [run for of_task in runs.values() for some in of_task.values() for run in some]
     one_agent = not any(run.config.task.particles for run in every)
     found = {name: compare(of_task, exhibit.measure(name)) for name, of_task in runs.items()}
-    pictures = {f"{exhibit.name}-{name}.svg": picture(one, exhibit.measure(name)) for name, one in found.items()}
+    pictures = {
+        f"{exhibit.name}-{name}.svg": picture(one, exhibit, exhibit.measure(name)) for name, one in found.items()
+    }
     parts = [
         f"# {exhibit.title}",
         f"The paper's {exhibit.source}, by `{command}`.",
@@ -184,8 +187,16 @@ def meaning(key: str) -> str:
     return {RETURN: "true return", ERROR: "error of the proxy reward", TRAVELLED: "metres travelled"}[key]
 
 
-def picture(found: Comparison, key: str) -> str:
-    return figures.bands(found.curves, "environment steps", f"{meaning(key)}, IQM", steps=True, decades=key == ERROR)
+def picture(found: Comparison, exhibit: Exhibit, key: str) -> str:
+    """Learning curves; a panel for each algorithm, where there are several."""
+    across, up = "environment steps", f"{meaning(key)}, IQM"
+    panels: dict[str, dict[str, Band]] = {}
+    for one in exhibit.contenders:
+        panel = panels.setdefault(one.algorithm or "", {})
+        panel[one.label.removesuffix(f", {one.algorithm}")] = found.curves[one.label]
+    if len(panels) > 1:
+        return figures.bands_side_by_side(panels, across, up)
+    return figures.bands(found.curves, across, up, steps=True, decades=key == ERROR)
 
 
 def pairs(claims: Iterable[Claim]) -> Iterator[tuple[Claim, str]]:
