@@ -138,18 +138,18 @@ class Method:
 
 DESCENT = frozenset({"learning_rate", "weight_decay", "normalise"})
 OF_FIT: dict[Fit, frozenset[str]] = {
-    Fit.ALL_STEPS: frozenset({"steps"}),
-    Fit.DRAWN_STEPS: frozenset({"steps", "drawn_steps"}),
-    Fit.DRAWN_STEPS_UNBIASED: frozenset({"steps", "drawn_steps"}),
+    Fit.ALL_STEPS: frozenset({"sum_form", "steps"}),
+    Fit.DRAWN_STEPS: frozenset({"sum_form", "steps", "drawn_steps"}),
+    Fit.DRAWN_STEPS_UNBIASED: frozenset({"sum_form", "steps", "drawn_steps"}),
     Fit.SUBTRAJECTORIES: frozenset({"episodes", "fits"}),
     Fit.RIDGE: frozenset({"ridge"}),
     Fit.SIGNS: frozenset(),
 }
 OF_DECODER: dict[Decoder, frozenset[str]] = {
-    Decoder.STEP: frozenset({"sum_form", "hidden"}),
-    Decoder.BOTTLENECK: frozenset({"sum_form", "hidden", "encoder", "bottleneck", "divergence"}),
-    Decoder.AREL: frozenset({"sum_form"}),
-    Decoder.STAS: frozenset({"sum_form"}),
+    Decoder.STEP: frozenset({"hidden"}),
+    Decoder.BOTTLENECK: frozenset({"hidden", "encoder", "bottleneck", "divergence"}),
+    Decoder.AREL: frozenset(),
+    Decoder.STAS: frozenset(),
     Decoder.DIASTER: frozenset({"hidden"}),
 }
 """Settings, by what reads them: whatever descends a gradient, each fit, each decoder."""

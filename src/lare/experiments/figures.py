@@ -47,10 +47,11 @@ def svg(figure: Figure) -> str:
     return drawn[drawn.index("<svg") :]
 
 
-def new_figure(rows: int = 1, height: float = 3.4) -> tuple[Figure, np.ndarray]:
+def new_figure(rows: int = 1, height: float = 3.4, columns: int = 1) -> tuple[Figure, np.ndarray]:
+    """A figure and its axes, row by row. They share x, and y where they stand side by side."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, height), layout="constrained")
-        return figure, figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+        return figure, figure.subplots(rows, columns, sharex=True, sharey=columns > 1, squeeze=False).ravel()
 
 
 def curves(
@@ -112,20 +113,16 @@ def bands(
 
 def bands_side_by_side(panels: Mapping[str, Mapping[str, Band]], across: str, up: str) -> str:
     """Panels of curves over steps, by title, two in a row. They share their axes, and what a colour stands for."""
-    with matplotlib.rc_context(STYLE):
-        rows = math.ceil(len(panels) / 2)
-        figure = Figure(figsize=(6.4, 0.6 + 2.2 * rows), layout="constrained")
-        every = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
-    for axes in every.ravel()[len(panels) :]:
+    rows = math.ceil(len(panels) / 2)
+    figure, every = new_figure(rows, height=0.6 + 2.2 * rows, columns=2)
+    for axes in every[len(panels) :]:
         axes.set_visible(False)
-    for axes, (title, by_name) in zip(every.ravel(), panels.items(), strict=False):
+    for axes, (title, by_name) in zip(every, panels.items(), strict=False):
         draw_bands(axes, by_name, steps=True)
         axes.set_title(title, fontsize=11, loc="left")
     figure.supxlabel(across, fontsize=11)
     figure.supylabel(up, fontsize=11)
-    figure.legend(
-        *every[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4, fontsize=10, frameon=False
-    )
+    figure.legend(*every[0].get_legend_handles_labels(), loc="outside upper left", ncols=4, fontsize=10, frameon=False)
     return svg(figure)
 
 
