@@ -21,6 +21,9 @@ Judges = Literal["before", "after", "both"]
 """Which observation `phi` judges a step by: that before the action, that which the action led to, or both, one after
 the other with their factors put side by side."""
 
+JudgedFrom = Literal["observation", "state"]
+"""What a step is judged by: each agent's own observation and action, or the global state and all actions side by side."""
+
 SHIPPED = files("lare.tasks") / "specs"
 
 FILL_IN = "FILL IN"
@@ -49,6 +52,12 @@ class TaskSpec(Checked):
     """Time limit, for an environment that has none of its own."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` that are averaged and reported beside the return."""
+    arguments: dict[str, Any] = Field(default_factory=dict)
+    """Keyword arguments of the environment, where it is made from a module (`pettingzoo/...`)."""
+    agents: tuple[str, ...] = ()
+    """Names, or patterns of names like `prey_*`, of the agents that this spec speaks of; all of them, unless given."""
+    judged_from: JudgedFrom = "observation"
+    """Whether `phi` judges each agent's step by what the agent observes, or the whole team's by the global state."""
     teams: tuple["TaskSpec", ...] = ()
     """Where several teams learn, each for itself: a spec for each, with texts of its own. In TOML, their names."""
 
