@@ -13,18 +13,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import tyro
-from measure import interleave, show, summary, write
+from measure import advance, interleave, new_session, show, summary, write
 
 import lare
 from lare.credit.methods import METHODS
 from lare.experiments import figures
 from lare.tasks.particles.table import find_particle_task
-from lare.training.many_agents import Session, start
-from lare.training.run import create
-from lare.training.settings import decide
-from lare.training.train import chosen_functions
+from lare.training.session import Session
 
 TASKS = ("TriangleArea", "CN-6", "CN-15", "CN-30")
 """3, 6, 15 and 30 agents."""
@@ -36,15 +32,11 @@ PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "agents-cost.svg"
 
 
 def session(directory: Path, task_name: str, method: str, seeds: int = 1) -> Session:
-    task = lare.load_task(task_name)
-    plan = decide(lare.Settings(method=method, seed=SEED, seeds=seeds), task)
-    return start(create(directory, task, plan, chosen_functions(task, plan, None)))
+    return new_session(directory, task_name, lare.Settings(method=method, seed=SEED, seeds=seeds))
 
 
 def turn(of: Session) -> None:
-    for _ in range(of.settings.agents.fit_every):
-        of.advance()
-    jax.block_until_ready(of.learner)
+    advance(of, of.settings.fit_every * of.settings.iteration_steps)
 
 
 def drawn(by_task: Mapping[str, Mapping[str, Any]]) -> str:

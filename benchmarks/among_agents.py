@@ -8,7 +8,6 @@ agents, so that whatever proxy rewards differ by among them is wrong.
 
 import sys
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -16,23 +15,29 @@ import numpy as np
 from jaxtyping import Float
 from measure import apart, correlation, write
 
-from lare.experiments.agents import proxy_rewards
-from lare.training import teams
-from lare.training.many_agents import Session, restore
-from lare.training.run import open_run
+from lare.experiments.watch import on_device, proxy_of
+from lare.tasks.env import JaxEnv
+from lare.tasks.table import make_env
+from lare.training.annotate import annotate
+from lare.training.compiled import module_of
+from lare.training.run import Run, open_run
 from lare.training.seeds import of_seed
+from lare.training.session import load_learner
 
 EPISODES, KEY = 100, 7
 
 Rewards = Float[np.ndarray, "episodes steps agents"]
 
 
-def judged(session: Session, place: int) -> tuple[Rewards, Rewards]:
+def judged(run: Run, place: int) -> tuple[Rewards, Rewards]:
     """True and proxy rewards of some episodes of a seed."""
-    recipe, learner = session.recipe, of_seed(session.learner, place)
-    play = jax.jit(partial(teams.play, count=EPISODES, recipe=recipe))
-    played = play(learner.algorithm.online.actor, jax.random.key(KEY))
-    return np.asarray(played.reward).swapaxes(0, 1), proxy_rewards(session, learner, played)
+    (config, learner, *_), env = load_learner(run), make_env(run.config.task)
+    assert isinstance(env, JaxEnv)
+    one = jax.tree.map(lambda leaf: leaf[place : place + 1], learner)
+    actor = module_of(config).actor(one, run.config.settings.steps, config)
+    steps, _, _ = on_device(env, config, actor, EPISODES, KEY)
+    proxy = proxy_of(of_seed(learner, place), steps, annotate(run, config, steps), config)
+    return steps.after.reward.swapaxes(0, 1), proxy.swapaxes(0, 1)
 
 
 def figures(true: Rewards, proxy: Rewards) -> Mapping[str, float]:
@@ -50,8 +55,7 @@ def main(directories: list[str]) -> None:
     found = {}
     for directory in directories:
         run = open_run(directory)
-        session, _ = restore(run)
-        of_run = {str(seed): figures(*judged(session, place)) for place, seed in enumerate(run.seeds)}
+        of_run = {str(seed): figures(*judged(run, place)) for place, seed in enumerate(run.seeds)}
         found[Path(directory).name] = {
             name: {seed: round(row[name], 3) for seed, row in of_run.items()} for name in of_run[str(run.seeds[0])]
         }

@@ -14,52 +14,74 @@ import jax.numpy as jnp
 import numpy as np
 from measure import apart, correlation, write
 
+from lare.algorithms.table import ALGORITHMS
 from lare.credit import arel
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
-from lare.experiments.agents import indifferent
-from lare.tasks.particles.table import find_particle_task
+from lare.data.trajectory import Trajectory
+from lare.experiments.watch import on_device, proxy_of
+from lare.tasks.particles.env import ParticleJaxEnv
 from lare.tasks.particles.task import STEPS
-from lare.training import teams
-from lare.training.settings import AgentSettings, Settings
-from lare.training.teams import Learner, Played, Recipe
+from lare.training import learner as common
+from lare.training.compiled import module_of, new_learners
+from lare.training.config import TrainConfig
+from lare.training.learner import Learner
+from lare.training.seeds import of_seed
 
-TASK, STORED, JUDGED, AT_A_TIME = find_particle_task("CN-6"), 1600, 200, 100
+ENV, STORED, JUDGED, AT_A_TIME = ParticleJaxEnv("CN-6"), 1600, 200, 100
 CONTENDERS = {"rd": (None, 3200), "arel": (None, 3200), "arel without its penalty": (0.0, 800)}
 """The weight of AREL's penalty, if it is not the published one, and updates."""
-SETTINGS = AgentSettings(fit_updates=AT_A_TIME, capacity=STORED, credit=CreditSettings(steps=32 * STEPS))
 
 
-def no_factors(episodes: int) -> jax.Array:
-    return jnp.zeros((STEPS, episodes, TASK.agents, 0))
+def config_of(name: str) -> TrainConfig:
+    """Each episode is stored in an environment of its own."""
+    ippo = ALGORITHMS["ippo"]
+    return TrainConfig(
+        env=ENV.spec,
+        judged_from="observation",
+        method=find_method(name),
+        algorithm=ippo,
+        hyperparameters=ippo.settings,
+        credit=CreditSettings(steps=32 * STEPS),
+        scale_rewards=False,
+        factors=(),
+        environments=STORED,
+        rollout_steps=STEPS,
+        capacity=3 * STEPS,
+        steps=1,
+        fit_updates=AT_A_TIME,
+    )
 
 
-def random_episodes(learner: Learner, key: int, count: int, recipe: Recipe) -> Played:
-    play = jax.jit(partial(teams.play, count=count, recipe=recipe))
-    return play(indifferent(learner.algorithm.online.actor), jax.random.key(key))
+def no_factors(episodes: int) -> np.ndarray:
+    return np.zeros((STEPS, episodes, ENV.spec.agents, 0), np.float32)
 
 
-def judged(learner: Learner, played: Played, recipe: Recipe) -> tuple[float, float]:
+def random_episodes(key: int, count: int, config: TrainConfig) -> Trajectory:
+    """By networks of zeros, which prefer nothing."""
+    actor = module_of(config).actor(new_learners(jax.random.key(0)[None], config), 0, config)
+    return on_device(ENV, config, jax.tree.map(jnp.zeros_like, actor), count, key)[0]
+
+
+def judged(learner: Learner, steps: Trajectory, config: TrainConfig) -> tuple[float, float]:
     """Correlation within an episode, and of returns."""
-    true = jnp.swapaxes(played.reward, 0, 1)
-    rows = teams.features(played, no_factors(JUDGED), recipe)
-    r_hat = teams.rewards(learner, rows, true, recipe)
-    one, other = np.asarray(true).mean(2), np.asarray(r_hat).mean(2)
+    r_hat = proxy_of(learner, steps, no_factors(JUDGED), config)
+    one, other = (rewards.swapaxes(0, 1).mean(2) for rewards in (np.asarray(steps.after.reward), r_hat))
     within = correlation(apart(one), apart(other))
     return round(within, 3), round(correlation(one.sum(1), other.sum(1)), 3)
 
 
 def curve(name: str, updates: int) -> Iterator[tuple[int, tuple[float, float]]]:
-    recipe = Recipe(TASK, find_method(name), Settings().ippo, SETTINGS, ())
-    learner = teams.init(jax.random.key(0), recipe)
-    learner = teams.store(learner, random_episodes(learner, 1, STORED, recipe), no_factors(STORED), recipe)
-    others = random_episodes(learner, 99, JUDGED, recipe)
-    fit = jax.jit(partial(teams.fit, recipe=recipe))
+    config = config_of(name)
+    learner = of_seed(new_learners(jax.random.key(0)[None], config))
+    learner = common.store(learner, random_episodes(1, STORED, config), jnp.asarray(no_factors(STORED)), config)
+    others = random_episodes(99, JUDGED, config)
+    fit = jax.jit(partial(common.fit_often, config=config))
     for done in range(AT_A_TIME, updates + 1, AT_A_TIME):
         credit, _ = fit(learner, jax.random.key(done))
         learner = learner._replace(credit=credit)
         if (done // AT_A_TIME).bit_count() == 1:
-            yield done, judged(learner, others, recipe)
+            yield done, judged(learner, others, config)
 
 
 def main() -> None:

@@ -20,48 +20,50 @@ from lare.credit import accuracy, decomposition
 from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import METHODS
+from lare.data import replay
 from lare.training import learner as common
-from lare.training import replay
-from lare.training.learner import Learner
-from lare.training.recipe import Recipe
+from lare.training.config import TrainConfig
+from lare.training.learner import Learner, Paid
 from lare.training.run import open_run
 from lare.training.seeds import of_seed
-from lare.training.single_agent import load_learner
+from lare.training.session import load_learner
+
+AT_A_TIME = 50
+"""Fits in a compiled call."""
 
 
-def untrained(learner: Learner, recipe: Recipe, key: jax.Array) -> Learner:
+def untrained(learner: Learner, config: TrainConfig, key: jax.Array) -> Learner:
     """With a new decoder, which knows the statistics of all that is stored."""
-    credit = decomposition.init(
-        key, recipe.features, recipe.method, recipe.credit, steps=recipe.longest_episode, agents=1
-    )
+    (credit,) = common.init_credit([key], config)
     held = learner.replay
-    every = replay.read(held, jnp.arange(int(replay.oldest_transition(held)), int(held.transitions)))
-    credit = decomposition.observe_steps(credit, common.features(every, recipe.method))
-    return learner._replace(credit=credit._replace(scale=learner.scale))
+    every = replay.read(held, replay.newest(held, int(replay.size(held)[0])))
+    credit = decomposition.observe_steps(credit, common.features(every, config, 0))
+    return learner._replace(credit=(credit._replace(scale=learner.scale[0]),))
 
 
-def curve(learner: Learner, recipe: Recipe, fits: tuple[int, ...], seed: int) -> list[dict[str, float]]:
+def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: int) -> list[dict[str, float]]:
     """What the decoder is worth after so many fits."""
-    learner, found, begin = untrained(learner, recipe, jax.random.key(seed)), [], time.perf_counter()
-    number = learner.replay.transitions - 1 - jnp.arange(RECENT)
-    recent = replay.read(learner.replay, number)
-    first = jnp.isin(number, learner.replay.first)
-    every = jnp.ones(RECENT, bool)
-    some = jax.jit(common.fit_often, static_argnames=("updates", "recipe"))
+    learner, found, begin = untrained(learner, config, jax.random.key(seed)), [], time.perf_counter()
+    index = replay.newest(learner.replay, RECENT)
+    recent = jax.tree.map(lambda rows: rows[0], replay.read(learner.replay, index))
+    first = jnp.isin(index.number[0], learner.replay.first)
+    reward, every = recent.before["reward"][:, 0], jnp.ones(RECENT, bool)
+    some = jax.jit(common.fit_often, static_argnames="config")
     done = 0
     for wanted in fits:
         while done < wanted:
-            learner, _ = some(learner, jax.random.key(1000 * seed + done), updates=50, recipe=recipe)
-            done += 50
-        r_hat = common.proxy_rewards(recent, learner, recipe)
+            credit, _ = some(learner, jax.random.key(1000 * seed + done), config=config)
+            learner = learner._replace(credit=credit)
+            done += AT_A_TIME
+        r_hat = common.proxy_rewards(recent, Paid(learner.credit, learner.scale), config, 0)[:, 0]
         found.append(
             {
                 "fits": done,
-                "correlation": float(accuracy.correlation(r_hat, recent.reward, every)),
-                "error": float(accuracy.mean_error(r_hat, recent.reward, every)),
+                "correlation": float(accuracy.correlation(r_hat, reward, every)),
+                "error": float(accuracy.mean_error(r_hat, reward, every)),
                 "r_hat of the first step": float(r_hat[first].mean()),
-                "r of the first step": float(recent.reward[first].mean()),
-                "return": float(recent.mean_reward.mean() * recipe.longest_episode),
+                "r of the first step": float(reward[first].mean()),
+                "return": float(recent.mean_reward.mean() * config.env.max_steps),
                 "seconds": time.perf_counter() - begin,
             }
         )
@@ -77,10 +79,10 @@ def main(directory: tyro.conf.Positional[Path], fits: tuple[int, ...] = (100, 80
         seeds: of the run's.
     """
     run = open_run(directory)
-    recipe, everyone, _, _ = load_learner(run)
+    config, everyone, _, _ = load_learner(run)
     results = {}
     for name in ("diaster", "rd"):
-        chosen = dataclasses.replace(recipe, method=METHODS[name], credit=CreditSettings())
+        chosen = dataclasses.replace(config, method=METHODS[name], credit=CreditSettings(), fit_updates=AT_A_TIME)
         results[name] = [curve(of_seed(everyone, seed), chosen, fits, seed) for seed in range(seeds)]
         for of_one in results[name]:
             print(

@@ -32,6 +32,7 @@ from lare.latent.verify import verify
 from lare.llm.recording import SHIPPED, read_recording
 from lare.llm.reply import parse
 from lare.tasks.spec import read_task
+from lare.training import session as sessions
 
 CASES = Path(__file__).parents[1] / "tests" / "latent" / "cases.json"
 OBSERVATION, ACTION, SEED = 17, 6, 0
@@ -260,19 +261,20 @@ def share(phi: Any, steps_of_run: int = 3000) -> dict[str, float]:
         session = new_session(Path(place) / "run", "HalfCheetah-v4", settings)
         advance(session, 1000)
         spent = 0.0
-        evaluate = session.factors
+        annotate = sessions.annotate
 
-        def timed(collected: Any) -> Any:
+        def timed(*given: Any) -> Any:
             nonlocal spent
             start = time.perf_counter()
-            result = evaluate(collected)
+            result = annotate(*given)
             spent += time.perf_counter() - start
             return result
 
-        session.factors = timed  # type: ignore[method-assign]
+        sessions.annotate = timed
         start = time.perf_counter()
         advance(session, steps_of_run)
         whole = time.perf_counter() - start
+        sessions.annotate = annotate
         session.close()
     return {"steps": steps_of_run, "seconds": whole, "seconds in phi": spent, "share": spent / whole}
 

@@ -37,8 +37,8 @@ HALF_CHEETAH = {
     "lare-linear": {"method": "lare-linear"},
     "rd-linear": {"method": "rd-linear"},
     "episodic": {"method": "episodic"},
-    "lare-rrdu-chunk-1": {"method": "lare-rrdu", "chunk": 1},
-    "lare-rrdu-chunk-1000": {"method": "lare-rrdu", "chunk": 1000},
+    "lare-rrdu-chunk-1": {"method": "lare-rrdu", "rollout_steps": 1},
+    "lare-rrdu-chunk-1000": {"method": "lare-rrdu", "rollout_steps": 1000},
 }
 OTHERS = {name: HALF_CHEETAH[name] for name in ("lare-rrdu", "rrdu", "dense")}
 EXPERIMENTS: dict[str, dict[str, dict[str, Any]]] = {

@@ -17,9 +17,9 @@ from jaxtyping import Float
 
 import lare
 from lare.source import source
+from lare.training.decide import decide
 from lare.training.run import create
-from lare.training.settings import decide
-from lare.training.single_agent import Session, start
+from lare.training.session import Session, start
 from lare.training.train import chosen_functions
 
 PACKAGES = (
@@ -130,12 +130,12 @@ def machine() -> dict[str, Any]:
 def new_session(directory: Path, task_name: str, settings: lare.Settings) -> Session:
     """What `lare.train` starts, without the loop around it."""
     task = lare.load_task(task_name)
-    plan = decide(settings, task)
-    return start(create(directory, task, plan, chosen_functions(task, plan, None)))
+    resolved = decide(settings, task)
+    return start(create(directory, task, resolved, chosen_functions(task, resolved, None)))
 
 
 def advance(session: Session, steps: int) -> None:
     """`steps` environment steps of each seed, to the last computation."""
-    for _ in range(steps // session.settings.turn):
+    for _ in range(steps // session.settings.iteration_steps):
         session.advance()
     jax.block_until_ready(session.learner)

@@ -19,76 +19,79 @@ from lare.credit import accuracy, decomposition
 from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Fit
+from lare.data import replay
+from lare.data.sampling import CreditDraw, draw_parts
 from lare.normalise import Scale
 from lare.training import learner as common
-from lare.training import replay
-from lare.training.credit_draws import CreditDraws, draw_parts_of_episodes
+from lare.training.config import TrainConfig
 from lare.training.learner import Learner
-from lare.training.recipe import Recipe
 from lare.training.run import open_run
-from lare.training.single_agent import load_learner
+from lare.training.seeds import of_seed
+from lare.training.session import load_learner
 
 UPDATES, STRETCH = 20_000, 5_000
 
 
-@partial(jax.jit, static_argnames=("fit", "recipe"))
-def updates(credit: Decomposition, held: replay.Replay, key: jax.Array, fit: Fit, recipe: Recipe) -> Decomposition:
-    def one(credit: Decomposition, drawn: CreditDraws) -> tuple[Decomposition, None]:
-        features = common.features(replay.read(held, drawn.steps), recipe.method)
+@partial(jax.jit, static_argnames=("fit", "config"))
+def updates(credit: Decomposition, held: replay.Replay, key: jax.Array, fit: Fit, config: TrainConfig) -> Decomposition:
+    def one(credit: Decomposition, drawn: CreditDraw) -> tuple[Decomposition, None]:
+        features = common.features(replay.read(held, drawn.steps), config, 0)
         chosen = drawn.episodes
-        episodes = Episodes(features, drawn.episode, chosen.length, chosen.mean_reward, chosen.counts)
-        return decomposition.update(credit, episodes, key, fit, recipe.credit)[0], None
+        episodes = Episodes(features, drawn.episode, chosen.length, chosen.mean_reward[..., 0], chosen.mask)
+        return decomposition.update(credit, episodes, key, fit, config.credit)[0], None
 
-    return jax.lax.scan(one, credit, draw_parts_of_episodes(held, key, STRETCH, recipe))[0]
+    drawn_steps = min(config.credit.drawn_steps, config.env.max_steps)
+    return jax.lax.scan(one, credit, draw_parts(held, key, STRETCH, common.parts_count(config), drawn_steps))[0]
 
 
-def refit(learner: Learner, recipe: Recipe, fit: Fit, scale: Scale) -> list[dict[str, float]]:
-    held, known = learner.replay, learner.credit
-    assert known is not None
-    recent = replay.read(held, held.transitions - 1 - jnp.arange(RECENT))
-    features, every = common.features(recent, recipe.method), jnp.ones(RECENT, bool)
-    credit = decomposition.init(jax.random.key(0), recipe.features, recipe.method, recipe.credit, steps=1, agents=1)
-    credit = credit._replace(moments=known.moments, scale=scale)
+def newest(learner: Learner, config: TrainConfig) -> tuple[jax.Array, jax.Array]:
+    """Features and true rewards of the last steps."""
+    recent = replay.read(learner.replay, replay.newest(learner.replay, RECENT))
+    return common.features(recent, config, 0)[0], recent.before["reward"][0, :, 0]
+
+
+def refit(learner: Learner, config: TrainConfig, fit: Fit, scale: Scale) -> list[dict[str, float]]:
+    (known,) = learner.credit
+    (features, reward), every = newest(learner, config), jnp.ones(RECENT, bool)
+    (credit,) = common.init_credit([jax.random.key(0)], config)
+    credit = credit._replace(statistics=known.statistics, scale=scale)
     found = []
     for number in range(UPDATES // STRETCH):
-        credit = updates(credit, held, jax.random.key(number), fit, recipe)
-        r_hat = decomposition.proxy_rewards(credit, features, recipe.credit)
+        credit = updates(credit, learner.replay, jax.random.key(number), fit, config)
+        r_hat = decomposition.proxy_rewards(credit, features, config.credit)[:, 0]
         found.append(
             {
                 "updates": (number + 1) * STRETCH,
-                "correlation": float(accuracy.correlation(r_hat, recent.reward, every)),
-                "error": float(accuracy.mean_error(r_hat, recent.reward, every)),
+                "correlation": float(accuracy.correlation(r_hat, reward, every)),
+                "error": float(accuracy.mean_error(r_hat, reward, every)),
             }
         )
     return found
 
 
-def ceiling(learner: Learner, recipe: Recipe) -> float:
-    held = learner.replay
-    recent = replay.read(held, held.transitions - 1 - jnp.arange(RECENT))
-    rows = np.c_[np.asarray(common.features(recent, recipe.method)), np.ones(RECENT)]
-    best = rows @ np.linalg.lstsq(rows, np.asarray(recent.reward), rcond=None)[0]
-    return float(np.corrcoef(best, recent.reward)[0, 1])
+def ceiling(learner: Learner, config: TrainConfig) -> float:
+    features, reward = (np.asarray(part) for part in newest(learner, config))
+    rows = np.c_[features[:, 0], np.ones(RECENT)]
+    best = rows @ np.linalg.lstsq(rows, reward, rcond=None)[0]
+    return float(np.corrcoef(best, reward)[0, 1])
 
 
 def main(directories: list[str]) -> None:
     results = {}
     for directory in directories:
         run = open_run(directory)
-        recipe, everyone, _, _ = load_learner(run)
-        learner = jax.tree.map(lambda leaf: leaf[0], everyone)
-        own = learner.scale
+        config, everyone, _, _ = load_learner(run)
+        learner = of_seed(everyone)
+        (own,) = learner.scale
         unit = own._replace(mean_square=jnp.ones(()))
-        assert recipe.method.fit is not None
+        assert config.method.fit is not None
         cases = {
-            "as it is": (recipe.method.fit, own),
-            "targets as they are": (recipe.method.fit, unit),
+            "as it is": (config.method.fit, own),
+            "targets as they are": (config.method.fit, unit),
             "biased": (Fit.DRAWN_STEPS, own),
         }
-        found = {name: refit(learner, recipe, *case) for name, case in cases.items()}
-        ceilings = [
-            ceiling(jax.tree.map(lambda leaf, s=seed: leaf[s], everyone), recipe) for seed in range(len(run.seeds))
-        ]
+        found = {name: refit(learner, config, *case) for name, case in cases.items()}
+        ceilings = [ceiling(of_seed(everyone, place), config) for place in range(len(run.seeds))]
         results[f"{run.config.task.name} {run.config.settings.method}"] = {"ceiling of each seed": ceilings, **found}
         print(f"{directory}: ceiling {', '.join(f'{value:.3f}' for value in ceilings)}")
         for name, steps in found.items():

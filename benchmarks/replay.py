@@ -5,7 +5,7 @@
 
 A draw is what one update of LaRe-RRDu reads on HalfCheetah-v4: 256 transitions, and 64 steps of each of 4 episodes; the
 three replays take turns. For the memory, a session on HumanoidStandup-v4 (376 numbers an observation) has its replay of a
-million observations filled with random numbers, in chunks, the way it stores its own steps, and then goes on training.
+million observations filled with random numbers, the way it stores its own steps, and then goes on training.
 """
 
 import resource
@@ -25,75 +25,71 @@ import tyro
 from measure import advance, interleave, new_session, show, summary, write
 
 import lare
+from lare.algorithms.table import ALGORITHMS
 from lare.algorithms.td3 import TD3Settings
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
-from lare.training import off_policy, replay
+from lare.data import replay
+from lare.data.replay import Replay
+from lare.data.trajectory import Trajectory
+from lare.tasks.env import EnvSpec, Team, Timestep
+from lare.training import off_policy
+from lare.training.config import TrainConfig
 from lare.training.learner import features
-from lare.training.recipe import Recipe
-from lare.training.replay import Replay, Step
-from lare.training.single_agent import Session
+from lare.training.session import Session
 
 SEED, EPISODE, UPDATES = 0, 1000, 50
 STORED = (10_000, 100_000, 1_000_000)
-RECIPE = Recipe(
+CONFIG = TrainConfig(
+    env=EnvSpec((Team("agent", 0, 1),), observation_size=17, action_size=6, discrete=False, max_steps=EPISODE),
+    judged_from="observation",
     method=find_method("lare-rrdu"),
-    algorithm=TD3Settings(),
+    algorithm=ALGORITHMS["td3"],
+    hyperparameters=TD3Settings(),
     credit=CreditSettings(),
     scale_rewards=False,
-    observation_size=17,
-    action_size=6,
-    discrete=False,
-    factors=6,
-    longest_episode=EPISODE,
+    factors=(6,),
+    environments=1,
+    rollout_steps=UPDATES,
     capacity=1_010_000,
     steps=1_000_000,
-    turn=UPDATES,
     fit_updates=1,
 )
+"""Of a size with HalfCheetah-v4."""
 
 
 def filled(transitions: int) -> Replay:
     """A replay as whole episodes of 1000 random steps would leave it, with a leading seed axis of 1."""
     random, number = np.random.default_rng(SEED), np.arange(transitions)
-    episodes, rows = transitions // EPISODE, RECIPE.capacity
-    held = replay.empty(RECIPE.capacity, RECIPE.observation_size, RECIPE.action_size, RECIPE.factors)
+    episodes, held = transitions // EPISODE, replay.empty(CONFIG.columns, 1, CONFIG.capacity, 1)
 
-    def numbers(*shape: int) -> np.ndarray:
-        return random.standard_normal((rows, *shape), np.float32)
+    def numbers(column: jax.Array) -> np.ndarray:
+        return random.standard_normal(column.shape, np.float32).astype(column.dtype)
 
     held = held._replace(
-        observation=numbers(RECIPE.observation_size),
-        action=numbers(RECIPE.action_size),
-        factors=numbers(RECIPE.factors),
-        reward=numbers(),
-        row=np.asarray(held.row.at[:transitions].set(number + number // EPISODE)),
-        episode=np.asarray(held.episode.at[:transitions].set(number // EPISODE)),
-        first=np.asarray(held.first.at[:episodes].set(EPISODE * np.arange(episodes))),
-        episode_return=random.standard_normal(held.episode_return.shape, np.float32),
-        next_row=jnp.asarray(episodes * (EPISODE + 1)),
-        transitions=jnp.asarray(transitions),
-        episodes=jnp.asarray(episodes),
+        columns={name: numbers(column) for name, column in held.columns.items()},
+        row=np.asarray(held.row.at[0, :transitions].set(number + number // EPISODE)),
+        episode=np.asarray(held.episode.at[0, :transitions].set(number // EPISODE)),
+        first=np.asarray(held.first.at[0, :episodes].set(EPISODE * np.arange(episodes))),
+        episode_return=numbers(held.episode_return),
+        next_row=jnp.asarray([episodes * (EPISODE + 1)]),
+        transitions=jnp.asarray([transitions]),
+        episodes=jnp.asarray([episodes]),
     )
     return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], held)
 
 
 def reads(held: Replay, key: jax.Array) -> Any:
     """Everything that 50 updates read, one after the other; what the last one read is returned."""
-    draws = off_policy.draw(held, key, UPDATES, RECIPE)
+    draws = off_policy.draw(held, key, UPDATES, CONFIG)
 
     def one(draw: off_policy.Draws) -> Any:
         assert draw.credit is not None
         drawn, batch = replay.read(held, draw.credit.steps), replay.read(held, draw.batch)
-        credit = features(drawn, RECIPE.method), draw.credit.episodes
-        return (
-            credit,
-            features(batch, RECIPE.method),
-            batch.observation,
-            batch.action,
-            batch.next_observation,
-            batch.continues,
-        )
+        credit = features(drawn, CONFIG, 0), draw.credit.episodes
+        before, after = batch.before, batch.after
+        read = before["observation"], before["action"], after["observation"], before["terminated"]
+        return credit, features(batch, CONFIG, 0), read
 
     start = jax.tree.map(jnp.zeros_like, one(jax.tree.map(lambda leaf: leaf[0], draws)))
     return jax.lax.scan(lambda _, draw: (one(draw), None), start, draws)[0]
@@ -115,23 +111,32 @@ def draws(rounds: int, calls: int) -> None:
 
 def fill(session: Session, transitions: int) -> None:
     """Random steps into a session's replay, by its own compiled `store`."""
-    recipe, chunk, random = session.recipe, session.settings.chunk, np.random.default_rng(SEED)
+    config, random = session.config, np.random.default_rng(SEED)
+    env, rollout = config.env, config.rollout_steps
+    every = {
+        "available": np.ones((1, rollout, 1, 1, env.action_size), bool),
+        "alive": np.ones((1, rollout, 1, 1), bool),
+    }
 
     def numbers(*shape: int) -> np.ndarray:
-        return random.standard_normal((1, chunk, *shape), np.float32)
+        return random.standard_normal((1, rollout, 1, *shape), np.float32)
 
-    for start in range(0, transitions, chunk):
-        ended = (start + 1 + np.arange(chunk)) % EPISODE == 0
-        steps = Step(
-            observation=numbers(recipe.observation_size),
-            action=numbers(recipe.action_size),
-            factors=numbers(recipe.factors),
-            reward=numbers(),
-            next_observation=numbers(recipe.observation_size),
-            terminated=np.zeros((1, chunk), bool),
-            ended=ended[None],
+    def shown(ended: np.ndarray) -> Timestep:
+        return Timestep(
+            observation=numbers(1, env.observation_size),
+            state=numbers(0),
+            reward=numbers(1),
+            terminated=np.zeros_like(ended),
+            truncated=ended,
+            measures={},
+            **every,
         )
-        session.learner = session.functions.store(session.learner, steps)
+
+    for start in range(0, transitions, rollout):
+        ended = ((start + 1 + np.arange(rollout)) % EPISODE == 0)[None, :, None]
+        action = numbers(1, env.action_size)
+        steps = Trajectory(shown(np.zeros_like(ended)), action, action, shown(ended))
+        session.learner = session.functions.store(session.learner, steps, numbers(1, *config.factors))
     session.step = transitions
 
 
@@ -157,7 +162,7 @@ def memory(transitions: int) -> None:
         session.close()
     arrays = sum(leaf.nbytes for leaf in jax.tree.leaves(session.learner.replay))
     held = session.learner.replay
-    stored = int(held.transitions[0] - jax.vmap(replay.oldest_transition)(held)[0])
+    stored = int(jax.vmap(replay.size)(held)[0, 0])
     print(f"{stored:,} transitions stored; the arrays of the replay: {arrays / 1e9:.3f} GB")
     for stage, bytes_used in stages.items():
         print(f"{stage:28s} resident {bytes_used['resident'] / 1e9:.3f} GB, peak {bytes_used['peak'] / 1e9:.3f} GB")

@@ -4,8 +4,8 @@ the updates.
     python benchmarks/step_costs.py
 
 The methods of an algorithm take turns; a turn is so many steps of one session, by the same `Session.advance` that `lare train`
-calls. Off-policy algorithms update at every step, after random ones that fill the replay with whole episodes; of ppo a turn is one
-rollout of 2000 steps with its updates. Many agents: `agents_speed.py`.
+calls. Algorithms that consume transitions update at every step, after random ones that fill the replay with whole episodes; of
+ppo a turn is one rollout of 2000 steps with its updates. Many agents: `agents_speed.py`.
 """
 
 import tempfile
@@ -17,21 +17,20 @@ import tyro
 from measure import advance, interleave, new_session, show, summary, write
 
 import lare
-from lare.algorithms.table import ALGORITHMS, Kind
+from lare.algorithms.table import ALGORITHMS, Consumes
 from lare.credit.methods import METHODS
-from lare.training.single_agent import Session
+from lare.training.session import Session
 
 TASK, SEED, BEFORE, ROLLOUT = "HalfCheetah-v4", 0, 2000, 2000
-ONE_AGENT = [row.name for row in ALGORITHMS.values() if row.kind is not Kind.MANY_AGENTS]
+ONE_AGENT = [row.name for row in ALGORITHMS.values() if row.one_agent and row.continuous]
 FITTING = [row.name for row in METHODS.values() if not row.for_many_only]
 
 
 def session(directory: Path, algorithm: str, method: str) -> Session:
     """One that has just begun to update."""
     chosen = ALGORITHMS[algorithm]
-    figures = (
-        {} if chosen.kind is Kind.ON_POLICY else {algorithm: chosen.settings.model_copy(update={"warmup": BEFORE})}
-    )
+    rollouts = chosen.consumes is Consumes.ROLLOUTS
+    figures = {} if rollouts else {algorithm: chosen.settings.model_copy(update={"warmup": BEFORE})}
     settings = lare.Settings(
         **{"method": method, "algorithm": algorithm, "seed": SEED, "evaluation_episodes": 1, **figures}
     )
@@ -45,12 +44,12 @@ def main(rounds: int = 3, steps: int = 500, algorithms: tuple[str, ...] = tuple(
 
     Args:
         rounds: how often each has its turn.
-        steps: environment steps in a turn of an off-policy algorithm, a multiple of 50.
+        steps: environment steps in a turn of an algorithm that consumes transitions, a multiple of 50.
         algorithms: which ones.
     """
     tables = {}
     for algorithm in algorithms:
-        of_turn = ROLLOUT if ALGORITHMS[algorithm].kind is Kind.ON_POLICY else steps
+        of_turn = ROLLOUT if ALGORITHMS[algorithm].consumes is Consumes.ROLLOUTS else steps
         with tempfile.TemporaryDirectory() as place:
             sessions = {method: session(Path(place), algorithm, method) for method in FITTING}
             turns = {method: partial(advance, one, of_turn) for method, one in sessions.items()}
@@ -62,7 +61,7 @@ def main(rounds: int = 3, steps: int = 500, algorithms: tuple[str, ...] = tuple(
         "task": TASK,
         "seeds": [SEED],
         "rounds": rounds,
-        "steps in a turn": {"off-policy": steps, "ppo": ROLLOUT},
+        "steps in a turn": {"transitions": steps, "ppo": ROLLOUT},
     }
     write("step_costs", {**figures, "milliseconds for a step": tables})
 

@@ -4,7 +4,7 @@
 
 LaRe's methods, TD3 of Stable-Baselines3 and TD3 of SBX take turns in one process; all with batches of 256, networks of
 256-256, one update a step, the actor every second one, a replay for a million transitions. `matrix products` are those
-of one LaRe-RRDu update alone, in a compiled loop, on random numbers. A second table has LaRe-RRDu by its chunk length.
+of one LaRe-RRDu update alone, in a compiled loop, on random numbers. A second table has LaRe-RRDu by the steps of its rollouts.
 """
 
 import tempfile
@@ -26,19 +26,19 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 import lare
 from lare.algorithms.td3 import TD3Settings
-from lare.training.single_agent import Session
+from lare.training.session import Session
 
 TASK, SEED = "HalfCheetah-v4", 0
 BEFORE = 2000
 """Random steps before the first update: every method has whole episodes to draw."""
-CHUNKS = (1, 10, 50, 200, 1000)
+ROLLOUTS = (1, 10, 50, 200, 1000)
 
 
-def ours(directory: Path, method: str, chunk: int = 50) -> Session:
+def ours(directory: Path, method: str, rollout: int = 50) -> Session:
     settings = lare.Settings(
-        method=method, seed=SEED, chunk=chunk, evaluation_episodes=1, td3=TD3Settings(warmup=BEFORE)
+        method=method, seed=SEED, rollout_steps=rollout, evaluation_episodes=1, td3=TD3Settings(warmup=BEFORE)
     )
-    session = new_session(directory / f"{method}-{chunk}", TASK, settings)
+    session = new_session(directory / f"{method}-{rollout}", TASK, settings)
     advance(session, BEFORE)
     return session
 
@@ -162,8 +162,8 @@ def side_by_side(directory: Path, steps: int) -> Iterator[tuple[str, Callable[[]
         session = ours(directory, method)
         yield method, partial(advance, session, steps)
         if method == "lare-rrdu":
-            recipe = session.recipe
-            products = matrix_products(recipe.factors, recipe.observation_size, recipe.action_size)
+            env, (factors,) = session.config.env, session.config.factors
+            products = matrix_products(factors, env.observation_size, env.action_size)
             yield "matrix products", partial(repeat, products, steps // 50)
     yield "Stable-Baselines3 TD3", partial(go_on, theirs(stable_baselines3.TD3), steps)
     yield "SBX TD3", partial(go_on, theirs(sbx.TD3), steps)
@@ -178,16 +178,17 @@ def main(rounds: int = 7, steps: int = 1000) -> None:
     """
     with tempfile.TemporaryDirectory() as place:
         seconds = interleave(dict(side_by_side(Path(place), steps)), rounds)
-        chunks = {chunk: ours(Path(place) / "chunks", "lare-rrdu", chunk) for chunk in CHUNKS if chunk <= steps}
-        by_chunk = interleave({str(chunk): partial(advance, chunks[chunk], steps) for chunk in chunks}, rounds)
-    table, chunk_table = summary(seconds, steps, "SBX TD3"), summary(by_chunk, steps, "50")
+        wanted = [rollout for rollout in ROLLOUTS if rollout <= steps]
+        sessions = {rollout: ours(Path(place) / "rollouts", "lare-rrdu", rollout) for rollout in wanted}
+        taken = interleave({str(rollout): partial(advance, one, steps) for rollout, one in sessions.items()}, rounds)
+    table, by_rollout = summary(seconds, steps, "SBX TD3"), summary(taken, steps, "50")
     show("training step", table, "SBX TD3")
     share = ratio(seconds["matrix products"], seconds["lare-rrdu"])
     print(f"the matrix products alone: {share:.1%} of lare-rrdu")
-    show("lare-rrdu, by chunk", chunk_table, "chunk 50")
+    show("lare-rrdu, by rollout_steps", by_rollout, "50 steps")
     figures = {"task": TASK, "seeds": [SEED], "rounds": rounds, "steps in a round": steps}
     share_of = {"matrix products, share of lare-rrdu": share}
-    write("training_step", {**figures, "training step": table, **share_of, "by chunk": chunk_table})
+    write("training_step", {**figures, "training step": table, **share_of, "by rollout_steps": by_rollout})
 
 
 if __name__ == "__main__":

@@ -9,13 +9,14 @@ from pathlib import Path
 import jax
 import pytest
 
+from jax_toys import Echo, echo_spec
 from lare import cli
 from lare.algorithms.ppo import PPOSettings
 from lare.algorithms.table import ALGORITHMS
-from lare.credit.decomposition import CreditSettings
 from lare.latent.function import LatentFunction, verified
 from lare.tasks.spec import TaskSpec
-from lare.training.settings import AgentSettings, RolloutSettings, Settings
+from lare.tasks.table import FAMILIES
+from lare.training.settings import Settings
 from toys import PHI, REWARD, Chase, toy_spec
 
 # Most of a small run's time is compilation, and many tests compile the same. JAX may have been imported already, and
@@ -35,7 +36,7 @@ for option, value in CACHE.items():
     os.environ.setdefault(option.upper(), str(value))
     jax.config.update(option, value)
 
-collect_ignore = ["toys.py", "servers.py", "recipes.py", "programs.py"]
+collect_ignore = ["toys.py", "jax_toys.py", "hosts.py", "parallel_toys.py", "servers.py", "recipes.py", "programs.py"]
 """No tests in there, and looking for doctests would import it, and register its environments, a second time."""
 
 __all__ = ["PHI", "Chase", "toy_spec"]
@@ -85,6 +86,13 @@ def command(monkeypatch, capsys, tmp_path):
     return run
 
 
+@pytest.fixture
+def echo(monkeypatch) -> TaskSpec:
+    """The toy of many agents in JAX, of a family of its own."""
+    monkeypatch.setitem(FAMILIES, "echo", lambda task, **_: Echo())
+    return echo_spec()
+
+
 @pytest.fixture(scope="session")
 def phi() -> LatentFunction:
     return verified(PHI, toy_spec())
@@ -104,16 +112,16 @@ def small():
         values = {
             "steps": 240,
             "seeds": 2,
-            "chunk": 12,
+            "rollout_steps": 12,
             "evaluate_every": 60,
             "evaluation_episodes": 2,
+            "fit_updates": 2,
             **{
                 name: ALGORITHMS[name].settings.model_copy(update={"hidden": (8,), "batch_size": 8, "warmup": 36})
                 for name in ("td3", "ddpg", "sac")
             },
             "ppo": PPOSettings(hidden=(8,), minibatch_size=16, epochs=2),
-            "rollout": RolloutSettings(steps=60, fit_updates=2),
-            "credit": CreditSettings(hidden=(8,), drawn_steps=4, steps=16),
+            "credit": {"hidden": (8,), "drawn_steps": 4, "steps": 16},
         }
         return Settings(**(values | changes))
 
@@ -122,17 +130,23 @@ def small():
 
 @pytest.fixture(scope="session")
 def small_many():
-    """The same for particle tasks: two updates of two seeds."""
+    """The same for tasks of many agents: two iterations of two seeds on a particle task."""
 
     def build(**changes) -> Settings:
-        credit = CreditSettings(hidden=(8,), steps=50, drawn_steps=5)
+        quick = {"hidden": 8, "embed": 4, "hypernet": 4, "batch_size": 4, "update_every": 4, "epsilon_steps": 100}
         values = {
             "steps": 200,
             "seeds": 2,
+            "environments": 4,
+            "rollout_steps": 25,
             "evaluate_every": 100,
             "evaluation_episodes": 4,
+            "fit_every": 1,
+            "fit_updates": 2,
+            "capacity": 400,
             "ippo": PPOSettings(hidden=(8,), minibatch_size=100, epochs=1),
-            "agents": AgentSettings(episodes=4, fit_every=1, fit_updates=2, capacity=6, credit=credit),
+            **{name: ALGORITHMS[name].settings.model_copy(update=quick) for name in ("qmix", "vdn")},
+            "credit": {"hidden": (8,), "steps": 50, "drawn_steps": 5},
         }
         return Settings(**(values | changes))
 

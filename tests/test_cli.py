@@ -15,7 +15,7 @@ from lare.tasks.spec import read_task, shipped_tasks
 from toys import PHI
 
 TINY = (
-    "--steps 200 --chunk 50 --evaluate-every 100 --evaluation-episodes 1 "
+    "--steps 200 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1 "
     "--td3.warmup 100 --td3.hidden 8 8 --credit.hidden 8 8"
 ).split()
 
@@ -70,19 +70,16 @@ def test_an_unknown_choice_lists_those_there_are(command):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            "CN-6 --credit.no-normalise",
-            "credit.normalise makes no difference to ippo on CN-6; it has agents.credit.normalise",
-        ),
-        ("CN-6 --agents.credit.fits 3", "agents.credit.fits makes no difference to ippo on CN-6"),
+        ("CN-6 --method dense --credit.sum-form True", "credit.sum_form makes no difference to dense"),
+        ("CN-6 --ppo.clip 0.1", "ppo.clip makes no difference to ippo on CN-6; it has ippo.clip"),
         ("Reacher-v4 --method dense --judges both", "judges makes no difference to dense"),
         ("CN-6 --scale-rewards", "scale_rewards makes no difference to ippo on CN-6"),
-        ("CN-6 --capacity 10", "capacity makes no difference to ippo on CN-6; it has agents.capacity"),
+        ("CN-6 --method dense --capacity 1000", "capacity makes no difference to dense"),
+        ("HalfCheetah-v4 --fit-every 2", "fit_every makes no difference to lare-rrdu"),
         (
             "Reacher-v4 --sac.learning-rate 1",
             "sac.learning_rate makes no difference to td3 on Reacher-v4; it has td3.learning_rate",
         ),
-        ("Reacher-v4 --algorithm ppo --chunk 10", "chunk makes no difference to ppo on Reacher-v4"),
         (
             "Reacher-v4 --draw 1 --function phi.py",
             "draw and candidates choose a recorded function, and a function is given: leave either out",
@@ -205,6 +202,14 @@ def test_a_new_task_is_written_once(command, tmp_path):
     assert "# Task\nThe inverted pendulum swingup problem" in out
 
 
+def test_a_new_task_of_two_teams_is_three_files(command, tmp_path):
+    status, out, err = command("new-task", "pettingzoo/mpe2.simple_adversary_v3:parallel_env")
+    assert (status, err) == (0, "")
+    files = [f"simple_adversary_v3{team}.toml" for team in ("", "-adversary", "-agent")]
+    assert out.splitlines()[0].startswith(f"wrote {', '.join(files)}; ")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(files)
+
+
 def test_what_a_new_task_lacks_is_said(command):
     status, out, _ = command("new-task", "Hopper-v4", "--out", "hopper.toml")
     assert status == 0
@@ -239,7 +244,7 @@ def test_the_ablation_without_pre_verification_keeps_what_runs(command):
             "--resume goes on with the run's own settings: give it no task and no other settings",
         ),
         ("train Reacher-v4 --function none.py", "the function file none.py is not there"),
-        ("train Reacher-v4 --steps 120", "steps = 120 is not a multiple of chunk = 50: take 100"),
+        ("train Reacher-v4 --steps 120", "steps = 120 is not a multiple of rollout_steps = 50: take 100"),
         ("train Reacher-v4 --seed -1", "seed = -1: input should be greater than or equal to 0"),
         (
             "train Reacher-v4 --method magic",
@@ -248,11 +253,14 @@ def test_the_ablation_without_pre_verification_keeps_what_runs(command):
         ("train CN-6 --algorithm ppo", "ppo is for a single agent, and CN-6 is a task of many"),
         (
             "train CN-6 --steps 1000",
-            "steps = 1000 is not a multiple of 2050 (agents.episodes = 82, of 25 steps each): take 2050",
+            "steps = 1000 is not a multiple of 2050 (rollout_steps = 25 of environments = 82): take 2050",
         ),
-        ("train CN-6 --agents.capacity 50", "agents.capacity = 50 is less than the 82 episodes of an update"),
+        ("train CN-6 --capacity 50", "capacity = 50 is too small: a rollout of CN-6 takes up to 6150"),
         ("train CN-6 --ippo.hidden -1", "hidden.0 = -1: input should be greater than or equal to 1"),
-        ("train CompetitivePP-6-prey", "CompetitivePP-6-prey is one team of CompetitivePP-6: train that"),
+        (
+            "train CompetitivePP-6-prey",
+            "CompetitivePP-6-prey is one team of particles/CompetitivePP-6: train the task that has both",
+        ),
         (
             "train CompetitivePP-6 --function phi.py",
             "CompetitivePP-6 needs one latent function for each of CompetitivePP-6-predator, CompetitivePP-6-prey; 1 were "

@@ -22,11 +22,12 @@ MUST_NOT_KNOW = {
     "source": "tasks llm latent credit networks algorithms training experiments cli",
     "networks": "tasks llm latent credit algorithms training experiments cli",
     "normalise": "tasks llm latent credit networks algorithms training experiments cli",
-    "tasks": "llm latent credit networks algorithms training experiments cli",
-    "llm": "latent credit networks algorithms training experiments cli",
-    "latent": "credit networks algorithms training experiments cli",
-    "credit": "llm latent algorithms training experiments cli",
-    "algorithms": "tasks llm latent credit training experiments cli",
+    "tasks": "llm latent data credit networks algorithms training experiments cli",
+    "data": "llm latent credit networks algorithms training experiments cli",
+    "llm": "latent data credit networks algorithms training experiments cli",
+    "latent": "data credit networks algorithms training experiments cli",
+    "credit": "tasks llm latent data algorithms training experiments cli",
+    "algorithms": "tasks llm latent data credit training experiments cli",
     "theory": "tasks llm latent credit networks algorithms training experiments cli",
     "training": "experiments cli",
     "experiments": "cli",
@@ -86,7 +87,17 @@ def test_another_name_is_not():
         lare.trian  # noqa: B018
 
 
-@pytest.mark.parametrize("module", ["lare", "lare.latent.worker", "lare.latent.design", "lare.tasks.spec"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        "lare",
+        "lare.latent.worker",
+        "lare.latent.design",
+        "lare.tasks.spec",
+        "lare.tasks.pettingzoo",
+        "lare.tasks.workers",
+    ],
+)
 def test_what_need_not_wait_for_jax_does_not(module):
     program = f"import sys, {module}; print({module}.__name__, 'jax' in sys.modules)"
     printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout

@@ -4,7 +4,7 @@ import numpy as np
 import optax
 import pytest
 
-from lare.networks import MLP, descend, move_towards, start_adam
+from lare.networks import MLP, clipped, descend, move_towards, start_adam
 
 
 def test_mlp_against_numpy():
@@ -26,6 +26,16 @@ def test_descend_is_adam():
     moved, _ = descend(parameters, gradient, start_adam(parameters, 0.01), 0.01)
     # Adam's first step is the learning rate in the direction of the sign.
     np.testing.assert_allclose(moved, [0.99, -2.01], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("most", "want"), [(6.5, [1.5, 2.0, 6.0]), (13.0, [3.0, 4.0, 12.0]), (20.0, [3.0, 4.0, 12.0])])
+def test_a_gradient_is_clipped_as_a_whole(most, want):
+    got = clipped({"a": jnp.array([3.0, 4.0]), "b": jnp.array(12.0)}, most)
+    np.testing.assert_allclose([*got["a"], got["b"]], want, rtol=1e-6)
+
+
+def test_no_gradient_stays_none():
+    assert float(clipped(jnp.array(0.0), 1.0)) == 0
 
 
 @pytest.mark.parametrize("tau", [0.0, 0.25, 1.0])

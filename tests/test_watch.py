@@ -9,7 +9,8 @@ from rich.progress import Progress
 
 from lare.cli import watch
 from lare.experiments.jobs import Job
-from lare.training.settings import Plan
+from lare.training.decide import decide
+from lare.training.settings import Settings
 from toys import toy_spec
 
 
@@ -19,7 +20,8 @@ def job_at(directory, step):
     if step:
         (directory / "config.json").write_text("{}")
         (directory / "metrics.jsonl").write_text(json.dumps({"step": step, "seed": 0}) + "\n")
-    return Job(directory, toy_spec(), Plan(steps=100, evaluate_every=50))
+    settings = Settings(method="dense", steps=100, evaluate_every=50)
+    return Job(directory, toy_spec(), settings, decide(settings, toy_spec()))
 
 
 def test_bars_follow_the_runs(monkeypatch, tmp_path):

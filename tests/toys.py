@@ -106,6 +106,12 @@ class Pick(gymnasium.Env):
         return self.observe(), reward, False, False, {}
 
 
+def pick_spec(**changes) -> TaskSpec:
+    return toy_spec(
+        **{"name": "Pick", "environment": "toys/Pick-v0", "observation_size": 4, "action_size": 4} | changes
+    )
+
+
 class Forgetful(Chase):
     """Its chance does not come from the seed: an episode cannot be had again."""
 

@@ -1,4 +1,4 @@
-"""The one network shape that actors, critics and decoders share, and the steps that change its parameters."""
+"""The network shapes that actors, critics and decoders share, and the steps that change their parameters."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
@@ -60,6 +60,32 @@ class MLP(eqx.Module):
         return self.layers[-1](x)
 
 
+class GRU(eqx.Module):
+    """A gated recurrent unit (Cho et al., 2014), in the form that cuDNN and PyTorch have.
+
+        z = s(x U_z + h W_z)    r = s(x U_r + h W_r)    n = tanh(x U_n + r * (h W_n))    h' = (1 - z) n + z h
+
+    with a bias in each of the six products.
+    """
+
+    given: Linear
+    """U: of z, r and n side by side."""
+    kept: Linear
+    """W, likewise."""
+
+    def __init__(self, features: int, size: int, *, key: PRNGKeyArray):
+        given_key, kept_key = jax.random.split(key)
+        self.given, self.kept = Linear(features, 3 * size, key=given_key), Linear(size, 3 * size, key=kept_key)
+
+    def __call__(
+        self, given: Float[Array, "*batch three"], h: Float[Array, "*batch size"]
+    ) -> Float[Array, "*batch size"]:
+        """One step; `given` is x U, which a caller has computed for all steps at once."""
+        (z, r, n), (kept_z, kept_r, kept_n) = (jnp.split(part, 3, axis=-1) for part in (given, self.kept(h)))
+        z, r = jax.nn.sigmoid(z + kept_z), jax.nn.sigmoid(r + kept_r)
+        return (1 - z) * jnp.tanh(n + r * kept_n) + z * h
+
+
 def orthogonal(network: MLP, last_gain: float, *, key: PRNGKeyArray) -> MLP:
     """The same network with orthogonal weights (Saxe et al., 2014), of gain 1 and at last `last_gain`, and no biases."""
     keys = jax.random.split(key, len(network.layers))
@@ -89,6 +115,12 @@ def descend(
     """One step of Adam (Kingma and Ba, 2015) against the gradient."""
     change, state = optax.adam(cast(float, learning_rate)).update(cast(Any, gradient), state)
     return cast(Parameters, optax.apply_updates(cast(Any, parameters), change)), state
+
+
+def clipped(gradient: Parameters, most: float) -> Parameters:
+    """The gradient, cut down to the length `most` where it is longer (Pascanu et al., 2013)."""
+    shrink = most / jnp.maximum(optax.tree.norm(gradient), most)
+    return jax.tree.map(lambda leaf: leaf * shrink, gradient)
 
 
 def move_towards(target: Parameters, online: Parameters, tau: float) -> Parameters:

@@ -9,63 +9,84 @@ CLIP = 10.0
 """Normalised features are cut off at this many standard deviations."""
 
 
-class Moments(NamedTuple):
-    """Mean and spread of everything seen so far, one of each per feature."""
+class RunningMeanStd(NamedTuple):
+    """Mean and spread of every row so far, one of each per feature."""
 
-    seen: Float[Array, ""]
+    rows: Float[Array, ""]
+    """How many there were."""
     mean: Float[Array, " features"]
     squares: Float[Array, " features"]
     """Sum of the squared deviations from the mean."""
 
 
-def no_moments(features: int) -> Moments:
-    return Moments(jnp.zeros(()), jnp.zeros(features), jnp.zeros(features))
+def new_mean_std(features: int) -> RunningMeanStd:
+    """Statistics of no rows."""
+    return RunningMeanStd(jnp.zeros(()), jnp.zeros(features), jnp.zeros(features))
 
 
-def observe(moments: Moments, rows: Float[Array, "batch features"]) -> Moments:
-    """Take a batch in (the parallel update of Chan, Golub and LeVeque, 1983: no catastrophic cancellation)."""
-    count = moments.seen + rows.shape[0]
-    mean = jnp.mean(rows, axis=0)
-    gap = mean - moments.mean
-    share = rows.shape[0] / count
-    squares = moments.squares + jnp.sum((rows - mean) ** 2, axis=0) + gap**2 * moments.seen * share
-    return Moments(count, moments.mean + gap * share, squares)
+def observe(
+    statistics: RunningMeanStd, rows: Float[Array, "batch features"], mask: Bool[Array, " batch"] | None = None
+) -> RunningMeanStd:
+    """Add a batch (the parallel update of Chan, Golub and LeVeque, 1983: no catastrophic cancellation).
+
+    Rows where `mask` is false are passed over.
+    """
+    if mask is None:
+        added, mean = rows.shape[0], jnp.mean(rows, axis=0)
+        spread = jnp.sum((rows - mean) ** 2, axis=0)
+    else:
+        added, mean = jnp.sum(mask), jnp.sum(rows, axis=0, where=mask[:, None]) / jnp.maximum(jnp.sum(mask), 1)
+        spread = jnp.sum((rows - mean) ** 2, axis=0, where=mask[:, None])
+    count = statistics.rows + added
+    gap = mean - statistics.mean
+    share = added / jnp.maximum(count, 1)
+    squares = statistics.squares + spread + gap**2 * statistics.rows * share
+    return RunningMeanStd(count, statistics.mean + gap * share, squares)
 
 
-def deviation(moments: Moments) -> Float[Array, " features"]:
+def deviation(statistics: RunningMeanStd) -> Float[Array, " features"]:
     """Standard deviations; 0 for a feature that never varied."""
-    found = jnp.sqrt(moments.squares / jnp.maximum(moments.seen, 1))
+    found = jnp.sqrt(statistics.squares / jnp.maximum(statistics.rows, 1))
     # A deviation within float32's rounding of the mean is noise, whatever its absolute size.
-    return jnp.where(found > 1e-6 * jnp.abs(moments.mean), found, 0)
+    return jnp.where(found > 1e-6 * jnp.abs(statistics.mean), found, 0)
 
 
-def standardise(moments: Moments, rows: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
+def standardise(statistics: RunningMeanStd, rows: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
     """(x - mean) / std, cut off at ±10. A feature that never varied becomes 0."""
-    spread = deviation(moments)
-    scaled = (rows - moments.mean) / jnp.where(spread > 0, spread, 1)
+    spread = deviation(statistics)
+    scaled = (rows - statistics.mean) / jnp.where(spread > 0, spread, 1)
     return jnp.where(spread > 0, jnp.clip(scaled, -CLIP, CLIP), 0)
+
+
+def standardise_if_known(
+    statistics: RunningMeanStd, rows: Float[Array, "*batch features"]
+) -> Float[Array, "*batch features"]:
+    """The same; the rows as they are as long as there are no statistics."""
+    return jnp.where(statistics.rows > 0, standardise(statistics, rows), rows)
 
 
 class Scale(NamedTuple):
     """Of what size the mean reward of an episode is, R/T."""
 
-    seen: Float[Array, ""]
+    episodes: Float[Array, ""]
+    """How many there were."""
     mean_square: Float[Array, ""]
     lowest: Float[Array, ""]
     highest: Float[Array, ""]
 
 
-def no_scale() -> Scale:
+def new_scale() -> Scale:
+    """The scale of no episodes."""
     return Scale(*(jnp.zeros(()) for _ in Scale._fields))
 
 
-def observe_scale(scale: Scale, values: Float[Array, " batch"], counts: Bool[Array, " batch"]) -> Scale:
-    """Take in those of `values` where `counts` is true."""
-    count = scale.seen + jnp.sum(counts)
-    excess = jnp.sum(jnp.where(counts, values**2 - scale.mean_square, 0))
-    known = scale.seen > 0
-    lowest = jnp.min(values, where=counts, initial=jnp.inf)
-    highest = jnp.max(values, where=counts, initial=-jnp.inf)
+def observe_scale(scale: Scale, values: Float[Array, " batch"], mask: Bool[Array, " batch"]) -> Scale:
+    """Add those of `values` where `mask` is true."""
+    count = scale.episodes + jnp.sum(mask)
+    excess = jnp.sum(jnp.where(mask, values**2 - scale.mean_square, 0))
+    known = scale.episodes > 0
+    lowest = jnp.min(values, where=mask, initial=jnp.inf)
+    highest = jnp.max(values, where=mask, initial=-jnp.inf)
     some = count > 0
     return Scale(
         count,

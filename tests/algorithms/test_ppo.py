@@ -57,7 +57,7 @@ def test_out_of_time_bootstraps_and_a_termination_does_not():
 def test_values_are_in_units_of_the_reward_and_targets_in_deviations_of_the_return():
     state, rollout = state_of(), rollout_of()
     state = state._replace(returns=observe(state.returns, jnp.array([[3.0], [11.0]])))
-    said = np.asarray(state.online.critic(rollout.observation))[..., 0]
+    said = np.asarray(state.params.critic(rollout.observation))[..., 0]
     value = np.asarray(ppo.values(state, rollout.observation))
     np.testing.assert_allclose(value, 7 + 4 * said, rtol=1e-5)
     batch, returns, explained = ppo.prepare(state, rollout, SETTINGS)
@@ -96,17 +96,17 @@ def test_value_loss_is_clipped_and_huber(value, old, target, want):
 
 
 def test_a_choice_has_the_probabilities_of_its_softmax():
-    policy = state_of().online.actor
+    policy = state_of().params.actor
     observation = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3)), jnp.float32)
     both = jnp.stack([policy.log_probability(observation, jnp.tile(jnp.eye(2)[i], (5, 1))) for i in range(2)])
     np.testing.assert_allclose(np.exp(both).sum(axis=0), 1, rtol=1e-5)
     np.testing.assert_allclose(policy.entropy(observation), -(np.exp(both) * both).sum(axis=0), rtol=1e-4)
-    drawn = policy.sample(jnp.tile(observation[:1], (4000, 1)), jax.random.key(1))
+    drawn = policy.drawn(jnp.tile(observation[:1], (4000, 1)), jax.random.gumbel(jax.random.key(1), (4000, 2)))
     np.testing.assert_allclose(drawn.mean(axis=0), np.exp(both[:, 0]), atol=0.03)
 
 
 def test_a_gaussian_has_the_density_of_a_gaussian():
-    policy = state_of(discrete=False).online.actor
+    policy = state_of(discrete=False).params.actor
     observation, action = jnp.ones((1, 3)), jnp.array([[0.3, -1.2]])
     z = np.asarray(action - policy.network(observation))
     want = (-0.5 * z**2 - 0.5 * np.log(2 * np.pi)).sum()
@@ -129,11 +129,11 @@ def test_rewards_of_any_scale_and_offset_train_alike(discrete):
     settings = PPOSettings(hidden=(16,), minibatch_size=24, epochs=2, gamma=1.0, gae_lambda=1.0)
     rollout = rollout_of(ended=ended, discrete=discrete)._replace(continues=jnp.asarray(1 - ended))
     state = state_of(discrete, settings)
-    quiet = state._replace(online=state.online._replace(critic=jax.tree.map(jnp.zeros_like, state.online.critic)))
+    quiet = state._replace(params=state.params._replace(critic=jax.tree.map(jnp.zeros_like, state.params.critic)))
     actors = [
         ppo.update(quiet, rollout._replace(reward=scale * rollout.reward), jax.random.key(1), jnp.array(1.0), settings)[
             0
-        ].online.actor
+        ].params.actor
         for scale in (1.0, 1e-3, 1e3)
     ]
     for other in actors[1:]:
@@ -163,7 +163,7 @@ def test_an_update_against_plain_numpy():
         missed = 0.5 * (network(leaves[4:], rows.observation)[:, 0] - rows.target) ** 2
         return -gain + 0.7 * missed.mean() - 0.3 * entropy
 
-    old = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(state.online)]
+    old = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(state.params)]
     gradient = [np.zeros_like(leaf) for leaf in old]
     for slope, leaf in zip(gradient, old, strict=True):
         for place in np.ndindex(leaf.shape):
@@ -176,7 +176,7 @@ def test_an_update_against_plain_numpy():
     assert norm > 0.1
     after, _ = ppo.update(state, rollout, jax.random.key(1), jnp.array(0.5), settings)
     mean, square = (jax.tree.leaves(getattr(after.optimizer[0], name)) for name in ("mu", "nu"))
-    new = jax.tree.leaves(after.online)
+    new = jax.tree.leaves(after.params)
     for slope, leaf, m, v, moved in zip(gradient, old, mean, square, new, strict=True):
         cut = slope * 0.1 / norm
         np.testing.assert_allclose(m, 0.1 * cut, rtol=1e-2, atol=1e-6)
@@ -195,7 +195,7 @@ def test_how_far_an_update_moves_the_policy_is_measured():
     assert float(first["actor/clip_fraction"]) == 0
     twice = settings.model_copy(update={"epochs": 2})
     _, both = ppo.update(state, rollout, jax.random.key(1), left, twice)
-    log = np.asarray(after.online.actor.log_probability(batch.observation, batch.action) - batch.log_probability)
+    log = np.asarray(after.params.actor.log_probability(batch.observation, batch.action) - batch.log_probability)
     assert float(both["actor/approx_kl"]) == pytest.approx((np.exp(log) - 1 - log).mean() / 2, rel=1e-3)
     beyond = (np.abs(np.exp(log) - 1) > 0.2).mean()
     assert 0 < beyond < 1
@@ -206,9 +206,9 @@ def test_annealing_ends_at_rest():
     settings = PPOSettings(hidden=(16,), minibatch_size=8, epochs=1, anneal=True)
     state = state_of(settings=settings)
     after, _ = ppo.update(state, rollout_of(), jax.random.key(1), jnp.array(0.0), settings)
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, after.online, state.online))
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, after.params, state.params))
     after, _ = ppo.update(state, rollout_of(), jax.random.key(1), jnp.array(1.0), settings)
-    assert not jax.tree.all(jax.tree.map(jnp.array_equal, after.online, state.online))
+    assert not jax.tree.all(jax.tree.map(jnp.array_equal, after.params, state.params))
 
 
 @pytest.mark.parametrize("discrete", [True, False])
@@ -221,7 +221,8 @@ def test_must_learn_to_follow(discrete):
     def turn(state, key):
         keys = jax.random.split(key, 3)
         observation = jax.random.uniform(keys[0], (1, 256, 3), minval=-1, maxval=1)
-        action = state.online.actor.sample(observation, keys[1])
+        draw = jax.random.gumbel if discrete else jax.random.normal
+        action = state.params.actor.drawn(observation, draw(keys[1], (1, 256, 2)))
         reward = reward_of(observation, action)
         ends = jnp.ones((1, 256))
         rollout = Rollout(observation, action, reward, observation, 1 - ends, ends)
@@ -235,7 +236,7 @@ def test_must_learn_to_follow(discrete):
     for number in range(80):
         state = turn(state, jax.random.key(number))
     observation = jax.random.uniform(jax.random.key(5), (1, 256, 3), minval=-1, maxval=1)
-    learned = float(jnp.mean(reward_of(observation, state.online.actor.mode(observation))))
+    learned = float(jnp.mean(reward_of(observation, state.params.actor.mode(observation))))
     assert learned > (0.93 if discrete else -0.03)
 
 
@@ -248,6 +249,92 @@ def test_values_may_move_from_what_the_critic_said():
     action, reward = rng.normal(size=(6, 4, 2)).astype(np.float32), 100 + rng.normal(size=(6, 4)).astype(np.float32)
     rollout = ppo.Rollout(*map(jnp.asarray, (rows[0], action, reward, rows[1], np.ones((6, 4)), np.zeros((6, 4)))))
     batch, returns, _ = ppo.prepare(state, rollout, settings)
-    np.testing.assert_allclose(batch.value, state.online.critic(rollout.observation.reshape(-1, 3))[:, 0], rtol=1e-5)
+    np.testing.assert_allclose(batch.value, state.params.critic(rollout.observation.reshape(-1, 3))[:, 0], rtol=1e-5)
     assert float(returns.mean[0]) > 50
     np.testing.assert_allclose([batch.target.mean(), batch.target.std()], [0, 1], atol=1e-2)
+
+
+def padded(rollout):
+    """The same with two more lanes, of agents that are not there: what they hold is nonsense."""
+
+    def wider(rows, more):
+        return jnp.concatenate([rows, jnp.full((len(rows), more, *rows.shape[2:]), 7, rows.dtype)], axis=1)
+
+    time, lanes = rollout.reward.shape
+    mask = jnp.concatenate([jnp.ones((time, lanes)), jnp.zeros((time, 2))], axis=1)
+    return jax.tree.map(lambda rows: wider(rows, 2), rollout._replace(mask=None, available=None))._replace(mask=mask)
+
+
+@pytest.mark.parametrize("discrete", [True, False])
+@pytest.mark.parametrize("normalise", [True, False])
+def test_agents_that_are_not_there_change_nothing(discrete, normalise):
+    """One gradient step on all lanes at once: with padding, and with no more than those who are there."""
+    ended = np.zeros((6, 4), np.float32)
+    ended[3, 1] = ended[-1] = 1
+    rollout = rollout_of(ended=ended, discrete=discrete)
+    settings = PPOSettings(
+        hidden=(16,),
+        minibatch_size=99,
+        epochs=2,
+        entropy_coef=0.1,
+        normalise_observations=normalise,
+        learning_rate=0.01,
+    )
+    state = state_of(discrete, settings)
+    with_all = jnp.ones((6, 4))
+    found = [
+        ppo.update(state, given, jax.random.key(1), jnp.array(1.0), settings)
+        for given in (rollout, rollout._replace(mask=with_all), padded(rollout))
+    ]
+    for other in found[1:]:
+        for a, b in zip(jax.tree.leaves(found[0]), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(a, b, rtol=2e-3, atol=1e-5)
+
+
+def test_what_follows_an_agents_last_step_does_not_reach_back():
+    """Steps behind it are masked, whatever stands there; the same lane cut off has the same advantages."""
+    ended, rollout = np.zeros((6, 4), np.float32), rollout_of()
+    ended[2] = 1
+    left = rollout._replace(ended=jnp.asarray(ended), continues=jnp.asarray(1 - ended))
+    mask = (jnp.arange(6) < 3)[:, None] * jnp.ones((6, 4))
+    spoilt = jax.tree.map(lambda rows: rows.at[3:].set(9.0), left)
+    short = jax.tree.map(lambda rows: rows[:3], left)
+    state = state_of()
+    one, other = (ppo.prepare(state, given, SETTINGS) for given in (spoilt._replace(mask=mask), short))
+    np.testing.assert_allclose(one[0].advantage.reshape(6, 4)[:3].ravel(), other[0].advantage, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(one[0].target.reshape(6, 4)[:3].ravel(), other[0].target, rtol=1e-4, atol=1e-5)
+    for a, b in zip(jax.tree.leaves(one[1:]), jax.tree.leaves(other[1:]), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4)
+
+
+def test_choices_that_there_are_not_have_no_probability():
+    policy = ppo.init(jax.random.key(0), 3, 4, True, SETTINGS).params.actor
+    observation = jnp.asarray(np.random.default_rng(0).normal(size=(500, 3)), jnp.float32)
+    available = np.random.default_rng(1).random((500, 4)) < 0.5
+    available[:, 0] |= ~available.any(axis=1)
+    each = [policy.log_probability(observation, jnp.tile(row, (500, 1)), jnp.asarray(available)) for row in jnp.eye(4)]
+    probability = np.exp(np.stack(each, axis=1))
+    np.testing.assert_array_equal(probability[~available], 0)
+    np.testing.assert_allclose(probability.sum(axis=1), 1, rtol=1e-5)
+    some = np.where(available, probability, 1)
+    np.testing.assert_allclose(
+        policy.entropy(observation, jnp.asarray(available)), -(some * np.log(some)).sum(axis=1), rtol=1e-4, atol=1e-6
+    )
+    noise = jax.random.gumbel(jax.random.key(2), (500, 4))
+    for action in (
+        policy.drawn(observation, noise, jnp.asarray(available)),
+        policy.mode(observation, jnp.asarray(available)),
+    ):
+        assert available[np.asarray(action, bool)].all()
+        np.testing.assert_array_equal(np.asarray(action).sum(axis=1), 1)
+    alone = np.eye(4, dtype=bool)[np.arange(500) % 4]
+    np.testing.assert_array_equal(policy.entropy(observation, jnp.asarray(alone)), 0)
+
+
+def test_what_an_unavailable_choice_is_worth_teaches_nothing():
+    """The gradient does not know of logits that were not there."""
+    state, rollout = ppo.init(jax.random.key(0), 3, 2, True, SETTINGS), rollout_of()
+    only = rollout.action > 0
+    after, measured = ppo.update(state, rollout._replace(available=only), jax.random.key(1), jnp.array(1.0), SETTINGS)
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, after.params.actor, state.params.actor))
+    assert float(measured["actor/entropy"]) == 0

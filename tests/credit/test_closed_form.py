@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from lare.credit.closed_form import (
+    add_steps,
     best_signs,
     forget_running,
-    no_totals,
+    new_totals,
     radius,
     ridge_regression,
-    take_in,
     uncertainty,
 )
 
@@ -37,10 +37,10 @@ def episodes(seed=0, noise=0.0, offset=0.0, count=1):
 
 
 def taken(rows, at_its_end, ended, parts=1):
-    totals = no_totals(rows.shape[1])
+    totals = new_totals(rows.shape[1])
     for piece in np.array_split(np.arange(len(rows)), parts):
-        given = (jnp.asarray(part[piece], jnp.float32) for part in (rows, at_its_end))
-        totals = jax.jit(take_in)(totals, *given, jnp.asarray(ended[piece]))
+        given = (jnp.asarray(part[piece][:, None], jnp.float32) for part in (rows, at_its_end))
+        totals = jax.jit(add_steps)(totals, *given, jnp.asarray(ended[piece][:, None]))
     return totals
 
 
@@ -94,10 +94,44 @@ def test_signs_against_trying_all(seed):
 def test_an_episode_that_is_forgotten_leaves_nothing():
     rows, at_its_end, ended, *_ = episodes()
     whole = taken(rows, at_its_end, ended)
-    begun = take_in(whole, jnp.ones((2, 3)), jnp.zeros(2), jnp.zeros(2, bool))
-    assert float(begun.steps) == 2
-    for a, b in zip(jax.tree.leaves(forget_running(begun)), jax.tree.leaves(whole), strict=True):
+    begun = add_steps(whole, jnp.ones((2, 1, 3)), jnp.zeros((2, 1)), jnp.zeros((2, 1), bool))
+    assert begun.steps.tolist() == [2]
+    for a, b in zip(jax.tree.leaves(forget_running(begun, jnp.array([True]))), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def several(parts, envs=3):
+    """The same of steps that come from several environments at a time, whose episodes end anywhere."""
+    given = [episodes(seed, noise=0.5) for seed in range(envs)]
+    rows, at_its_end, ended = (np.stack([one[part] for one in given], axis=1) for part in range(3))
+    ended[LENGTHS[0] + LENGTHS[1] - 1, 0] = False  # the first environment's second episode goes on into its third
+    totals, add = new_totals(3, envs), jax.jit(add_steps)
+    for piece in np.array_split(np.arange(len(rows)), parts):
+        totals = add(
+            *(totals, jnp.asarray(rows[piece], jnp.float32), jnp.asarray(at_its_end[piece], jnp.float32)), ended[piece]
+        )
+    v = [
+        np.append(rows[piece, env].mean(axis=0), at_its_end[piece[-1], env])
+        for env in range(envs)
+        for piece in np.split(np.arange(len(rows)), np.flatnonzero(ended[:, env]) + 1)
+        if len(piece)
+    ]
+    return totals, np.array(v)
+
+
+@pytest.mark.parametrize("parts", [1, 6])
+def test_totals_of_several_environments(parts):
+    totals, v = several(parts)
+    assert float(totals.episodes) == len(v) == 3 * len(LENGTHS) - 1
+    np.testing.assert_allclose(totals.mean, v.mean(axis=0), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(totals.products, (v - v.mean(axis=0)).T @ (v - v.mean(axis=0)), rtol=1e-3, atol=1e-4)
+
+
+def test_only_the_episodes_of_some_environments_are_forgotten():
+    begun = add_steps(new_totals(3, 2), jnp.ones((2, 2, 3)), jnp.zeros((2, 2)), jnp.zeros((2, 2), bool))
+    left = forget_running(begun, jnp.array([True, False]))
+    assert left.steps.tolist() == [0, 2]
+    np.testing.assert_array_equal(left.running, [[0, 0, 0], [1, 1, 1]])
 
 
 def test_the_radius_by_hand():
@@ -153,14 +187,15 @@ def test_uncertainty_holds_and_shrinks():
 
 def test_a_constant_says_nothing_however_long_episodes_are():
     """The sum of 0.1, divided by the length, is 0.1 and a rounding error that tells the length."""
-    random, totals = np.random.default_rng(0), no_totals(2)
-    take = jax.jit(take_in)
+    random, totals = np.random.default_rng(0), new_totals(2)
+    take = jax.jit(add_steps)
     lengths = random.integers(20, 999, 60)
     for length in lengths:
         factors = np.stack([random.normal(size=length), np.full(length, 0.1)], axis=1).astype(np.float32)
         paid, ended = np.full(999, 0.5 + length / 500, np.float32), np.arange(999) == length - 1
         padded = np.concatenate([factors, np.full((999 - length, 2), 0.1, np.float32)])
-        totals = forget_running(take(totals, jnp.asarray(padded), jnp.asarray(paid), jnp.asarray(ended)))
+        given = (jnp.asarray(part)[:, None] for part in (padded, paid, ended))
+        totals = forget_running(take(totals, *given), jnp.array([True]))
     decoder = ridge_regression(totals, 1.0)
     assert float(decoder.weight[1]) == 0
     assert float(decoder.bias) == pytest.approx((0.5 + lengths / 500).mean(), abs=0.2)

@@ -49,7 +49,7 @@ def test_one_proxy_reward_for_each_agent_at_each_step(decoder):
         decoded = decoder(features(), key)
         assert decoded.r_hat.shape == (EPISODES * STEPS, AGENTS)
         assert np.isfinite(decoded.r_hat).all()
-        assert decoded.penalty.shape == (EPISODES * STEPS,)
+        assert decoded.penalty.shape == (EPISODES * STEPS, AGENTS)
         assert (np.asarray(decoded.penalty) >= 0).all()
 
 

@@ -4,8 +4,9 @@ import json
 
 import pytest
 
+from lare.training.decide import decide
 from lare.training.run import Run, describe
-from lare.training.settings import Settings, decide
+from lare.training.settings import Settings
 from toys import toy_spec
 
 
@@ -13,17 +14,17 @@ from toys import toy_spec
 def made(tmp_path):
     """Makes a run directory: configuration and metrics, nothing trained."""
 
-    def make(name, returns, task="Chase", steps=(50, 100), method="dense", **settings):
+    def make(name, returns, task="Chase", steps=(50, 100), method="dense", **given):
         spec = toy_spec(name=task)
-        plan = decide(Settings(method=method, steps=100, seeds=len(returns), **settings), spec)
+        settings = decide(Settings(method=method, steps=100, seeds=len(returns), **given), spec)
         directory = tmp_path / "runs" / task / name
         directory.mkdir(parents=True)
-        config = describe(spec, plan, ())
+        config = describe(spec, settings, ())
         (directory / "config.json").write_text(config.model_dump_json())
         lines = [
             {"step": step, "seed": seed, "evaluation/return": value * share}
             for step, share in zip(steps, (0.5, 1.0), strict=bool(steps))
-            for seed, value in zip(plan.all_seeds, returns, strict=True)
+            for seed, value in zip(settings.all_seeds, returns, strict=True)
         ]
         (directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         return Run(directory, config, ())

@@ -2,22 +2,22 @@
 
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lare
-from lare.algorithms import ppo
-from lare.algorithms.ppo import PPOSettings
 from lare.errors import LareError
 from lare.experiments import agents
 from lare.experiments.evaluation import evaluate_run
 from lare.experiments.video import record_video
-from lare.training import teams
-from lare.training.many_agents import load_learner
-from lare.training.seeds import of_seed
+from lare.experiments.watch import watch
+from lare.tasks.env import Team
+from lare.tasks.table import make_env
+from lare.training.collect_device import play
+from lare.training.compiled import module_of
+from lare.training.session import load_learner
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +33,13 @@ def runs(tmp_path_factory, small_many):
 
 
 def test_an_episode_is_watched(runs):
-    watched = agents.watch(runs[0])
-    assert watched.position.shape == (25, 11, 2)
-    assert watched.reward.shape == watched.proxy.shape == watched.credit.shape == (25, 8)
+    watched = watch(runs[0])
+    assert watched.state.world.position.shape == (25, 1, 11, 2)
+    assert watched.reward.shape == watched.proxy.shape == watched.credit.shape == (25, 1, 8)
     assert watched.proxy.std() > 0
-    without = agents.watch(runs[1])
+    assert watched.of_episode(watched.reward).shape == (25, 8)
+    assert [picture.shape for picture in agents.frames(runs[0], watched)] == [(400, 400, 3)] * 25
+    without = watch(runs[1])
     assert without.proxy is None
     np.testing.assert_array_equal(without.credit, without.reward)
 
@@ -76,30 +78,25 @@ def test_cross_play_is_every_team_against_every_other(runs):
 
 
 def test_a_pair_is_the_first_team_of_one_seed_and_the_others_of_another(runs):
-    recipe = load_learner(runs[0])[0]
-    actors = [load_learner(run)[1].algorithm.online.actor for run in runs[:2]]
-
-    def led_by(first, others):
-        mixed = agents.Mixed(of_seed(first, 0), of_seed(others, 1), 6)
-        played = jax.jit(partial(teams.play, count=4, recipe=recipe))(mixed, jax.random.key(0))
-        return float(played.reward[..., :6].sum(axis=(0, 2)).mean())
-
-    matches = agents.cross_play((runs[0], runs[1]), episodes=4)
-    found = [float(match.returns[0, 1]) for match in matches]
-    np.testing.assert_allclose(found, [led_by(one, other) for one in actors for other in actors], rtol=1e-4)
-    assert len(set(found)) == 4
+    """Where both policies are one, it is simply played."""
+    config, learner, *_ = load_learner(runs[0])
+    env, team = make_env(runs[0].config.task), config.env.teams[0]
+    matches = agents.cross_play((runs[0], runs[1]), episodes=40)
+    for seed in range(2):
+        one = jax.tree.map(lambda leaf, seed=seed: leaf[seed : seed + 1], learner)
+        actor = module_of(config).actor(one, 200, config)
+        played = jax.jit(partial(play, env, count=40, config=config, greedy=False))(actor, jax.random.key(0)[None])
+        alone = played.steps.after.reward[..., team.agents].sum(axis=(0, -1)).mean()
+        np.testing.assert_allclose(matches[0].returns[seed, seed], alone, rtol=1e-4)
+    assert len({match.returns[0, 1] for match in matches}) == 4
 
 
 def test_who_leads_whom():
-    """One policy always goes left and the other always up."""
+    def act(actor, memory, *shown):
+        return jnp.full((1, 3, 8, 5), actor), memory
 
-    def always(action):
-        actor = ppo.init(jax.random.key(0), 32, 5, True, PPOSettings(hidden=(4,))).online.actor
-        bias = actor.network.layers[-1].bias
-        return eqx.tree_at(lambda actor: actor.network.layers[-1].bias, actor, bias.at[action].set(100.0))
-
-    taken = agents.Mixed(always(1), always(4), 6).sample(jnp.zeros((3, 8, 32)), jax.random.key(0))
-    np.testing.assert_array_equal(np.argmax(taken, axis=-1), np.tile([1] * 6 + [4] * 2, (3, 1)))
+    actions, _ = agents.led_by_two((1.0, 4.0), (), act=act, team=Team("first", 0, 6))
+    np.testing.assert_array_equal(actions[0, :, :, 0], np.tile([1.0] * 6 + [4.0] * 2, (3, 1)))
 
 
 def test_cross_play_needs_two_teams_of_one_task(runs):

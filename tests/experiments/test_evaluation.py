@@ -1,15 +1,23 @@
+from functools import partial
+
 import gymnasium
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lare
 from lare.errors import LareError
 from lare.experiments import evaluation
-from lare.experiments.evaluation import evaluate_run, load_policy, policy_of
+from lare.experiments.evaluation import acting, evaluate_run, policy_of
 from lare.experiments.video import check_video, write_video
-from lare.tasks.episodic import EpisodicReward
+from lare.tasks.gymnasium import GymnasiumEnv
 from lare.tasks.spec import read_task
-from lare.training.environments import evaluate, make_episodic, to_bounds
+from lare.tasks.table import make_host_env
+from lare.tasks.workers import LocalEnvs
+from lare.training.collect_host import evaluate, policy
+from lare.training.compiled import compiled
+from lare.training.session import load_learner
 from toys import toy_spec
 
 
@@ -43,10 +51,10 @@ def test_more_episodes_than_there_are_environments_begin_each_from_a_start_of_it
     assert len(np.unique(whole)) == 10
     opened, closed = [], []
     monkeypatch.setattr(evaluation, "AT_A_TIME", 2)
-    monkeypatch.setattr(evaluation, "make_episodic", lambda task: opened.append(make_episodic(task)) or opened[-1])
-    monkeypatch.setattr(EpisodicReward, "close", lambda environment: closed.append(environment))
+    monkeypatch.setattr(evaluation, "make_host_env", lambda task: opened.append(make_host_env(task)) or opened[-1])
+    monkeypatch.setattr(GymnasiumEnv, "close", lambda environment: closed.append(environment))
     np.testing.assert_allclose(evaluate_run(run, 5)["Chase"], whole, rtol=1e-5)
-    assert len(opened) == 4
+    assert len(opened) == 2 * 5
     assert set(map(id, opened)) <= set(map(id, closed))
 
 
@@ -58,8 +66,11 @@ def test_no_episodes(small, tmp_path):
 
 def test_its_starts_are_those_of_no_evaluation_of_the_run(small, tmp_path):
     run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
-    environments, policy = [[make_episodic(toy_spec()) for _ in range(4)] for _ in run.seeds], load_policy(run)
-    returns = evaluate(environments, policy, run.seeds).returns
+    config, learner, _, _ = load_learner(run)
+    functions = compiled(config)
+    act = policy(functions, config, functions.actor(learner, 60), run.seeds, 4)
+    with LocalEnvs([partial(make_host_env, toy_spec())] * 8) as envs:
+        returns = evaluate(envs, act, run.seeds, 4).returns[..., 0]
     np.testing.assert_allclose(
         returns[:, :2].mean(axis=1), [line["evaluation/return"] for line in run.metrics()[-2:]], rtol=1e-5
     )
@@ -69,9 +80,12 @@ def test_its_starts_are_those_of_no_evaluation_of_the_run(small, tmp_path):
 def test_the_policy_of_each_seed(small, tmp_path):
     run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
     observation = np.ones(toy_spec().observation_size, np.float32)
-    together, space = load_policy(run)(np.stack([observation, observation])), make_episodic(toy_spec()).action_space
+    learner = load_learner(run)[1]
+    together = 2 * jnp.tanh(
+        jax.vmap(lambda actor: actor(jnp.ones((1, 2))))(learner.algorithm.online.actor)
+    )  # in its units
     for place, seed in enumerate(run.seeds):
-        np.testing.assert_allclose(policy_of(run, seed)(observation), to_bounds(together[place], space), rtol=1e-5)
+        np.testing.assert_allclose(policy_of(run, seed)(observation), together[place, 0], rtol=1e-5)
     np.testing.assert_array_equal(policy_of(run)(observation), policy_of(run, 0)(observation))
     with pytest.raises(LareError, match=r"run has no seed 7: there are 0, 1$"):
         policy_of(run, 7)
@@ -82,8 +96,7 @@ def test_the_policy_of_a_choice_gives_what_the_environment_takes(small, tmp_path
     run = lare.train(spec, small(method="dense", algorithm="ppo"), out=tmp_path / "run", listeners=[])
     policy, observation = policy_of(run), np.eye(4, dtype=np.float32)[2]
     assert gymnasium.make("toys/Pick-v0").action_space.contains(np.int64(policy(observation)))
-    row = load_policy(run)(np.stack([observation, observation]))[0]
-    assert policy(observation) == int(np.argmax(row))
+    assert policy(observation) == int(np.argmax(acting(run)(observation)))
 
 
 def test_many_agents_have_no_single_policy(small_many, tmp_path):

@@ -31,7 +31,7 @@ draws = [0, 3]
 [settings]
 steps = 200
 seeds = 2
-chunk = 50
+rollout_steps = 50
 evaluate_every = 100
 evaluation_episodes = 1
 td3 = { hidden = [8], warmup = 100, batch_size = 8 }
@@ -67,8 +67,8 @@ def test_every_run_that_is_asked_for(file, tmp_path):
         "Reacher-v4/lare-linear-td3-draw3",
     ]
     assert jobs[0].directory == tmp_path / "runs" / "small" / "Reacher-v4" / "dense-td3"
-    assert [job.plan.draw for job in jobs] == [0, 0, 3]
-    assert {job.plan.steps for job in jobs} == {200}
+    assert [job.resolved.draw for job in jobs] == [0, 0, 3]
+    assert {job.resolved.steps for job in jobs} == {200}
     assert not any(job.done or job.begun for job in jobs)
 
 
@@ -77,7 +77,7 @@ def test_what_is_done_is_left_alone_and_what_was_begun_goes_on(file, in_this_pro
     train_one(as_json(dense))
     stop = At(100, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(Interrupted):
-        lare.train(first.task, lare.Settings(**first.plan.model_dump()), out=first.directory, listeners=[stop])
+        lare.train(first.task, first.settings, out=first.directory, listeners=[stop])
     wanted, jobs = read_sweep(file)
     said = []
     assert run_sweep(wanted, jobs, said.append) == []
@@ -254,9 +254,9 @@ def test_how_a_process_ended(file, monkeypatch):
         (('"dense"', '"dence"'), "no method 'dence' (did you mean 'dense'?); the methods are "),
         (('["Reacher-v4"]', "[]"), "tasks = []: tuple should have at least 1 item after validation, not 0"),
         (("seeds = 2", "seed = -1"), "seed = -1: input should be greater than or equal to 0"),
-        (("steps = 200", "steps = 201"), "steps = 201 is not a multiple of chunk = 50: take 200"),
+        (("steps = 200", "steps = 201"), "steps = 201 is not a multiple of rollout_steps = 50: take 200"),
         (('["Reacher-v4"]', '["Reacher-v5"]'), "no task 'Reacher-v5'"),
-        (("chunk = 50", 'method = "rd"'), "settings = {'steps': 200, "),
+        (("rollout_steps = 50", 'method = "rd"'), "settings = {'steps': 200, "),
         (
             ("[settings]", '[functions]\nReacher = ["phi.py"]\n[settings]'),
             "functions of Reacher, which is none of the tasks Reacher-v4",
@@ -289,8 +289,14 @@ def test_a_file_that_lies(change, message, file):
     ("change", "message"),
     [
         (("draws = [0, 3]", "draws = [7]"), "no recording of factors has draw 7; the draws are 0, 1, 2, 3, 4"),
-        (("chunk = 50", "candidates = 3"), "no recorded reply fits this request for task 'Reacher-v4' (reply 1): "),
-        (("chunk = 50", "capacity = 40"), "capacity = 40 is too small: a chunk of Reacher-v4 takes up to 150"),
+        (
+            ("rollout_steps = 50", "candidates = 3"),
+            "no recorded reply fits this request for task 'Reacher-v4' (reply 1): ",
+        ),
+        (
+            ("rollout_steps = 50", "capacity = 40"),
+            "{}/small.toml: capacity = 40 is too small: an iteration of Reacher-v4 takes up to 150",
+        ),
         (
             ("draws = [0, 3]", '[functions]\nReacher-v4 = ["phi.py"]'),
             "the function file {}/phi.py is not there",

@@ -10,10 +10,11 @@ from lare.errors import LareError
 from lare.latent import design as module
 from lare.latent.design import design
 from lare.latent.function import verified
-from lare.latent.reflect import episodes_of, gather, held_out_fit
+from lare.latent.reflect import EPISODES, gather, held_out_fit
 from lare.latent.verify import random_steps
 from lare.llm import prompts
 from lare.llm.recording import RecordedModel, read_recording
+from lare.tasks.play import episodes_of
 from toys import Chase, toy_spec
 
 
@@ -42,22 +43,23 @@ class Says:
 
 @pytest.fixture(scope="module")
 def episodes():
-    return episodes_of(toy_spec())
+    return episodes_of(toy_spec(), EPISODES)
 
 
 def test_episodes_are_whole_and_always_the_same(episodes):
-    again = episodes_of(toy_spec())
+    again = episodes_of(toy_spec(), EPISODES)
     assert len(episodes) == 40
     for one, other in zip(episodes, again, strict=True):
-        assert (one.observation.shape, one.action.shape) == ((21, 2), (20, 1))
-        np.testing.assert_array_equal(one.observation, other.observation)
+        assert (one.before.shape, one.action.shape, one.after.shape) == ((20, 1, 2), (20, 1, 1), (20, 1, 2))
+        np.testing.assert_array_equal(one.before[1:], one.after[:-1])
+        np.testing.assert_array_equal(one.after, other.after)
         # The toy pays -(a - s_0)^2.
-        assert one.total == pytest.approx(-np.sum((one.action - one.observation[:-1, :1]) ** 2), rel=1e-5)
+        assert one.total == pytest.approx(-np.sum((one.action - one.before[..., :1]) ** 2), rel=1e-5)
         assert one.total == other.total
 
 
 def test_episodes_of_a_policy():
-    (perfect,) = episodes_of(toy_spec(), lambda observation: observation[:1], count=1)
+    (perfect,) = episodes_of(toy_spec(), 1, lambda observation: observation[:1])
     assert perfect.total == pytest.approx(0, abs=1e-9)
 
 
@@ -103,7 +105,7 @@ def test_a_better_function_is_kept_and_a_worse_one_is_not():
     # The second round is about the best function so far.
     assert "Functions" in model.asked[2][2]["content"]
     assert json.loads(model.asked[2][2]["content"])["Functions"] == RIGHT
-    evidence = gather(verified(WRONG, task), task, episodes_of(task)).text
+    evidence = gather(verified(WRONG, task), task, episodes_of(task, EPISODES)).text
     assert model.asked[1] == prompts.reflect(
         task, json.dumps({"Understand": "", "Analyze": "", "Functions": WRONG}), evidence
     )
@@ -162,8 +164,9 @@ gymnasium.register("misfits/Reused-v0", entry_point=Reused, max_episode_steps=20
 @pytest.mark.filterwarnings("ignore:.*share an object")  # Gymnasium sees it too
 def test_observations_are_copied(episodes):
     task = toy_spec(environment="misfits/Reused-v0")
-    for one, other in zip(episodes_of(task), episodes, strict=True):
-        np.testing.assert_array_equal(one.observation, other.observation)
+    for one, other in zip(episodes_of(task, EPISODES), episodes, strict=True):
+        np.testing.assert_array_equal(one.before, other.before)
+        np.testing.assert_array_equal(one.after, other.after)
     for one, other in zip(random_steps(task), random_steps(toy_spec()), strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -190,9 +193,10 @@ def test_what_was_verified_is_kept_when_the_model_leaves():
 def test_episodes_of_a_given_policy():
     """The best there is returns 0, and its factor with it."""
     task = toy_spec()
-    best = episodes_of(task, lambda observation: observation[:1], count=2)
+    best = episodes_of(task, 2, lambda observation: observation[:1])
     assert [episode.total for episode in best] == pytest.approx([0, 0], abs=1e-9)
     model = Says(RIGHT, WRONG)
     design(task, model=model, candidates=1, reflect=1, policy=lambda observation: observation[:1] + 0.5)
-    shown = gather(verified(RIGHT, task), task, episodes_of(task, lambda observation: observation[:1] + 0.5)).text
+    played = episodes_of(task, EPISODES, lambda observation: observation[:1] + 0.5)
+    shown = gather(verified(RIGHT, task), task, played).text
     assert shown in model.asked[1][-1]["content"]

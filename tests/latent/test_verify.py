@@ -220,7 +220,7 @@ def test_random_steps_are_the_tasks_and_always_the_same(chase):
     assert 1 < np.abs(action).max() <= 2
     # Episodes of 20 steps: there was a reset in between, and every step is a new one.
     assert len(np.unique(observation[:, 0])) == 50
-    verification.steps_in.cache_clear()
+    verification.known_steps.cache_clear()
     for one, again in zip((observation, action), random_steps(chase, steps=50), strict=True):
         np.testing.assert_array_equal(one, again)
     assert not np.array_equal(action, random_steps(chase, steps=50, seed=1)[1])

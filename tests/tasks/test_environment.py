@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from lare.errors import LareError
-from lare.latent.verify import steps_in
+from lare.latent.verify import random_steps
 from lare.tasks.environment import make, number
-from toys import Chase
+from toys import Chase, toy_spec
 
 
 class Falters(Chase):
@@ -51,7 +51,7 @@ for where in ("reset", "step", "itself", "window", "reward"):
 @pytest.mark.filterwarnings("ignore:.*The reward returned by")  # Gymnasium has seen it too
 def test_a_failure_is_one_line(where, message):
     with pytest.raises(LareError) as error:
-        steps_in(f"misfits/{where}-v0", None, 1, 0)
+        random_steps(toy_spec(environment=f"misfits/{where}-v0"), 1)
     assert str(error.value) == message
 
 

@@ -84,7 +84,12 @@ def test_whatever_the_rewards_the_payment_is_their_sum(rewards, end):
 # The checker makes the environment again, by Gymnasium itself, which advises against v4.
 @pytest.mark.filterwarnings("ignore:.*is out of date:DeprecationWarning")
 @pytest.mark.parametrize(
-    "name", ["CartPole-v1", "Pendulum-v1", *(read_task(task).environment for task in shipped_tasks())]
+    "name",
+    [
+        "CartPole-v1",
+        "Pendulum-v1",
+        *sorted({task.environment for task in map(read_task, shipped_tasks()) if task.family in ("", "lare")}),
+    ],
 )
 def test_gymnasiums_checker_finds_no_fault(name):
     environment = EpisodicReward(make(name))

@@ -200,3 +200,56 @@ def test_what_points_at_a_picture_is_left_out():
     text = draft("Pendulum-v1").toml
     assert "diagram" not in text
     assert "The system consists of a pendulum" in text
+
+
+def written(tmp_path, drafted):
+    for name, text in drafted.teams.items():
+        (tmp_path / name).write_text(text)
+    return load(tmp_path, drafted.toml)
+
+
+def test_agents_of_one_kind(tmp_path):
+    drafted = draft("pettingzoo/mpe2.simple_spread_v3:parallel_env")
+    assert (drafted.name, drafted.missing, drafted.teams) == ("simple_spread_v3", (), {})
+    task = written(tmp_path, drafted)
+    assert (task.name, task.observation_size, task.action_size) == ("simple_spread_v3", 18, 5)
+    assert task.description.endswith("agents must learn to cover all the landmarks while avoiding collisions.")
+    assert task.observation.startswith("18 entries.\nAgent observations: [self_vel, self_pos")
+    assert task.action.startswith("5 entries, all 0 but one: the action that is taken.\nAgent action space: [no_action")
+    assert drafted.left_out == 3
+    assert "\n# arguments = { N = 3, local_ratio = 0.5, max_cycles = 25, " in drafted.toml
+
+
+def test_agents_of_two_kinds_are_two_teams(tmp_path):
+    drafted = draft("pettingzoo/mpe2.simple_adversary_v3:parallel_env")
+    assert list(drafted.teams) == ["simple_adversary_v3-adversary.toml", "simple_adversary_v3-agent.toml"]
+    task = written(tmp_path, drafted)
+    bad, good = task.roles
+    assert [(role.name, role.agents) for role in task.roles] == [
+        ("adversary", ("adversary_[0-9]*",)),
+        ("agent", ("agent_[0-9]*",)),
+    ]
+    assert bad.observation == (
+        "13 entries: 8 of adversary_0's own, then 2 zeros, then all 0 but one: which agent it is (adversary_0, agent_0, agent_1)."
+        "\nAdversary observation space: [landmark_rel_position, other_agents_rel_positions]"
+    )
+    assert good.observation.splitlines()[1].startswith("Agent observation space: [goal_rel_position")
+    for role in task.roles:
+        request = " ".join(message["content"] for message in candidate(role)[1:]).lower()
+        assert "reward" not in request
+
+
+def test_agents_of_a_continuous_environment_document_themselves_in_a_module():
+    drafted = draft("pettingzoo/pettingzoo.sisl.multiwalker_v9:parallel_env")
+    assert drafted.missing == ("action",)
+    assert 'action = """\n4 entries, each between -1 and 1.\nFILL IN' in drafted.toml
+    assert "0: Hull angle; [0, 2*pi]" in drafted.toml
+    assert "max_episode_steps" not in drafted.toml
+
+
+def test_agents_that_document_little():
+    drafted = draft("pettingzoo/parallel_toys:Toy")
+    assert (drafted.name, drafted.missing) == ("Toy", ("action",))
+    assert "Agents count their steps, and their seed is what they observe first." in drafted.toml
+    assert "The seed, then the count." in drafted.toml
+    assert "reward" not in drafted.toml.split("description", 1)[1]

@@ -6,12 +6,14 @@ import pytest
 from gymnasium.spaces import Box, MultiDiscrete
 
 from lare.errors import LareError
-from lare.tasks.spec import load_task, read_task, shipped_tasks, time_limit
+from lare.tasks.spec import load_task, read_task, shipped_tasks
+from lare.tasks.table import env_spec
 from toys import Chase, toy_spec
 
 NAMES = (
     "CN-15, CN-30, CN-6, CompetitivePP-6, CompetitivePP-6-predator, CompetitivePP-6-prey, HalfCheetah-v4, "
-    "HalfCheetahSparse-v4, HumanoidStandup-v4, PP-15, PP-30, PP-6, Reacher-v4, TriangleArea, Walker2d-v4"
+    "HalfCheetahSparse-v4, HumanoidStandup-v4, PP-15, PP-30, PP-6, Reacher-v4, SMAC-1c3s5z, SMAC-2s3z, SMAC-3s_vs_5z, "
+    "SMAX-1c3s5z, SMAX-2s3z, SMAX-3s_vs_5z, TriangleArea, Walker2d-v4"
 )
 
 
@@ -34,7 +36,7 @@ gymnasium.register("misfits/Board-v0", entry_point=Board, max_episode_steps=20)
 gymnasium.register("misfits/Broken-v0", entry_point=Broken, max_episode_steps=20)
 
 
-@pytest.mark.parametrize("name", shipped_tasks())
+@pytest.mark.parametrize("name", [name for name in shipped_tasks() if not name.startswith("SMAC-")])
 def test_every_shipped_task_fits_its_environment(name):
     assert load_task(name).name == name
 
@@ -121,28 +123,26 @@ def test_like_over_two_generations(spec_file, tmp_path):
         ),
         (
             {"teams": ["Reacher-v4"]},
-            "task '{file}': the teams of toys/Chase-v0 must be left out",
+            "task '{file}': Reacher-v4 is no team of toys/Chase-v0: it needs the same environment, and a team",
         ),
         (
             {"environment": "particles/CompetitivePP-6"},
-            "task '{file}': the teams of particles/CompetitivePP-6 must be the specs of particles/CompetitivePP-6-predator, "
-            "particles/CompetitivePP-6-prey, in this order",
+            "particles/CompetitivePP-6 has the teams predator, prey: name a spec for each of them, in this order",
         ),
         (
             {
                 "environment": "particles/CompetitivePP-6",
                 "teams": ["CompetitivePP-6-prey", "CompetitivePP-6-predator"],
             },
-            "task '{file}': the teams of particles/CompetitivePP-6 must be the specs of particles/CompetitivePP-6-predator, "
-            "particles/CompetitivePP-6-prey, in this order",
+            "the teams of particles/CompetitivePP-6 must be predator, prey, in this order",
         ),
         (
             {"environment": "particles/CN-6", "max_episode_steps": 50},
-            "task '{file}': max_episode_steps makes no difference to a particle task: leave it out",
+            "task 'Chase': max_episode_steps makes no difference to particles/CN-6: leave it out",
         ),
         (
             {"environment": "particles/CN-6", "measures": ["info"]},
-            "task '{file}': measures makes no difference to a particle task: leave it out",
+            "task 'Chase': particles/CN-6 does not measure 'info'",
         ),
         (
             {"environment": "misfits/Broken-v0"},
@@ -208,17 +208,30 @@ def test_a_file_that_is_not_there():
 def test_teams_have_specs_of_their_own():
     task = read_task("CompetitivePP-6")
     assert [role.name for role in task.roles] == ["CompetitivePP-6-predator", "CompetitivePP-6-prey"]
-    assert (task.particles, task.whole) == ("CompetitivePP-6", None)
-    assert [(role.particles, role.whole) for role in task.roles] == [(None, "CompetitivePP-6")] * 2
+    assert (task.family, task.environment_name, task.team) == ("particles", "CompetitivePP-6", None)
+    assert [(role.environment, role.team) for role in task.roles] == [
+        (task.environment, "predator"),
+        (task.environment, "prey"),
+    ]
     single = read_task("CN-6")
-    assert (single.roles, single.particles, single.whole) == ((single,), "CN-6", None)
-    assert (toy_spec().particles, toy_spec().whole) == (None, None)
+    assert (single.roles, single.team) == ((single,), None)
+
+
+def test_a_team_has_what_its_task_says_of_the_environment(spec_file, tmp_path):
+    spec_file(team="one", environment=None, judges=None)
+    (tmp_path / "whole.toml").write_text(
+        'like = "chase.toml"\nname = "Whole"\nenvironment = "x/y"\nteams = ["chase.toml"]\n'
+    )
+    text = (tmp_path / "whole.toml").read_text() + 'judges = "both"\narguments = { n = 3 }\n'
+    (tmp_path / "whole.toml").write_text(text.replace('like = "chase.toml"\n', 'like = "Reacher-v4"\n'))
+    (role,) = read_task(tmp_path / "whole.toml").teams
+    assert (role.environment, role.judges, role.arguments, role.team) == ("x/y", "both", {"n": 3}, "one")
 
 
 def test_a_task_of_ones_own_has_the_same_teams(tmp_path):
     (tmp_path / "mine.toml").write_text('like = "CompetitivePP-6"\nname = "Mine"\n')
     task = read_task(tmp_path / "mine.toml")
-    assert [task.team(role) for role in task.roles] == ["predator", "prey"]
+    assert [role.team for role in task.roles] == ["predator", "prey"]
 
 
 @pytest.mark.parametrize("circle", [["a"], ["a", "b"], ["a", "b", "c"]])
@@ -238,9 +251,9 @@ def test_the_digest_follows_every_text(key):
 
 
 def test_the_time_limit_is_the_specs_before_the_environments():
-    assert time_limit(toy_spec()) == 20
-    assert time_limit(toy_spec(max_episode_steps=7)) == 7
-    assert time_limit(toy_spec(environment="misfits/Endless-v0", max_episode_steps=7)) == 7
+    assert env_spec(toy_spec()).max_steps == 20
+    assert env_spec(toy_spec(max_episode_steps=7)).max_steps == 7
+    assert env_spec(toy_spec(environment="misfits/Endless-v0", max_episode_steps=7)).max_steps == 7
 
 
 def test_a_key_called_self(spec_file):

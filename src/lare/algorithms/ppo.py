@@ -7,6 +7,7 @@
 
 Independent PPO (de Witt et al., 2020) lets all agents share one actor and one critic, each judging by what it observes
 itself: to this file an agent is one more lane of the rollout. The algorithm knows rewards, never where they come from.
+Where an agent has left, its `mask` is 0 and its steps count nowhere.
 
 The critic predicts returns in units of their running mean and deviation (Yu et al., 2022), and advantages are normalised
 over the rollout, so rewards of any scale train alike.
@@ -18,12 +19,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
 from pydantic import Field
 
 from lare.errors import Checked
-from lare.networks import MLP, descend, orthogonal, start_adam
-from lare.normalise import Moments, deviation, no_moments, observe
+from lare.networks import MLP, clipped, descend, orthogonal, start_adam
+from lare.normalise import RunningMeanStd, deviation, new_mean_std, observe, standardise_if_known
 
 
 class PPOSettings(Checked):
@@ -55,56 +56,76 @@ class PPOSettings(Checked):
     """What the gradient of actor and critic together is cut down to."""
     anneal: bool = False
     """Let learning rate and clip fall linearly to 0 over the run."""
+    normalise_observations: bool = False
+    """Let the networks see observations by their running mean and deviation."""
+
+
+Available = Bool[Array, "*batch action"] | None
+"""Which choices there are; all of them, and all continuous actions, where None."""
 
 
 class Policy(eqx.Module):
     """A Gaussian of constant deviation, or, without one, a choice among the entries of the action.
 
-    A choice is a row with a single 1, so that every action is a row of numbers.
+    A choice is a row with a single 1, so that every action is a row of numbers. Observations are as the network is given them.
     """
 
     network: MLP
     log_deviation: Float[Array, "*stack action"] | None
 
+    def logits(
+        self, observation: Float[Array, "*batch observation"], available: Available
+    ) -> Float[Array, "*batch action"]:
+        """Of each choice; so low where it is not available that its probability is 0."""
+        out = self.network(observation)
+        return out if available is None else jnp.where(available, out, UNAVAILABLE)
+
     def log_probability(
-        self, observation: Float[Array, "*batch observation"], action: Float[Array, "*batch action"]
+        self,
+        observation: Float[Array, "*batch observation"],
+        action: Float[Array, "*batch action"],
+        available: Available = None,
     ) -> Float[Array, "*batch"]:
         """Of the action: log pi(a | s)."""
-        out = self.network(observation)
         if self.log_deviation is None:
-            return jnp.sum(action * jax.nn.log_softmax(out), axis=-1)
-        scaled = (action - out) * jnp.exp(-self.log_deviation)
+            return jnp.sum(action * jax.nn.log_softmax(self.logits(observation, available)), axis=-1)
+        scaled = (action - self.network(observation)) * jnp.exp(-self.log_deviation)
         return jnp.sum(-0.5 * scaled**2 - self.log_deviation - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
 
-    def entropy(self, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch"]:
+    def entropy(
+        self, observation: Float[Array, "*batch observation"], available: Available = None
+    ) -> Float[Array, "*batch"]:
         """-E log pi(a | s)."""
         if self.log_deviation is None:
-            log = jax.nn.log_softmax(self.network(observation))
+            log = jax.nn.log_softmax(self.logits(observation, available))
             return -jnp.sum(jnp.exp(log) * log, axis=-1)
         of_one = self.log_deviation + 0.5 * jnp.log(2 * jnp.pi * jnp.e)
         return jnp.broadcast_to(jnp.sum(of_one, axis=-1), observation.shape[:-1])
 
-    def sample(
-        self, observation: Float[Array, "*batch observation"], key: PRNGKeyArray
-    ) -> Float[Array, "*batch action"]:
-        """Draw a ~ pi(. | s)."""
-        draw = jax.random.gumbel if self.log_deviation is None else jax.random.normal
-        size = self.network.layers[-1].bias.shape[-1]
-        return self.drawn(observation, draw(key, (*observation.shape[:-1], size)))
-
     def drawn(
-        self, observation: Float[Array, "*batch observation"], noise: Float[Array, "*batch action"]
+        self,
+        observation: Float[Array, "*batch observation"],
+        noise: Float[Array, "*batch action"],
+        available: Available = None,
     ) -> Float[Array, "*batch action"]:
         """The action that noise decides on: standard normal noise, or Gumbel's, whose largest sum is a choice."""
-        out = self.network(observation)
         if self.log_deviation is None:
-            return jax.nn.one_hot(jnp.argmax(out + noise, axis=-1), out.shape[-1])
-        return out + jnp.exp(self.log_deviation) * noise
+            logits = self.logits(observation, available)
+            return jax.nn.one_hot(jnp.argmax(logits + noise, axis=-1), logits.shape[-1])
+        return self.network(observation) + jnp.exp(self.log_deviation) * noise
 
-    def mode(self, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch action"]:
+    def mode(
+        self, observation: Float[Array, "*batch observation"], available: Available = None
+    ) -> Float[Array, "*batch action"]:
         """The likeliest action."""
-        out = self.network(observation)
-        return jax.nn.one_hot(jnp.argmax(out, axis=-1), out.shape[-1]) if self.log_deviation is None else out
+        if self.log_deviation is None:
+            logits = self.logits(observation, available)
+            return jax.nn.one_hot(jnp.argmax(logits, axis=-1), logits.shape[-1])
+        return self.network(observation)
+
+
+UNAVAILABLE = -1e9
+"""The logit of a choice that there is not."""
 
 
 class Networks(NamedTuple):
@@ -115,10 +136,20 @@ class Networks(NamedTuple):
 class PPO(NamedTuple):
     """Everything that PPO learns."""
 
-    online: Networks
+    params: Networks
     optimizer: optax.OptState
-    returns: Moments
+    returns: RunningMeanStd
     """Of the returns that the critic was fitted to."""
+    observations: RunningMeanStd | None
+    """What the networks' observations are normalised by; None where they are not. A rollout is added to it after it has been
+    learned from, so that the policy that is updated is the policy that acted."""
+
+
+class Actor(NamedTuple):
+    """What is needed to act."""
+
+    policy: Policy
+    observations: RunningMeanStd | None
 
 
 class Rollout(NamedTuple):
@@ -131,7 +162,11 @@ class Rollout(NamedTuple):
     continues: Float[Array, "time lanes"]
     """0 where the episode terminated, else 1: the bootstrap goes on."""
     ended: Float[Array, "time lanes"]
-    """1 at the last step of an episode, terminated or out of time."""
+    """1 at the last step of an episode, terminated or out of time, and at an agent's own last step."""
+    available: Bool[Array, "time lanes action"] | None = None
+    """Which choices there were; all of them where None."""
+    mask: Float[Array, "time lanes"] | None = None
+    """1 where the agent acted, 0 where it had left; all 1 where None."""
 
 
 class Minibatch(NamedTuple):
@@ -146,6 +181,8 @@ class Minibatch(NamedTuple):
     """What the critic said before the update, as it said it: that is what may move by no more than `value_clip`."""
     target: Float[Array, " batch"]
     """In deviations of the return, the newest included."""
+    available: Bool[Array, "batch action"] | None
+    mask: Float[Array, " batch"] | None
 
 
 def init(key: PRNGKeyArray, observation_size: int, action_size: int, discrete: bool, settings: PPOSettings) -> PPO:
@@ -154,16 +191,46 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, discrete: b
     actor = MLP(observation_size, settings.hidden, action_size, key=actor_key, activation=jnp.tanh)
     critic = MLP(observation_size, settings.hidden, 1, key=critic_key, activation=jnp.tanh)
     policy = Policy(orthogonal(actor, 0.01, key=keys[0]), None if discrete else jnp.zeros(action_size))
-    online = Networks(policy, orthogonal(critic, 1.0, key=keys[1]))
-    return PPO(online, start_adam(online, settings.learning_rate), no_moments(1))
+    params = Networks(policy, orthogonal(critic, 1.0, key=keys[1]))
+    observations = new_mean_std(observation_size) if settings.normalise_observations else None
+    return PPO(params, start_adam(params, settings.learning_rate), new_mean_std(1), observations)
+
+
+def actor_of(state: PPO) -> Actor:
+    """What acts."""
+    return Actor(state.params.actor, state.observations)
+
+
+def shown(
+    observation: Float[Array, "*batch observation"], observations: RunningMeanStd | None
+) -> Float[Array, "*batch observation"]:
+    """Observations as the networks are given them."""
+    return observation if observations is None else standardise_if_known(observations, observation)
+
+
+def act(
+    actor: Actor, observation: Float[Array, "*batch observation"], available: Available
+) -> Float[Array, "*batch action"]:
+    """The likeliest action."""
+    return actor.policy.mode(shown(observation, actor.observations), available)
+
+
+def explore(
+    actor: Actor,
+    observation: Float[Array, "*batch observation"],
+    available: Available,
+    noise: Float[Array, "*batch action"],
+) -> Float[Array, "*batch action"]:
+    """An action of the policy, drawn by given noise."""
+    return actor.policy.drawn(shown(observation, actor.observations), noise, available)
 
 
 def values(state: PPO, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch"]:
     """V(s), in units of the reward."""
-    return (state.returns.mean + unit(state.returns) * state.online.critic(observation))[..., 0]
+    return (state.returns.mean + unit(state.returns) * state.params.critic(observation))[..., 0]
 
 
-def unit(returns: Moments) -> Float[Array, " 1"]:
+def unit(returns: RunningMeanStd) -> Float[Array, " 1"]:
     """What values are measured in: the deviation of the returns, or 1 as long as they have none."""
     spread = deviation(returns)
     return jnp.where(spread > 0, spread, 1)
@@ -186,77 +253,107 @@ def advantages(
     return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, carried), reverse=True)[1]
 
 
+def masked_mean(values: Float[Array, "*batch"], mask: Float[Array, "*batch"] | None) -> Float[Array, ""]:
+    """The mean of the values where `mask` is 1."""
+    return jnp.mean(values) if mask is None else jnp.sum(values * mask) / jnp.maximum(jnp.sum(mask), 1)
+
+
 def policy_objective(
-    ratio: Float[Array, " batch"], advantage: Float[Array, " batch"], clip: float | Array
+    ratio: Float[Array, " batch"],
+    advantage: Float[Array, " batch"],
+    clip: float | Array,
+    mask: Float[Array, " batch"] | None = None,
 ) -> Float[Array, ""]:
     """Mean min(rho A, clip(rho, 1 - c, 1 + c) A): Schulman et al. (2017), Eq. 7."""
-    return jnp.mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage))
+    return masked_mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage), mask)
 
 
 def value_loss(
-    value: Float[Array, " batch"], old: Float[Array, " batch"], target: Float[Array, " batch"], settings: PPOSettings
+    value: Float[Array, " batch"],
+    old: Float[Array, " batch"],
+    target: Float[Array, " batch"],
+    settings: PPOSettings,
+    mask: Float[Array, " batch"] | None = None,
 ) -> Float[Array, ""]:
     """Mean of the worse of two Huber losses: that of the value, and that of the value kept near the old one."""
     near = old + jnp.clip(value - old, -settings.value_clip, settings.value_clip)
     losses = (optax.huber_loss(guess, target, delta=settings.huber_delta) for guess in (value, near))
-    return jnp.mean(jnp.maximum(*losses))
+    return masked_mean(jnp.maximum(*losses), mask)
 
 
 def update(
-    state: PPO, rollout: Rollout, key: PRNGKeyArray, left: Float[Scalar, ""], settings: PPOSettings
+    state: PPO, rollout: Rollout, key: PRNGKeyArray, progress_remaining: Float[Scalar, ""], settings: PPOSettings
 ) -> tuple[PPO, dict[str, Float[Array, ""]]]:
     """All gradient steps on one rollout; returns the mean of each metric over them.
 
-    `left` is the share of the run that is still to come, for annealing.
+    `progress_remaining` is the share of the run that is still to come, for annealing.
     """
     batch, returns, explained = prepare(state, rollout, settings)
-    share = left if settings.anneal else 1.0
+    share = progress_remaining if settings.anneal else 1.0
     rate, clip = settings.learning_rate * share, settings.clip * share
 
-    def loss_of(online: Networks, rows: Minibatch) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-        log_ratio = online.actor.log_probability(rows.observation, rows.action) - rows.log_probability
+    def loss_of(params: Networks, rows: Minibatch) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+        actor, mask = params.actor, rows.mask
+        log_ratio = actor.log_probability(rows.observation, rows.action, rows.available) - rows.log_probability
         ratio = jnp.exp(log_ratio)
-        gain = policy_objective(ratio, rows.advantage, clip)
-        loss = value_loss(online.critic(rows.observation)[:, 0], rows.value, rows.target, settings)
-        entropy = jnp.mean(online.actor.entropy(rows.observation))
+        gain = policy_objective(ratio, rows.advantage, clip, mask)
+        loss = value_loss(params.critic(rows.observation)[:, 0], rows.value, rows.target, settings, mask)
+        entropy = masked_mean(actor.entropy(rows.observation, rows.available), mask)
         total = -gain + settings.value_coef * loss - settings.entropy_coef * entropy
         return total, {
             "actor/objective": gain,
             "actor/entropy": entropy,
-            "actor/approx_kl": jnp.mean(ratio - 1 - log_ratio),
-            "actor/clip_fraction": jnp.mean(jnp.abs(ratio - 1) > clip),
+            "actor/approx_kl": masked_mean(ratio - 1 - log_ratio, mask),
+            "actor/clip_fraction": masked_mean((jnp.abs(ratio - 1) > clip).astype(jnp.float32), mask),
             "critic/loss": loss,
         }
 
     def one(carry: tuple[Networks, optax.OptState], rows: Int[Array, " batch"]):
-        online, optimizer = carry
+        params, optimizer = carry
         chosen = jax.tree.map(lambda leaf: leaf[rows], batch)
-        gradient, measured = jax.grad(loss_of, has_aux=True)(online, chosen)
-        shrink = settings.max_grad_norm / jnp.maximum(optax.tree.norm(gradient), settings.max_grad_norm)
-        gradient = jax.tree.map(lambda leaf: leaf * shrink, gradient)
-        return descend(online, gradient, optimizer, rate), measured
+        gradient, measured = jax.grad(loss_of, has_aux=True)(params, chosen)
+        return descend(params, clipped(gradient, settings.max_grad_norm), optimizer, rate), measured
 
     order = minibatches(key, len(batch.target), settings)
-    (online, optimizer), measured = jax.lax.scan(one, (state.online, state.optimizer), order)
+    (params, optimizer), measured = jax.lax.scan(one, (state.params, state.optimizer), order)
     measured = jax.tree.map(jnp.mean, measured) | {"critic/explained_variance": explained}
-    return PPO(online, optimizer, returns), measured
+    return PPO(params, optimizer, returns, after_rollout(state.observations, rollout)), measured
 
 
-def prepare(state: PPO, rollout: Rollout, settings: PPOSettings) -> tuple[Minibatch, Moments, Float[Array, ""]]:
-    """All steps of all agents as one batch; the statistics of their returns, these taken in; the share of the returns' variance
+def after_rollout(observations: RunningMeanStd | None, rollout: Rollout) -> RunningMeanStd | None:
+    """What observations are normalised by from now on."""
+    if observations is None:
+        return None
+    rows = rollout.observation.reshape(-1, rollout.observation.shape[-1])
+    return observe(observations, rows, None if rollout.mask is None else rollout.mask.ravel() > 0)
+
+
+def prepare(state: PPO, rollout: Rollout, settings: PPOSettings) -> tuple[Minibatch, RunningMeanStd, Float[Array, ""]]:
+    """All steps of all agents as one batch; the statistics of their returns, these added; the share of the returns' variance
     that the critic knew.
     """
-    value, next_value = values(state, rollout.observation), values(state, rollout.next_observation)
+    before, after = (shown(rows, state.observations) for rows in (rollout.observation, rollout.next_observation))
+    value, next_value = values(state, before), values(state, after)
     advantage = advantages(rollout, value, next_value, settings)
-    explained = 1 - jnp.var(advantage) / jnp.var(advantage + value)
+    mask = rollout.mask
+    explained = 1 - masked_variance(advantage, mask) / masked_variance(advantage + value, mask)
     target = (advantage + value).reshape(-1)
-    returns = observe(state.returns, target[:, None])
-    centred = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
-    observation, action = (x.reshape(-1, x.shape[-1]) for x in (rollout.observation, rollout.action))
-    log_probability = state.online.actor.log_probability(observation, action)
-    said = state.online.critic(observation)[:, 0]
+    returns = observe(state.returns, target[:, None], None if mask is None else mask.ravel() > 0)
+    spread = jnp.sqrt(masked_variance(advantage, mask))
+    centred = (advantage - masked_mean(advantage, mask)) / (spread + 1e-8)
+    observation, action = (x.reshape(-1, x.shape[-1]) for x in (before, rollout.action))
+    available = None if rollout.available is None else rollout.available.reshape(-1, action.shape[-1])
+    log_probability = state.params.actor.log_probability(observation, action, available)
+    said = state.params.critic(observation)[:, 0]
     target = (target - returns.mean) / unit(returns)
-    return Minibatch(observation, action, log_probability, centred.reshape(-1), said, target), returns, explained
+    flat_mask = None if mask is None else mask.ravel()
+    batch = Minibatch(observation, action, log_probability, centred.reshape(-1), said, target, available, flat_mask)
+    return batch, returns, explained
+
+
+def masked_variance(values: Float[Array, "*batch"], mask: Float[Array, "*batch"] | None) -> Float[Array, ""]:
+    """The variance of the values where `mask` is 1."""
+    return jnp.var(values) if mask is None else masked_mean((values - masked_mean(values, mask)) ** 2, mask)
 
 
 def minibatches(key: PRNGKeyArray, steps: int, settings: PPOSettings) -> Int[Array, "updates batch"]:

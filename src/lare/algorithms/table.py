@@ -1,7 +1,7 @@
 """The table of algorithms: who learns from the rewards that a method gives.
 
 A row is a name with hyperparameters of its own. Two that differ in these alone share their equations: `ddpg` is `td3.py` with one
-critic, no noise on the target action and no delay; `ippo` is `ppo.py` with all agents as one.
+critic, no noise on the target action and no delay; `ippo` is `ppo.py` for all agents at once.
 """
 
 from dataclasses import dataclass
@@ -9,80 +9,133 @@ from enum import StrEnum
 from typing import Literal
 
 from lare.algorithms.ppo import PPOSettings
+from lare.algorithms.qmix import VDN, QMIXSettings
 from lare.algorithms.sac import SACSettings
 from lare.algorithms.td3 import TD3Settings
 
-AlgorithmSettings = TD3Settings | SACSettings | PPOSettings
+AlgorithmSettings = TD3Settings | SACSettings | PPOSettings | QMIXSettings
 
 
-class Kind(StrEnum):
-    """What an algorithm learns from, and for whom."""
+class Consumes(StrEnum):
+    """What an update of an algorithm reads."""
 
-    OFF_POLICY = "off-policy"
-    """From a replay of all that was met."""
-    ON_POLICY = "on-policy"
-    """From what the newest policy met."""
-    MANY_AGENTS = "many agents"
-    """From what the newest policy of all agents met."""
+    TRANSITIONS = "transitions"
+    """Single steps out of a replay of all that was met."""
+    ROLLOUTS = "rollouts"
+    """The newest steps, which the newest policy met."""
+    SEQUENCES = "sequences"
+    """Whole episodes out of a replay."""
+
+
+class Noise(StrEnum):
+    """What the policy that collects is disturbed by: independent numbers, for each entry of an action."""
+
+    NORMAL = "normal"
+    GUMBEL = "gumbel"
+    """By which the largest of the disturbed logits is a choice of the softmax."""
+    UNIFORM = "uniform"
+    """And one more for each agent, which decides whether it explores."""
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """One row: a published name."""
+    """One row: a published name, what it consumes and what it can do."""
 
     name: str
-    kind: Kind
+    consumes: Consumes
     settings: AlgorithmSettings
     """The published hyperparameters."""
     summary: str
     source: str
+    continuous: bool = True
+    """Whether it can act by numbers within bounds."""
+    discrete: bool = True
+    """Whether it can choose."""
+    one_agent: bool = True
+    """Whether it trains a single agent."""
+    many_agents: bool = False
+    """Whether it trains many agents."""
+    many_teams: bool = False
+    """Whether it trains several teams, each for itself."""
+    greedy: bool = True
+    """Whether it is evaluated without noise."""
+
+    def noise(self, discrete: bool) -> Noise:
+        """What its exploration draws."""
+        if self.consumes is Consumes.SEQUENCES:
+            return Noise.UNIFORM
+        return Noise.GUMBEL if discrete else Noise.NORMAL
 
 
 DDPG = TD3Settings(critics=1, policy_noise=0.0, policy_delay=1)
-PPO = PPOSettings(hidden=(256, 256), entropy_coef=0.01, anneal=True)
+PPO = PPOSettings(hidden=(256, 256), entropy_coef=0.01, anneal=True, normalise_observations=True)
 IPPO = PPOSettings(
     learning_rate=1e-4, gamma=1.0, minibatch_size=128, clip=0.5, entropy_coef=0.01, max_grad_norm=10.0, anneal=True
 )
-
 TABLE = (
     Algorithm(
         "td3",
-        Kind.OFF_POLICY,
+        Consumes.TRANSITIONS,
         TD3Settings(),
         "two critics against overestimation, a delayed deterministic policy",
         "Fujimoto et al., ICML 2018",
+        discrete=False,
     ),
     Algorithm(
         "ddpg",
-        Kind.OFF_POLICY,
+        Consumes.TRANSITIONS,
         DDPG,
         "one critic and a deterministic policy",
         "Lillicrap et al., ICLR 2016",
+        discrete=False,
     ),
     Algorithm(
         "sac",
-        Kind.OFF_POLICY,
+        Consumes.TRANSITIONS,
         SACSettings(),
         "maximum entropy, with a learned temperature",
         "Haarnoja et al., 2018 (arXiv 1812.05905)",
+        discrete=False,
     ),
     Algorithm(
         "ppo",
-        Kind.ON_POLICY,
+        Consumes.ROLLOUTS,
         PPO,
         "clipped policy steps on the newest rollout",
         "Schulman et al., 2017; a Gaussian takes the place of LaRe's Beta policy",
     ),
     Algorithm(
         "ippo",
-        Kind.MANY_AGENTS,
+        Consumes.ROLLOUTS,
         IPPO,
         "ppo for every agent, with one actor and one critic for all",
         "de Witt et al., 2020; hyperparameters of LaRe",
+        one_agent=False,
+        many_agents=True,
+        many_teams=True,
+        greedy=False,
+    ),
+    Algorithm(
+        "qmix",
+        Consumes.SEQUENCES,
+        QMIXSettings(),
+        "a team's value as a monotonic mixture of its agents' values, each with a memory of its episode",
+        "Rashid et al., ICML 2018; hyperparameters of PyMARL2 (Hu et al., 2021)",
+        continuous=False,
+        many_agents=True,
+    ),
+    Algorithm(
+        "vdn",
+        Consumes.SEQUENCES,
+        VDN,
+        "the same, as their sum",
+        "Sunehag et al., AAMAS 2018; hyperparameters of PyMARL2",
+        continuous=False,
+        many_agents=True,
     ),
 )
 
 ALGORITHMS = {algorithm.name: algorithm for algorithm in TABLE}
 
-Name = Literal["td3", "ddpg", "sac", "ppo", "ippo"]
+Name = Literal["td3", "ddpg", "sac", "ppo", "ippo", "qmix", "vdn"]
 """The names of the table, for types and for the command line."""

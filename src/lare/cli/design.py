@@ -141,13 +141,13 @@ def policy_that_plays(run: Path | None, spec: TaskSpec) -> Callable[[np.ndarray]
     """The policy of a run, if there is one."""
     if run is None:
         return None
-    from lare.experiments.evaluation import acting, action_space
+    from lare.experiments.evaluation import acting
     from lare.training.run import open_run
 
     opened = open_run(run)
     if opened.config.task.environment != spec.environment:
         raise LareError(f"{run} is a run of {opened.config.task.name}: its policy cannot play {spec.name}")
-    return acting(opened, action_space(opened))
+    return acting(opened)
 
 
 def check_design(

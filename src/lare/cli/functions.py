@@ -28,21 +28,25 @@ def new_task(
     environment: Annotated[Positional[str], tyro.conf.arg(metavar="ENV_ID")],
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
 ) -> None:
-    """Write a first task file of a Gymnasium environment, from its spaces and its documentation.
+    """Write a first task file of an environment, from its spaces and its documentation.
 
-    Whatever speaks of rewards is left out, and what could not be found is marked for you to fill in.
+    Whatever speaks of rewards is left out, and what could not be found is marked for you to fill in. Where the agents are
+    of several kinds, a file for each kind is written beside it.
 
     Args:
-        environment: a Gymnasium id, as Pendulum-v1; module:id imports the module that registers it first.
-        out: the file to write, which must not exist; ENV_ID.toml unless given.
+        environment: a Gymnasium id, as Pendulum-v1; module:id imports the module that registers it first; or
+            pettingzoo/MODULE:NAME, where NAME makes a PettingZoo ParallelEnv.
+        out: the file to write, which must not exist; the task's name with .toml unless given.
     """
     from lare.tasks.new import draft
 
     drafted = draft(environment)
-    path = out or Path(f"{environment.rpartition(':')[2].replace('/', '-')}.toml")
+    path = out or Path(f"{drafted.name}.toml")
     write_new(path, drafted.toml, "--out")
+    for name, text in drafted.teams.items():
+        write_new(path.parent / name, text, "folder for --out")
     left_out = f"; {drafted.left_out} sentences or rows that spoke of rewards were left out" if drafted.left_out else ""
-    say(f"wrote {path}{left_out}")
+    say(f"wrote {', '.join(map(str, (path, *(path.parent / name for name in drafted.teams))))}{left_out}")
     for key in drafted.missing:
         say(f"  fill in: {key} (the environment does not document it)")
     say(f"read it, then: lare design {path} --model NAME --out phi.py")

@@ -5,12 +5,14 @@ from typing import TYPE_CHECKING
 from lare.cli.terminal import show
 
 if TYPE_CHECKING:
+    from lare.algorithms.table import Algorithm
     from lare.credit.methods import Method
 
 
 def tasks() -> None:
     """List the tasks that come with the package. `lare prompt TASK` says what one is about."""
     from lare.tasks.spec import read_task, shipped_tasks
+    from lare.tasks.table import FAMILIES
 
     specs = [read_task(name) for name in shipped_tasks()]
     show(
@@ -21,7 +23,7 @@ def tasks() -> None:
                 str(spec.observation_size),
                 str(spec.action_size),
                 spec.judges,
-                "many" if spec.particles else "of one team" if spec.whole else "one",
+                "of one team" if spec.team else "many" if spec.family in FAMILIES else "one",
             )
             for spec in specs
         ),
@@ -48,6 +50,16 @@ def algorithms() -> None:
     from lare.algorithms.table import TABLE
 
     show(
-        ("algorithm", "learns", "what it is", "source"),
-        ((row.name, row.kind, row.summary, row.source) for row in TABLE),
+        ("algorithm", "consumes", "agents", "actions", "what it is", "source"),
+        ((row.name, row.consumes, for_agents(row), for_actions(row), row.summary, row.source) for row in TABLE),
     )
+
+
+def for_agents(row: "Algorithm") -> str:
+    """How many agents an algorithm trains."""
+    return "any" if row.one_agent and row.many_agents else "many" if row.many_agents else "one"
+
+
+def for_actions(row: "Algorithm") -> str:
+    """Which actions an algorithm takes."""
+    return "any" if row.continuous and row.discrete else "continuous" if row.continuous else "discrete"

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from lare.cli.terminal import RunDirectories, RunDirectory, progress, say, show
 from lare.errors import LareError
-from lare.training.settings import Settings, decide, set_in_vain
+from lare.training.settings import Settings, set_in_vain
 
 DEFAULTS = Settings()
 
@@ -35,6 +35,7 @@ def train(
     """
     import lare
     from lare.latent.function import CHANGED, load, per_role
+    from lare.training.decide import decide
     from lare.training.train import check_given
 
     if resume is not None:
@@ -45,18 +46,18 @@ def train(
         raise LareError("say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR")
     else:
         spec = lare.load_task(task)
-        plan = decide(settings, spec)
-        for in_vain in set_in_vain(plan, spec).values():
+        resolved = decide(settings, spec)
+        for in_vain in set_in_vain(settings, resolved, spec).values():
             raise LareError(in_vain)
         if function:
-            check_given(plan)
+            check_given(resolved)
         functions = [load(file, role) for file, role in per_role(function, spec)] if function else None
         for one in functions or ():
             if one.changed:
                 progress(
                     f"the function by {one.model.removesuffix(CHANGED)} is not the one that was saved: its hash is another"
                 )
-        run = lare.train(spec, plan, function=functions, out=out, tensorboard=tensorboard)
+        run = lare.train(spec, settings, function=functions, out=out, tensorboard=tensorboard)
     say(f"finished {run.directory}; to see it: lare report {run.directory}")
 
 
@@ -65,18 +66,19 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
 
     Args:
         run: a run directory.
-        episodes: episodes for each seed. A single agent acts without noise, agents of particle tasks as in training.
+        episodes: episodes for each seed. A single agent acts without noise, many as their algorithm is evaluated.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
     from lare.experiments.evaluation import evaluate_run
     from lare.experiments.statistics import mean_and_deviation, plus_minus
     from lare.experiments.video import check_video, record_video
+    from lare.tasks.table import env_spec
     from lare.training.run import open_run
 
     opened = open_run(run)
     if video is not None:
         check_video(video)
-        if not opened.config.task.particles:
+        if env_spec(opened.config.task).agents == 1:
             if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
                 os.environ.setdefault("MUJOCO_GL", "egl")  # which needs no screen
             progress("filming an episode; without a graphics card that may take minutes")
@@ -123,7 +125,7 @@ def cross_play(
     runs = open_run(first), open_run(second)
     matches = play(runs, episodes)
     task = runs[0].config.task
-    ours, theirs = (task.team(role) for role in task.teams)
+    ours, theirs = (role.team for role in task.teams)
 
     def cell(match: Match) -> str:
         return plus_minus(*mean_and_deviation(match.returns.ravel()))

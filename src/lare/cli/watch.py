@@ -42,17 +42,17 @@ def watching(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
 
 def look(jobs: Sequence[Job], bars: Progress, ended: threading.Event) -> None:
     """Move the bars until the end."""
-    whole = bars.add_task("all runs", total=sum(job.plan.steps for job in jobs))
+    whole = bars.add_task("all runs", total=sum(job.resolved.steps for job in jobs))
     own: dict[str, TaskID] = {}
     while not ended.is_set():
         steps = {job.name: step_of(job) for job in jobs}
         bars.update(whole, completed=sum(steps.values()))
         for job in jobs:
             done = steps[job.name]
-            if 0 < done < job.plan.steps and job.name not in own:
-                own[job.name] = bars.add_task(job.name, total=job.plan.steps)
+            if 0 < done < job.resolved.steps and job.name not in own:
+                own[job.name] = bars.add_task(job.name, total=job.resolved.steps)
             if job.name in own:
-                bars.update(own[job.name], completed=done, visible=done < job.plan.steps)
+                bars.update(own[job.name], completed=done, visible=done < job.resolved.steps)
         ended.wait(EVERY)
 
 

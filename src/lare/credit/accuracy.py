@@ -4,32 +4,32 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 RECENT = 5000
-"""Steps over which a single agent's are compared: the newest."""
+"""Steps over which they are compared: the newest, of every agent."""
 
 
 def metrics(
-    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], counts: Bool[Array, " steps"], in_units: bool
+    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"], in_units: bool
 ) -> dict[str, Float[Array, ""]]:
     """By the keys of metrics.jsonl; the error only of proxy rewards that are in the unit of the true ones."""
-    found = {"credit/correlation": correlation(r_hat, reward, counts)}
-    return found | ({"credit/error": mean_error(r_hat, reward, counts)} if in_units else {})
+    found = {"credit/correlation": correlation(r_hat, reward, mask)}
+    return found | ({"credit/error": mean_error(r_hat, reward, mask)} if in_units else {})
 
 
 def mean_error(
-    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], counts: Bool[Array, " steps"]
+    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"]
 ) -> Float[Array, ""]:
-    """Mean |r_hat - r| over the steps that count (the paper's Table F.5)."""
-    return jnp.sum(jnp.abs(r_hat - reward) * counts) / jnp.maximum(jnp.sum(counts), 1)
+    """Mean |r_hat - r| over the steps where `mask` is true (the paper's Table F.5)."""
+    return jnp.sum(jnp.abs(r_hat - reward) * mask) / jnp.maximum(jnp.sum(mask), 1)
 
 
 def correlation(
-    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], counts: Bool[Array, " steps"]
+    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"]
 ) -> Float[Array, ""]:
-    """Pearson's correlation of r_hat with r over the steps that count; NaN where one of them never varies."""
-    total = jnp.maximum(jnp.sum(counts), 1)
+    """Pearson's correlation of r_hat with r over the steps where `mask` is true; NaN where one of them never varies."""
+    total = jnp.maximum(jnp.sum(mask), 1)
 
     def centred(x: Float[Array, " steps"]) -> Float[Array, " steps"]:
-        return (x - jnp.sum(x * counts) / total) * counts
+        return (x - jnp.sum(x * mask) / total) * mask
 
     a, b = centred(r_hat), centred(reward)
     return jnp.sum(a * b) / jnp.sqrt(jnp.sum(a**2) * jnp.sum(b**2))

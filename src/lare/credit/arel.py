@@ -87,6 +87,5 @@ class AREL(eqx.Module):
         first, second, last = self.read_out
         y = math.sqrt(steps) * last(jnp.sum(second(first(x)), axis=1))[..., 0]
         penalty = VARIANCE_PENALTY / steps**2 * jnp.var(y, axis=1, ddof=1, keepdims=True)
-        return Decoded(
-            jnp.broadcast_to(y.reshape(rows, 1), (rows, agents)), jnp.broadcast_to(penalty, y.shape).reshape(rows)
-        )
+        of_rows = y, jnp.broadcast_to(penalty, y.shape)
+        return Decoded(*(jnp.broadcast_to(values.reshape(rows, 1), (rows, agents)) for values in of_rows))

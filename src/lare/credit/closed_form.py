@@ -43,11 +43,11 @@ class LinearDecoder(eqx.Module):
     bias: Float[Array, ""]
 
     def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
-        return Decoded(features @ self.weight + self.bias, jnp.zeros(len(features)))
+        return Decoded(features @ self.weight + self.bias, jnp.zeros(features.shape[:-1]))
 
 
 class Totals(NamedTuple):
-    """Running statistics of v_k = (z_k, R_k/T) over episodes, and of the episode that is under way."""
+    """Running statistics of v_k = (z_k, R_k/T) over episodes, and of those that are under way."""
 
     episodes: Float[Array, ""]
     mean: Float[Array, " features_and_reward"]
@@ -55,53 +55,60 @@ class Totals(NamedTuple):
     """sum_k (v_k - mean)(v_k - mean)^T"""
     farthest: Float[Array, ""]
     """The largest |R/T|."""
-    running: Float[Array, " features"]
+    running: Float[Array, "envs features"]
     """Mean of the factors since the episode began: of a constant it is that constant, however long the episode is."""
-    steps: Float[Array, ""]
+    steps: Float[Array, " envs"]
     """Steps since then."""
 
 
-def no_totals(features: int) -> Totals:
+def new_totals(features: int, envs: int = 1) -> Totals:
+    """The totals of no episodes."""
     zero, size = jnp.zeros(()), features + 1
-    return Totals(zero, jnp.zeros(size), jnp.zeros((size, size)), jnp.copy(zero), jnp.zeros(features), jnp.copy(zero))
+    running = jnp.zeros((envs, features)), jnp.zeros(envs)
+    return Totals(zero, jnp.zeros(size), jnp.zeros((size, size)), jnp.copy(zero), *running)
 
 
-def take_in(
+def add_steps(
     totals: Totals,
-    features: Float[Array, "time features"],
-    mean_reward: Float[Array, " time"],
-    ended: Bool[Array, " time"],
+    features: Float[Array, "time envs features"],
+    mean_reward: Float[Array, "time envs"],
+    ended: Bool[Array, "time envs"],
 ) -> Totals:
-    """Take in steps that follow each other; `mean_reward` is R/T where an episode has `ended`.
+    """Add steps that follow each other in each environment; `mean_reward` is R/T where an episode has `ended`.
 
     The products grow by Welford's update (1962): no catastrophic cancellation.
     """
 
-    def one(totals: Totals, step: tuple[Float[Array, " features"], Float[Array, ""], Bool[Array, ""]]):
-        row, reward, last = step
+    def one(totals: Totals, step: tuple[Float[Array, "envs features"], Float[Array, " envs"], Bool[Array, " envs"]]):
+        rows, reward, last = step
         steps = totals.steps + 1
-        running = totals.running + (row - totals.running) / steps
-        v = jnp.append(running, reward)
-        count = totals.episodes + 1
-        gap = v - totals.mean
-        mean = totals.mean + gap / count
-        over = Totals(
-            count,
-            mean,
-            totals.products + jnp.outer(gap, v - mean),
-            jnp.maximum(totals.farthest, jnp.abs(reward)),
-            jnp.zeros_like(running),
-            jnp.zeros_like(steps),
-        )
-        goes_on = totals._replace(running=running, steps=steps)
-        return jax.tree.map(lambda ended, on: jnp.where(last, ended, on), over, goes_on), None
+        running = totals.running + (rows - totals.running) / steps[:, None]
+
+        def with_episode(place: Array, totals: Totals) -> Totals:
+            longer = add_episode(totals, jnp.append(running[place], reward[place]))
+            return jax.tree.map(lambda new, old: jnp.where(last[place], new, old), longer, totals)
+
+        totals = jax.lax.fori_loop(0, len(last), with_episode, totals)
+        return totals._replace(running=jnp.where(last[:, None], 0, running), steps=jnp.where(last, 0, steps)), None
 
     return jax.lax.scan(one, totals, (features, mean_reward, ended))[0]
 
 
-def forget_running(totals: Totals) -> Totals:
-    """Without the episode that is under way."""
-    return totals._replace(running=jnp.zeros_like(totals.running), steps=jnp.zeros_like(totals.steps))
+def add_episode(totals: Totals, v: Float[Array, " features_and_reward"]) -> Totals:
+    """With one more episode."""
+    count, gap = totals.episodes + 1, v - totals.mean
+    mean = totals.mean + gap / count
+    products = totals.products + jnp.outer(gap, v - mean)
+    return totals._replace(
+        episodes=count, mean=mean, products=products, farthest=jnp.maximum(totals.farthest, jnp.abs(v[-1]))
+    )
+
+
+def forget_running(totals: Totals, dropped: Bool[Array, " envs"]) -> Totals:
+    """Without the episodes that are under way in some of the environments."""
+    return totals._replace(
+        running=jnp.where(dropped[:, None], 0, totals.running), steps=jnp.where(dropped, 0, totals.steps)
+    )
 
 
 def deviations(totals: Totals) -> Float[Array, " features"]:

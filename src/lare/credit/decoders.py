@@ -2,11 +2,11 @@
 
 Every decoder is called with rows of features, in one shape:
 
-    decoder(features [rows *agents features], key) -> Decoded(r_hat [rows *agents], penalty [rows])
+    decoder(features [rows *agents features], key) -> Decoded(r_hat [rows *agents], penalty [rows *agents])
 
-The mean of `penalty` is added to the loss of the return decomposition. `key` is for decoders that draw while they
-learn; without one they give what the algorithm is to be trained on. Those that look across steps and agents have files
-of their own, `arel.py` and `stas.py`; their rows must be whole episodes, one behind the other.
+The mean of `penalty` over those who are there is added to the loss of the return decomposition. `key` is for decoders that
+draw while they learn; without one they give what the algorithm is to be trained on. Those that look across steps and agents
+have files of their own, `arel.py` and `stas.py`; their rows must be whole episodes, one behind the other.
 """
 
 from typing import NamedTuple
@@ -23,7 +23,7 @@ class Decoded(NamedTuple):
     """What a decoder says of some steps."""
 
     r_hat: Float[Array, "rows *agents"]
-    penalty: Float[Array, " rows"]
+    penalty: Float[Array, "rows *agents"]
 
 
 class StepDecoder(eqx.Module):
@@ -37,7 +37,7 @@ class StepDecoder(eqx.Module):
         self.network = MLP(features, hidden, 1, key=key)
 
     def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
-        return Decoded(self.gain * self.network(features)[..., 0], jnp.zeros(len(features)))
+        return Decoded(self.gain * self.network(features)[..., 0], jnp.zeros(features.shape[:-1]))
 
 
 class Bottleneck(eqx.Module):
@@ -74,4 +74,4 @@ class Bottleneck(eqx.Module):
         if key is not None:
             z = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
         divergence = 0.5 * jnp.sum(jnp.exp(log_variance) + mean**2 - 1 - log_variance, axis=-1)
-        return Decoded(self.decoder(z, None).r_hat, self.beta * jnp.mean(divergence.reshape(len(features), -1), axis=1))
+        return Decoded(self.decoder(z, None).r_hat, self.beta * divergence)

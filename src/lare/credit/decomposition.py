@@ -31,11 +31,11 @@ from lare.credit.arel import AREL
 from lare.credit.closed_form import (
     LinearDecoder,
     Totals,
+    add_steps,
     best_signs,
     forget_running,
-    no_totals,
+    new_totals,
     ridge_regression,
-    take_in,
 )
 from lare.credit.decoders import Bottleneck, Decoded, StepDecoder
 from lare.credit.diaster import Diaster
@@ -43,7 +43,16 @@ from lare.credit.methods import Decoder, Fit, Method
 from lare.credit.stas import STAS
 from lare.errors import Checked, LareError
 from lare.networks import descend, start_adam
-from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe, observe_scale, standardise
+from lare.normalise import (
+    RunningMeanStd,
+    Scale,
+    magnitude,
+    new_mean_std,
+    new_scale,
+    observe,
+    observe_scale,
+    standardise,
+)
 
 Network = StepDecoder | Bottleneck | AREL | STAS | Diaster | LinearDecoder
 """A decoder of any kind."""
@@ -65,12 +74,10 @@ class CreditSettings(Checked):
     drawn_steps: Annotated[int, Field(ge=2)] = 64
     """K: steps drawn from an episode by RRD and its kin."""
     steps: Annotated[int, Field(ge=2)] = 256
-    """Steps in one update of the decoder: K steps of so many episodes, or whole episodes that make up about as many. Of many
-    agents: of so many whole episodes, whatever is drawn from them."""
+    """Steps in one update of the decoder: K steps of so many episodes, or whole episodes that make up about as many. Where all
+    episodes are equally long: of so many whole episodes, whatever is drawn from them."""
     episodes: Annotated[int, Field(ge=1)] = 8
     """diaster (single agents): whole episodes in one update of its decoder."""
-    fits: Annotated[int, Field(ge=1)] = 1
-    """diaster (single agents): updates of its decoder for each chunk of steps."""
     ridge: Annotated[float, Field(gt=0)] = 1.0
     """Strength of the ridge penalty (lambda), in episodes."""
     encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
@@ -94,8 +101,10 @@ class Episodes(NamedTuple):
     length: Int[Array, " episodes"]
     mean_reward: Float[Array, " episodes"]
     """R/T."""
-    counts: Float[Array, " episodes"]
+    mask: Float[Array, " episodes"]
     """1 for an episode, 0 for a place that holds none."""
+    share: Float[Array, "rows *agents"] | None = None
+    """What part of the team's reward each agent's is: 1/n for each of n that are alive, else 0. All agents alike where None."""
 
 
 class Decomposition(NamedTuple):
@@ -104,7 +113,8 @@ class Decomposition(NamedTuple):
     decoder: Network
     optimizer: optax.OptState
     """Empty for a decoder that is fitted in closed form."""
-    moments: Moments
+    statistics: RunningMeanStd
+    """Of the features."""
     scale: Scale
     totals: Totals | None
     """For a decoder that is fitted in closed form."""
@@ -134,12 +144,12 @@ def whole_episodes(
         episode=jnp.asarray(np.pad(number, (0, padding), constant_values=len(length))),
         length=jnp.asarray(length),
         mean_reward=jnp.asarray(np.asarray(returns, np.float32) / length),
-        counts=jnp.ones(len(length)),
+        mask=jnp.ones(len(length)),
     )
 
 
 def init(
-    key: PRNGKeyArray, features: int, method: Method, settings: CreditSettings, steps: int, agents: int
+    key: PRNGKeyArray, features: int, method: Method, settings: CreditSettings, steps: int, agents: int, envs: int = 1
 ) -> Decomposition:
     """An untrained decoder of the method's kind.
 
@@ -150,6 +160,7 @@ def init(
         settings: of the decoder and its fit; the same ones go to every other function of this file.
         steps: of the longest episode.
         agents: 1, or how many a step has.
+        envs: how many environments' episodes are under way at a time.
     """
     gain = 1.0 if agents == 1 else math.sqrt(steps * agents)
     match method.decoder:
@@ -166,41 +177,50 @@ def init(
             decoder = Diaster(features, settings.hidden, key=key)
         case Decoder.LINEAR:
             decoder = LinearDecoder(jnp.zeros(features), jnp.zeros(()))
-            return Decomposition(decoder, (), no_moments(features), no_scale(), no_totals(features))
+            return Decomposition(decoder, (), new_mean_std(features), new_scale(), new_totals(features, envs))
     optimizer = start_adam(decoder, settings.learning_rate)
-    return Decomposition(decoder, optimizer, no_moments(features), no_scale(), None)
+    return Decomposition(decoder, optimizer, new_mean_std(features), new_scale(), None)
 
 
-def observe_steps(state: Decomposition, features: Float[Array, "*batch features"]) -> Decomposition:
-    """Take new steps into the statistics that `normalise` goes by: every step once, when it is met."""
-    return state._replace(moments=observe(state.moments, features.reshape(-1, features.shape[-1])))
+def observe_steps(
+    state: Decomposition, features: Float[Array, "*batch features"], mask: Bool[Array, "*batch"] | None = None
+) -> Decomposition:
+    """Add new steps to the statistics that `normalise` goes by: every step once, when it is met.
+
+    Places where `mask` is false are passed over.
+    """
+    rows = features.reshape(-1, features.shape[-1])
+    return state._replace(statistics=observe(state.statistics, rows, None if mask is None else mask.ravel()))
 
 
 def observe_returns(
     state: Decomposition, mean_reward: Float[Array, " batch"], finished: Bool[Array, " batch"]
 ) -> Decomposition:
-    """Take R/T of newly finished episodes into `scale`: every episode once. Places where `finished` is false are passed over."""
+    """Add R/T of newly finished episodes to `scale`: every episode once. Places where `finished` is false are passed over."""
     return state._replace(scale=observe_scale(state.scale, mean_reward, finished))
 
 
 def fit_in_closed_form(
     state: Decomposition,
-    features: Float[Array, "time features"],
-    mean_reward: Float[Array, " time"],
-    ended: Bool[Array, " time"],
+    features: Float[Array, "time envs features"],
+    mean_reward: Float[Array, "time envs"],
+    ended: Bool[Array, "time envs"],
     fit: Fit,
     settings: CreditSettings,
 ) -> Decomposition:
-    """Take in steps that follow each other, and fit the decoder to all episodes that have ended."""
+    """Add steps that follow each other in some environments, and fit the decoder to all episodes that have ended.
+
+    Of several agents the features are their mean: what is linear in them has the mean of the agents' proxy rewards.
+    """
     assert state.totals is not None
-    totals = take_in(state.totals, features, mean_reward, ended)
+    totals = add_steps(state.totals, features, mean_reward, ended)
     decoder = best_signs(totals) if fit is Fit.SIGNS else ridge_regression(totals, settings.ridge)
     return state._replace(decoder=decoder, totals=totals)
 
 
-def forget_episode(state: Decomposition) -> Decomposition:
-    """Without the episode that is under way."""
-    return state if state.totals is None else state._replace(totals=forget_running(state.totals))
+def forget_episodes(state: Decomposition, dropped: Bool[Array, " envs"]) -> Decomposition:
+    """Without the episodes that are under way in some of the environments."""
+    return state if state.totals is None else state._replace(totals=forget_running(state.totals, dropped))
 
 
 def normalised(state: Decomposition, settings: CreditSettings) -> bool:
@@ -212,7 +232,7 @@ def inputs(
     state: Decomposition, features: Float[Array, "*batch features"], settings: CreditSettings
 ) -> Float[Array, "*batch features"]:
     """Features as the decoder is given them."""
-    return standardise(state.moments, features) if normalised(state, settings) else features
+    return standardise(state.statistics, features) if normalised(state, settings) else features
 
 
 def decode(
@@ -247,7 +267,16 @@ def targets(
 ) -> tuple[Float[Array, " episodes"], Float[Array, " episodes"]]:
     """R/T in units of the scale, and the weight of each episode."""
     target = episodes.mean_reward / magnitude(state.scale) if normalised(state, settings) else episodes.mean_reward
-    return target, losses.episode_weight(episodes.length, episodes.counts, settings.sum_form)
+    return target, losses.episode_weight(episodes.length, episodes.mask, settings.sum_form)
+
+
+def over_agents(
+    values: Float[Array, "rows *agents"], share: Float[Array, "rows *agents"] | None
+) -> Float[Array, " rows"]:
+    """The mean over those who are there."""
+    if share is None:
+        return jnp.mean(values.reshape(len(values), -1), axis=1)
+    return jnp.sum((values * share).reshape(len(values), -1), axis=1)
 
 
 def loss_of_means(
@@ -256,7 +285,7 @@ def loss_of_means(
     """RD, RRD and RRD-unbiased: mean r_hat of an episode's steps against R/T; and what the decoder adds of its own."""
     target, weight = targets(state, episodes, settings)
     decoded = decode(decoder, state, episodes.features, settings, key)
-    r_hat = jnp.mean(decoded.r_hat.reshape(len(episodes.features), -1), axis=1)
+    r_hat, penalty = (over_agents(values, episodes.share) for values in decoded)
     steps = episodes.length if fit is Fit.ALL_STEPS else jnp.minimum(episodes.length, len(r_hat) // len(target))
     mean = losses.episode_means(r_hat, episodes.episode, steps)
     if fit is Fit.DRAWN_STEPS_UNBIASED:
@@ -265,7 +294,7 @@ def loss_of_means(
     else:
         loss = losses.squared_error(mean, target, weight)
     belongs = (episodes.episode >= 0) & (episodes.episode < len(target))
-    penalty = jnp.sum(jnp.where(belongs, decoded.penalty, 0)) / jnp.maximum(jnp.sum(belongs), 1)
+    penalty = jnp.sum(jnp.where(belongs, penalty, 0)) / jnp.maximum(jnp.sum(belongs), 1)
     return loss + penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
 
 
@@ -276,7 +305,7 @@ def loss_of_pieces(
     assert isinstance(decoder, Diaster)
     target, _ = targets(state, episodes, settings)
     whole = episodes.features.reshape(len(target), -1, episodes.features.shape[-1])
-    return decoder.loss(inputs(state, whole, settings), episodes.length, target, episodes.counts, key)
+    return decoder.loss(inputs(state, whole, settings), episodes.length, target, episodes.mask, key)
 
 
 def update(

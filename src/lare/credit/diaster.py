@@ -18,26 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare.credit.decoders import Decoded
-from lare.networks import MLP, Linear
-
-
-class GRU(eqx.Module):
-    """z = s(x U_z + h W_z), r = s(x U_r + h W_r), h' = (1 - z) n + z h with n = tanh(x U_n + r * (h W_n))."""
-
-    given: Linear
-    """U: of z, r and n side by side."""
-    kept: Linear
-    """W, likewise."""
-
-    def __init__(self, features: int, size: int, *, key: PRNGKeyArray):
-        given_key, kept_key = jax.random.split(key)
-        self.given, self.kept = Linear(features, 3 * size, key=given_key), Linear(size, 3 * size, key=kept_key)
-
-    def __call__(self, given: Float[Array, "batch three"], h: Float[Array, "batch size"]) -> Float[Array, "batch size"]:
-        """One step; `given` is x U, which a caller has computed for all steps at once."""
-        (z, r, n), (kept_z, kept_r, kept_n) = (jnp.split(part, 3, axis=-1) for part in (given, self.kept(h)))
-        z, r = jax.nn.sigmoid(z + kept_z), jax.nn.sigmoid(r + kept_r)
-        return (1 - z) * jnp.tanh(n + r * kept_n) + z * h
+from lare.networks import GRU, MLP, Linear
 
 
 class Diaster(eqx.Module):
@@ -55,7 +36,7 @@ class Diaster(eqx.Module):
 
     def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
         """What the step model says."""
-        return Decoded(self.step(features)[..., 0], jnp.zeros(len(features)))
+        return Decoded(self.step(features)[..., 0], jnp.zeros(features.shape[:-1]))
 
     def pieces(
         self, features: Float[Array, "batch steps features"], begins: Bool[Array, "batch steps"]

@@ -61,7 +61,7 @@ def unbiased_squared_error(
 
 
 def episode_weight(
-    length: Int[Array, " episodes"], counts: Float[Array, " episodes"], sum_form: bool
+    length: Int[Array, " episodes"], mask: Float[Array, " episodes"], sum_form: bool
 ) -> Float[Array, " episodes"]:
-    """The weight of an episode: 1 when R/T is fitted, T^2 when the sum R is (`sum_form`); 0 where `counts` is 0."""
-    return counts * length.astype(jnp.float32) ** 2 if sum_form else counts
+    """The weight of an episode: 1 when R/T is fitted, T^2 when the sum R is (`sum_form`); 0 where `mask` is 0."""
+    return mask * length.astype(jnp.float32) ** 2 if sum_form else mask

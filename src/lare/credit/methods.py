@@ -17,7 +17,7 @@ class Encoder(StrEnum):
 
     RAW = "raw"
     """As published for RD and RRD: [s, a, s - s'] of a single agent, the next observation of each of many."""
-    TAKEN = "taken"
+    STATE_ACTION = "state and action"
     """[s, a]."""
     LATENT = "latent"
     """The factors z = phi(s, a), and nothing else."""
@@ -128,7 +128,12 @@ class Method:
     @property
     def for_many_only(self) -> bool:
         """Whether it says nothing where there is a single agent."""
-        return self.shared or self.decoder in (Decoder.AREL, Decoder.STAS)
+        return self.shared or self.whole_episodes
+
+    @property
+    def whole_episodes(self) -> bool:
+        """Whether its decoder looks at whole episodes, all of one length."""
+        return self.decoder in (Decoder.AREL, Decoder.STAS)
 
     @property
     def for_one_only(self) -> bool:
@@ -141,7 +146,7 @@ OF_FIT: dict[Fit, frozenset[str]] = {
     Fit.ALL_STEPS: frozenset({"sum_form", "steps"}),
     Fit.DRAWN_STEPS: frozenset({"sum_form", "steps", "drawn_steps"}),
     Fit.DRAWN_STEPS_UNBIASED: frozenset({"sum_form", "steps", "drawn_steps"}),
-    Fit.SUBTRAJECTORIES: frozenset({"episodes", "fits"}),
+    Fit.SUBTRAJECTORIES: frozenset({"episodes"}),
     Fit.RIDGE: frozenset({"ridge"}),
     Fit.SIGNS: frozenset(),
 }
@@ -197,7 +202,7 @@ TABLE = (
     Method(
         "diaster",
         Reward.PROXY,
-        Encoder.TAKEN,
+        Encoder.STATE_ACTION,
         Fit.SUBTRAJECTORIES,
         "differences of what pieces of an episode pay",
         "Lin et al., Diaster, AAAI 2024",
@@ -215,7 +220,7 @@ TABLE = (
     Method(
         "stas",
         Reward.PROXY,
-        Encoder.TAKEN,
+        Encoder.STATE_ACTION,
         Fit.ALL_STEPS,
         "attention over time, Shapley values over agents",
         "Chen et al., STAS, AAAI 2024",

@@ -140,7 +140,7 @@ class STAS(eqx.Module):
         else:
             draws = jax.lax.map(lambda one: self.among_agents(x, one, None), jax.random.split(jax.random.key(0), USED))
             r_hat = jnp.mean(draws, axis=0)
-        return Decoded(r_hat.reshape(rows, agents), jnp.zeros(rows))
+        return Decoded(r_hat.reshape(rows, agents), jnp.zeros((rows, agents)))
 
     def among_agents(
         self, x: Float[Array, "episodes steps agents size"], key: PRNGKeyArray, drop: PRNGKeyArray | None

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.experiments import figures
-from lare.experiments.agents import Sample, Watched, sample, watch
+from lare.experiments.agents import Sample, frames, sample
 from lare.experiments.credit import correlations, factor_labels
 from lare.experiments.html import factor_table, function_text, note
-from lare.tasks.particles.drawing import film
-from lare.tasks.particles.table import find_particle_task
+from lare.experiments.video import gif
+from lare.experiments.watch import Watched, watch
 from lare.training.run import Run
 
 PICTURED = 1000
@@ -23,13 +23,15 @@ PICTURED = 1000
 def agents_details(run: Run) -> Iterable[str]:
     """Who got which credit, the episode as a film, the factors of each team, and where its steps lie."""
     watched = watch(run)
+    true = watched.of_episode(watched.reward)
+    proxy = None if watched.proxy is None else watched.of_episode(watched.proxy)
     yield "<h3>Who got which credit when</h3>"
-    yield figures.credit_map(watched.reward, watched.proxy)
-    sums = f"Sum of the true rewards {watched.reward.sum():.1f}"
-    if watched.proxy is not None:
-        sums += f", of the proxy rewards {watched.proxy.sum():.1f}"
+    yield figures.credit_map(true, proxy)
+    sums = f"Sum of the true rewards {true.sum():.1f}"
+    if proxy is not None:
+        sums += f", of the proxy rewards {proxy.sum():.1f}"
     yield note(
-        f"One episode of the first seed's policy, every agent a row. {sums}. In the film each agent wears its credit as "
+        f"One episode of the first seed's policy, every agent a row. {sums}. In a film each agent wears its credit as "
         "number and colour: blue for more, red for less."
     )
     yield moving(run, watched)
@@ -39,10 +41,11 @@ def agents_details(run: Run) -> Iterable[str]:
 
 
 def moving(run: Run, watched: Watched) -> str:
-    """The film, inside the page."""
-    name, buffer = run.config.task.particles, io.BytesIO()
-    assert name is not None
-    film(buffer, find_particle_task(name), watched.position, watched.credit)
+    """The film, inside the page; nothing for an environment that cannot be drawn."""
+    pictures, buffer = frames(run, watched), io.BytesIO()
+    if pictures is None:
+        return ""
+    gif(buffer, pictures)
     data = base64.b64encode(buffer.getvalue()).decode()
     return f'<img class="film" alt="one episode, with the credit of each agent" src="data:image/gif;base64,{data}">'
 
@@ -56,7 +59,7 @@ def of_team(run: Run, place: int, taken: Sample) -> Iterable[str]:
     raw, latent = (np.nanmean(np.abs(values)) for values in (of_observation, of_factors))
     yield note(
         f"Absolute correlation with the true reward, mean over dimensions: {raw:.2f} of the {taken.observation.shape[1]} "
-        f"numbers that an agent observes, {latent:.2f} of the {taken.factors.shape[1]} factors."
+        f"numbers that are judged, {latent:.2f} of the {taken.factors.shape[1]} factors."
     )
     yield from neighbourhoods(taken)
     yield f"<h3>The latent function of {escape(name)}</h3>"

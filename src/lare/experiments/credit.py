@@ -1,4 +1,4 @@
-"""What a run's decoder gives to the steps of an episode, beside what they truly paid."""
+"""What a run's decoders give to the steps of an episode, beside what they truly paid."""
 
 from dataclasses import dataclass
 
@@ -10,12 +10,13 @@ from jaxtyping import Float
 from lare.credit import closed_form
 from lare.credit.accuracy import RECENT
 from lare.credit.methods import Fit
-from lare.training import replay
-from lare.training.learner import Learner, features, proxy_rewards
-from lare.training.recipe import Recipe
+from lare.data import replay
+from lare.experiments.watch import newest_episode
+from lare.training.config import TrainConfig
+from lare.training.learner import Learner, Paid, features, rewards
 from lare.training.run import Run
 from lare.training.seeds import of_seed
-from lare.training.single_agent import load_learner
+from lare.training.session import load_learner
 
 DELTA = 0.5
 """Of the confidence radius: a band of 95%."""
@@ -25,13 +26,13 @@ DELTA = 0.5
 class Credit:
     """The last finished episode of a run's first seed, and the factors' correlations."""
 
-    reward: Float[np.ndarray, " steps"]
+    reward: Float[np.ndarray, "steps agents"]
     """True."""
-    proxy: Float[np.ndarray, " steps"]
-    """By the decoder of the last checkpoint."""
+    proxy: Float[np.ndarray, "steps agents"]
+    """By the decoders of the last checkpoint."""
     uncertainty: Float[np.ndarray, " steps"] | None
-    """How far the proxy reward may be off, by the confidence radius of a decoder in closed form."""
-    factors: Float[np.ndarray, "steps factors"]
+    """How far the proxy reward of a single agent may be off, by the confidence radius of a decoder in closed form."""
+    factors: Float[np.ndarray, "steps rows factors"]
     correlations: Float[np.ndarray, " factors"]
     """Pearson's, of each factor with the true reward, over the last steps of all seeds. NaN where one never varies."""
 
@@ -48,20 +49,21 @@ def factor_labels(run: Run, place: int = 0) -> list[tuple[str, str]]:
 
 def credit_of(run: Run) -> Credit | None:
     """None for a method without proxy rewards, and as long as no episode has finished."""
-    recipe, learner, _, _ = load_learner(run)
+    config, learner, _, _ = load_learner(run)
     one = of_seed(learner)
-    if not recipe.method.has_proxy or not int(replay.finished(one.replay)):
+    index = newest_episode(one)
+    if not config.method.has_proxy or index is None:
         return None
-    episode = one.replay.episodes - 1
-    begin = int(one.replay.first[episode % len(one.replay.first)])
-    steps = replay.read(one.replay, jnp.arange(begin, int(replay.end_of(one.replay, episode))))
-    proxy = proxy_rewards(steps, one, recipe)
+    steps = replay.read(one.replay, index)
+    proxy = rewards(steps, Paid(one.credit, one.scale), config)
     uncertainty = None
-    if one.credit is not None and one.credit.totals is not None and recipe.method.fit is Fit.RIDGE:
-        seen = features(steps, recipe.method)
-        uncertainty = np.asarray(closed_form.uncertainty(one.credit.totals, seen, recipe.credit.ridge, DELTA))
-    reward, proxy, factors = (np.asarray(part) for part in (steps.reward, proxy, steps.factors))
-    return Credit(reward, proxy, uncertainty, factors, factor_correlations(learner, recipe))
+    totals = one.credit[0].totals if one.credit else None
+    if totals is not None and config.method.fit is Fit.RIDGE and config.judged_rows == 1:
+        rows = features(steps, config, 0)[:, 0]
+        uncertainty = np.asarray(closed_form.uncertainty(totals, rows, config.credit.ridge, DELTA))
+    factors = np.asarray(steps.before["factors"]) if "factors" in steps.before else np.zeros((len(proxy), 1, 0))
+    correlations = factor_correlations(learner, config)
+    return Credit(np.asarray(steps.before["reward"]), np.asarray(proxy), uncertainty, factors, correlations)
 
 
 def correlations(
@@ -72,13 +74,14 @@ def correlations(
         return np.array([np.corrcoef(column, reward)[0, 1] for column in columns.T])
 
 
-def factor_correlations(learner: Learner, recipe: Recipe) -> Float[np.ndarray, " factors"]:
-    known = int(jnp.min(learner.replay.transitions - jax.vmap(replay.oldest_transition)(learner.replay)))
-
-    def recent(held: replay.Replay) -> replay.Draw:
-        return replay.read(held, held.transitions - 1 - jnp.arange(min(RECENT, known)))
-
-    steps = jax.vmap(recent)(learner.replay)
-    reward = np.asarray(steps.reward).ravel()
-    factors = np.asarray(steps.factors).reshape(len(reward), recipe.factors)
+def factor_correlations(learner: Learner, config: TrainConfig) -> Float[np.ndarray, " factors"]:
+    """Of a single agent's factors with its true reward, over the newest steps; nothing for many agents."""
+    if not config.method.latent or config.judged_rows > 1 or config.env.agents > 1:
+        return np.zeros(0)
+    held = learner.replay
+    known = int(jnp.min(held.transitions - jax.vmap(replay.oldest_transition)(held)))
+    count = min(RECENT, known)
+    steps = jax.vmap(lambda one: replay.read(one, replay.newest(one, count)))(held)
+    reward = np.asarray(steps.before["reward"]).ravel()
+    factors = np.asarray(steps.before["factors"]).reshape(len(reward), -1)
     return correlations(factors, reward)

@@ -1,31 +1,27 @@
-"""The policy of a finished (or stopped) run, and its evaluation, for one agent and for many."""
+"""The policy of a finished (or stopped) run, and its evaluation."""
 
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import closing
+from functools import partial
 from typing import Any
 
-import gymnasium
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
-from lare.experiments import agents
-from lare.tasks.spaces import Choice
+from lare.tasks.env import HostEnv, in_units
 from lare.tasks.spec import check_against_environment
-from lare.training.environments import Policy, evaluate, make_episodic, to_bounds
+from lare.tasks.table import env_spec, make_env, make_host_env
+from lare.tasks.workers import LocalEnvs
+from lare.training.collect_device import DeviceCollector
+from lare.training.collect_host import evaluate, policy
+from lare.training.compiled import compiled, new_memory
 from lare.training.run import Run
-from lare.training.single_agent import compiled, load_learner
+from lare.training.session import load_learner
 
 AT_A_TIME = 20
 """Environments of a seed that are open together."""
-
-
-def load_policy(run: Run) -> Policy:
-    """The deterministic policies of all seeds, as of the last checkpoint."""
-    recipe, learner, _, _ = load_learner(run)
-    functions = compiled(recipe)
-    actor = functions.actor(learner)
-    return lambda observation: np.asarray(functions.act(actor, observation))
 
 
 def policy_of(run: Run, seed: int | None = None) -> Callable[[np.ndarray], Any]:
@@ -38,26 +34,42 @@ def policy_of(run: Run, seed: int | None = None) -> Callable[[np.ndarray], Any]:
     """
     if seed is not None and seed not in run.seeds:
         raise LareError(f"{run.directory} has no seed {seed}: there are {', '.join(map(str, run.seeds))}")
-    space = action_space(run)
-    act = acting(run, space, 0 if seed is None else run.seeds.index(seed))
-    return (lambda observation: space.number(act(observation))) if isinstance(space, Choice) else act
+    act = acting(run, 0 if seed is None else run.seeds.index(seed))
+    if not env_spec(run.config.task).discrete:
+        return act
+    first = first_action(run)
+    return lambda observation: first + int(np.argmax(act(observation)))
 
 
-def action_space(run: Run) -> gymnasium.Space:
-    """Of a run's environment, as training has it: a choice as rows. Raises `LareError` for a run of many agents."""
-    if run.config.task.particles:
+def first_action(run: Run) -> int:
+    """The number of the first action, as the environment counts them."""
+    from lare.tasks.gymnasium import GymnasiumEnv
+
+    env = make_env(run.config.task)
+    assert isinstance(env, GymnasiumEnv)
+    with closing(env):
+        return env.environment.action_space.start  # type: ignore[attr-defined]
+
+
+def acting(run: Run, place: int = 0) -> Callable[[np.ndarray], np.ndarray]:
+    """The deterministic policy of one of the seeds, from one observation to one action in the environment's units.
+
+    Raises:
+        LareError: it is a run of many agents.
+    """
+    env = env_spec(run.config.task)
+    if env.agents > 1:
         raise LareError(f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy")
-    with closing(make_episodic(run.config.task)) as environment:
-        return environment.action_space
-
-
-def acting(run: Run, space: gymnasium.Space, place: int = 0) -> Callable[[np.ndarray], np.ndarray]:
-    """The deterministic policy of one of the seeds, from one observation to one action within the space."""
-    policy = load_policy(run)
+    config, learner, _, _ = load_learner(run)
+    functions = compiled(config)
+    actor = jax.tree.map(lambda leaf: leaf[place : place + 1], functions.actor(learner, run.config.settings.steps))
+    memory = [new_memory(config, 1, 1)]
+    available, new = np.ones((1, 1, 1, env.action_size), bool), np.zeros((1, 1), bool)
 
     def act(observation: np.ndarray) -> np.ndarray:
-        everyone = np.broadcast_to(np.asarray(observation, np.float32), (len(run.seeds), len(observation)))
-        return to_bounds(policy(everyone)[place], space)
+        row = np.asarray(observation, np.float32).reshape(1, 1, 1, -1)
+        action, memory[0] = functions.act(actor, memory[0], row, available, None, new)
+        return in_units(np.asarray(action)[0, 0], env)[0]
 
     return act
 
@@ -65,26 +77,30 @@ def acting(run: Run, space: gymnasium.Space, place: int = 0) -> Callable[[np.nda
 def evaluate_run(run: Run, episodes: int = 10) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
     """True returns by team; the only team of most tasks is called by the task's name.
 
-    From starts that no evaluation of the run has used. A single agent acts without noise. Agents of particle tasks draw
-    their actions, as they do in training; a team's return is the sum over its agents.
+    From starts that no evaluation of the run has used. A single agent acts without noise, many as their algorithm is evaluated.
+    A team's return is the sum over the steps of the mean over its agents.
 
     Raises:
         LareError: there is nothing to evaluate, or the task's environment has changed.
     """
     if episodes < 1:
         raise LareError(f"episodes = {episodes}: at least one is needed")
-    task = run.config.task
-    if task.particles:
-        return agents.returns(run, episodes)
+    task, settings = run.config.task, run.config.settings
     check_against_environment(task)
-    policy, parts = load_policy(run), []
-    with ExitStack() as opened:
-        environments = [
-            [opened.enter_context(closing(make_episodic(task))) for _ in range(min(episodes, AT_A_TIME))]
-            for _ in run.seeds
-        ]
-        used = run.config.settings.evaluation_episodes
+    config, learner, host, _ = load_learner(run)
+    functions = compiled(config)
+    actor = functions.actor(learner, host["step"])
+    env = make_env(task)
+    if not isinstance(env, HostEnv):
+        returns = DeviceCollector(env, config, run.seeds).evaluate(actor, episodes, number=1).returns
+    else:
+        env.close()
+        parts = []
         for done in range(0, episodes, AT_A_TIME):
-            some = [row[: episodes - done] for row in environments]
-            parts.append(evaluate(some, policy, run.seeds, first=used + done).returns)
-    return {task.name: np.concatenate(parts, axis=1)}
+            some = min(AT_A_TIME, episodes - done)
+            with closing(LocalEnvs([partial(make_host_env, task)] * (some * len(run.seeds)))) as envs:
+                first = settings.evaluation_episodes + done
+                act = policy(functions, config, actor, run.seeds, some)
+                parts.append(evaluate(envs, act, run.seeds, some, first).returns)
+        returns = np.concatenate(parts, axis=1)
+    return {role.name: returns[..., place] for place, role in enumerate(task.roles)}

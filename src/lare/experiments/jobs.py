@@ -11,8 +11,9 @@ from lare.errors import LareError
 from lare.latent.design import CANDIDATES, check_recorded
 from lare.tasks.spec import TaskSpec
 from lare.training.checkpoint import saved_step
-from lare.training.run import CHECKPOINT, CONFIG, check_room, read_config, read_metrics
-from lare.training.settings import Plan, Settings, decide
+from lare.training.decide import decide
+from lare.training.run import CHECKPOINT, CONFIG, read_config, read_metrics
+from lare.training.settings import ResolvedSettings, Settings
 from lare.training.train import chosen_functions
 
 
@@ -22,7 +23,9 @@ class Job:
 
     directory: Path
     task: TaskSpec
-    plan: Plan
+    settings: Settings
+    """As they are given."""
+    resolved: ResolvedSettings
     functions: tuple[Path, ...] = ()
     """Latent functions of one's own, instead of recorded ones: one for each team."""
 
@@ -40,9 +43,9 @@ class Job:
         """Whether every seed has come to its end, and the checkpoint with them, where one has been kept."""
         if not self.begun:
             return False
-        ended = {line["seed"] for line in read_metrics(self.directory) if line["step"] == self.plan.steps}
+        ended = {line["seed"] for line in read_metrics(self.directory) if line["step"] == self.resolved.steps}
         saved = saved_step(self.directory / CHECKPOINT)
-        return ended == set(self.plan.all_seeds) and saved in (None, self.plan.steps)
+        return ended == set(self.resolved.all_seeds) and saved in (None, self.resolved.steps)
 
     @property
     def begun(self) -> bool:
@@ -51,24 +54,25 @@ class Job:
 
 def job_of(root: Path, task: TaskSpec, settings: Settings, functions: Sequence[Path] = ()) -> Job:
     """A run in its place: ROOT/TASK/METHOD-ALGORITHM, with the draw and an unusual number of candidates where they matter."""
-    plan = decide(settings, task)
+    resolved = decide(settings, task)
     ending = ""
-    latent = find_method(plan.method).latent
+    latent = find_method(resolved.method).latent
     if latent and not functions:
-        ending = f"-draw{plan.draw}" + (f"-candidates{plan.candidates}" if plan.candidates != CANDIDATES else "")
-    name = f"{plan.method}-{plan.algorithm}{ending}"
-    return Job(root / task.name / name, task, plan, tuple(functions) if latent else ())
+        ending = f"-draw{resolved.draw}"
+        ending += f"-candidates{resolved.candidates}" if resolved.candidates != CANDIDATES else ""
+    name = f"{resolved.method}-{resolved.algorithm}{ending}"
+    return Job(root / task.name / name, task, settings, resolved, tuple(functions) if latent else ())
 
 
 def check(job: Job) -> None:
     """Raise `LareError` where a job could not be trained, or something else is in its place."""
-    method = find_method(job.plan.method)
-    functions = chosen_functions(job.task, job.plan, job.functions) if job.functions else ()
+    method = find_method(job.resolved.method)
+    functions = chosen_functions(job.task, job.resolved, job.functions) if job.functions else ()
     if job.begun:
         config = read_config(job.directory)
         if config.task.digest != job.task.digest:
             raise LareError(f"{job.directory} holds a run of another task: choose another out")
-        theirs, ours = config.settings.in_force(config.task), job.plan.in_force(job.task)
+        theirs, ours = config.settings.in_force(config.task), job.resolved.in_force(job.task)
         if differing := [name for name in ours if theirs.get(name) != ours[name]]:
             name = differing[0]
             raise LareError(
@@ -79,16 +83,15 @@ def check(job: Job) -> None:
     elif job.directory.exists():
         raise LareError(f"{job.directory} exists, and is not a run: choose another out")
     else:
-        check_room(job.task, job.plan)
         for role in job.task.roles if method.latent and not functions else ():
-            check_recorded(role, method.kind, job.plan.draw, job.plan.candidates)
+            check_recorded(role, method.kind, job.resolved.draw, job.resolved.candidates)
 
 
 def as_json(job: Job) -> dict[str, Any]:
     return {
         "directory": str(job.directory.absolute()),
         "task": job.task.model_dump(mode="json"),
-        "settings": job.plan.model_dump(mode="json"),
+        "settings": job.settings.model_dump(mode="json"),
         "functions": [str(path.absolute()) for path in job.functions],
     }
 

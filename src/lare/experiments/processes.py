@@ -129,7 +129,7 @@ def in_a_process(job: Job, cores: list[int], running: Running) -> str | None:
             process.stdout.close()
             running.ended(process)
     if process.returncode == 0:
-        return None if job.done else f"it ended at step {job.step()} of {job.plan.steps} ({log})"
+        return None if job.done else f"it ended at step {job.step()} of {job.resolved.steps} ({log})"
     if process.returncode < 0:  # there is no last word of a process that was killed, for memory as it may be
         return f"it was ended by {signal.Signals(-process.returncode).name} ({log})"
     if last_word:  # not from the log, which a full disk may have cut short

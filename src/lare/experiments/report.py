@@ -18,8 +18,9 @@ from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN
 from lare.experiments.statistics import mean_and_deviation, plus_minus
 from lare.source import source
 from lare.tasks.spec import TaskSpec
+from lare.tasks.table import env_spec
 from lare.training.run import Run, open_run
-from lare.training.settings import Settings, decide, dotted
+from lare.training.settings import Settings, resolve
 
 TOP = "True rewards, for a million steps of the best public TD3,"
 """What the upper ends of `REFERENCES` are."""
@@ -132,7 +133,7 @@ def learning(task: str, runs: dict[str, Run]) -> Iterable[str]:
 
 def curves_of(task: TaskSpec) -> Iterable[tuple[str, str, str]]:
     """What is drawn over time: key of metrics.jsonl, title, unit; one of each team, where there are several."""
-    teams = {f"_{team}": f", team of {team}" for team in map(task.team, task.teams)} or {"": ""}
+    teams = {f"_{role.team}": f", team of {role.team}" for role in task.teams} or {"": ""}
     for key, title, unit in (
         (RETURN, "true return", "true return"),
         *((f"evaluation/{name}", name, name) for name in task.measures),
@@ -149,7 +150,7 @@ def details(name: str, run: Run) -> Iterable[str]:
     yield f"<h2>{escape(name)} on {escape(run.config.task.name)}</h2>"
     yield f"<p>{escape(method.summary[0].upper() + method.summary[1:])}. Source: {escape(method.source)}.</p>"
     if run.has_checkpoint():
-        yield from agents_details(run) if run.config.task.particles else one_agent_details(run)
+        yield from agents_details(run) if env_spec(run.config.task).agents > 1 else one_agent_details(run)
     else:
         yield note("Its checkpoint is not there any more, and with it what credit and factors would be drawn from.")
     yield "<h3>Settings</h3>"
@@ -160,7 +161,7 @@ def one_agent_details(run: Run) -> Iterable[str]:
     credit = credit_of(run)
     if credit is not None:
         yield f"<h3>Credit over one episode ({len(credit.reward)} steps)</h3>"
-        yield figures.credit(credit.reward, credit.proxy, credit.uncertainty)
+        yield figures.credit(credit.reward[:, 0], credit.proxy[:, 0], credit.uncertainty)
         steps = figures.window(len(credit.reward))
         yield note(
             "The last training episode of the first seed, exploration included, judged by the newest decoder: "
@@ -185,7 +186,7 @@ def factors(run: Run, credit: Any) -> Iterable[str]:
     correlations = credit.correlations if credit is not None else [np.nan] * len(named)
     yield factor_table(named, correlations)
     if credit is not None:
-        yield figures.courses(credit.factors, [name for name, _ in named])
+        yield figures.courses(credit.factors[:, 0], [name for name, _ in named])
     yield note(f"phi judges the observation {judged(run)} the step.")
 
 
@@ -195,12 +196,13 @@ def judged(run: Run) -> str:
 
 def settings_table(run: Run) -> str:
     """What differs from the defaults in sight, everything else folded away."""
-    usual = decide(Settings(), run.config.task)
-    chosen, defaults = (dict(dotted(plan.model_dump())) for plan in (run.config.settings, usual))
+    settings = run.config.settings
+    usual = resolve(Settings(method=settings.method, algorithm=settings.algorithm), env_spec(run.config.task))
+    defaults = usual.in_force(run.config.task)
     rows = [
         (key, value if isinstance(value, str) else json.dumps(value))
-        for key, value in chosen.items()
-        if value != defaults[key] or key in ("method", "algorithm")
+        for key, value in settings.in_force(run.config.task).items()
+        if value != defaults.get(key) or key in ("method", "algorithm")
     ]
     config = run.config
     rows.append(("LaRe", f"{config.lare}; {', '.join(f'{name} {number}' for name, number in config.versions.items())}"))

@@ -25,6 +25,9 @@ million steps, the upper end of what public benchmarks report."""
 RETURN = "evaluation/return"
 """What is compared, unless something else is asked for."""
 
+SUMMED_RETURN = "evaluation/summed_return"
+"""The sum over a team's agents, where there are many."""
+
 ERROR, CORRELATION = "credit/error", "credit/correlation"
 """How near the proxy rewards come to the true ones."""
 

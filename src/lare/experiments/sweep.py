@@ -81,7 +81,7 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
         if places.setdefault(job.directory, job) is not job:
             raise LareError(f"{path}: {job.name} is asked for twice; two task files need two names")
         check(job)
-    in_vain = [set_in_vain(job.plan, job.task) for job in jobs]
+    in_vain = [set_in_vain(job.settings, job.resolved, job.task) for job in jobs]
     for name, said in in_vain[0].items():
         if all(name in others for others in in_vain):
             raise LareError(f"{path}: {said}")

@@ -3,18 +3,25 @@
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from lare.errors import LareError
 from lare.experiments import agents
 from lare.experiments.evaluation import acting
-from lare.tasks.episodic import EpisodicReward
-from lare.tasks.particles.drawing import FRAMES_PER_SECOND
-from lare.training.environments import Stream, episode_seed, make_episodic
+from lare.experiments.watch import watch
+from lare.tasks.env import HostEnv
+from lare.tasks.gymnasium import GymnasiumEnv
+from lare.tasks.table import env_spec, make_host_env
 from lare.training.run import Run
+from lare.training.streams import Stream, episode_seed
+
+FRAMES_PER_SECOND = 8
+"""Of a film of many agents."""
 
 FRAME = {"width": 320, "height": 320}
 """Pixels of a MuJoCo film: its usual 480 by 480 take twice as long, and as much room."""
@@ -30,30 +37,40 @@ def record_video(run: Run, path: str | Path) -> None:
     """
     path = Path(path)
     check_video(path)
-    if run.config.task.particles:
-        write_video(path, agents.frames(run), 1 / FRAMES_PER_SECOND)
+    if env_spec(run.config.task).agents > 1:
+        pictures = agents.frames(run, watch(run))
+        if pictures is None:
+            raise LareError(f"{run.config.task.name} steps on the host, where only single agents are filmed")
+        write_video(path, pictures, 1 / FRAMES_PER_SECOND)
         return
     camera = {"camera_name": "track", **FRAME} if has_tracking_camera(run) else {}
-    with closing(make_episodic(run.config.task, render_mode="rgb_array", **camera)) as environment:
-        fps = environment.metadata.get("render_fps", 30)
+    with closing(make_host_env(run.config.task, render_mode="rgb_array", **camera)) as environment:
+        assert isinstance(environment, GymnasiumEnv)
+        fps = environment.environment.metadata.get("render_fps", 30)
         # Browsers play a GIF at 50 frames a second at most, and a frame may take long where there is no graphics card.
         every = max(1, round(fps / 25)) if path.suffix == ".gif" else 1
         write_video(path, list(drawn(run, environment, every)), every / fps)
 
 
-def drawn(run: Run, environment: EpisodicReward, every: int) -> Iterator[np.ndarray]:
+def drawn(run: Run, environment: HostEnv, every: int) -> Iterator[np.ndarray]:
     """Pictures of every so many steps of an episode. Raises `LareError` where this machine draws none."""
-    act = acting(run, environment.action_space)
-    observation, _ = environment.reset(seed=episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
+    act = acting(run)
+    shown = environment.reset(episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
     ended, step = False, 0
     while not ended:
         if step % every == 0:
-            yield picture(environment)
-        observation, _, terminated, truncated, _ = environment.step(act(observation))
-        ended, step = terminated or truncated, step + 1
+            yield picture(environment, run)
+        shown = environment.step(act(shown.observation[0])[None])
+        ended, step = bool(shown.terminated or shown.truncated), step + 1
 
 
-def picture(environment: EpisodicReward) -> np.ndarray:
+def gif(file: BytesIO, frames: Sequence[np.ndarray]) -> None:
+    """Pictures of many agents as a film within a page."""
+    first, *others = (Image.fromarray(frame) for frame in frames)
+    first.save(file, format="GIF", save_all=True, append_images=others, duration=1000 // FRAMES_PER_SECOND, loop=0)
+
+
+def picture(environment: HostEnv, run: Run) -> np.ndarray:
     """The environment as it is now."""
     try:
         with warnings.catch_warnings():
@@ -61,15 +78,16 @@ def picture(environment: EpisodicReward) -> np.ndarray:
             return np.asarray(environment.render())
     except Exception as error:  # a missing display shows itself in as many ways as there are graphics libraries
         raise LareError(
-            f"{environment.spec.id if environment.spec else 'the environment'} cannot be drawn here: "
+            f"{run.config.task.environment} cannot be drawn here: "
             f"{error}; without a screen, MUJOCO_GL=egl in the environment may help"
         ) from error
 
 
 def has_tracking_camera(run: Run) -> bool:
     """Whether the environment is a MuJoCo model with a camera that follows it, which Gymnasium does not use by itself."""
-    with closing(make_episodic(run.config.task)) as environment:
-        model: Any = getattr(environment.unwrapped, "model", None)
+    with closing(make_host_env(run.config.task)) as environment:
+        assert isinstance(environment, GymnasiumEnv)
+        model: Any = getattr(environment.environment.unwrapped, "model", None)
         return hasattr(model, "ncam") and "track" in (model.camera(number).name for number in range(model.ncam))
 
 

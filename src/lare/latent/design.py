@@ -12,13 +12,14 @@ from lare.errors import LareError
 from lare.latent.checks import Check, Failed, factors_of
 from lare.latent.function import LatentFunction, normal
 from lare.latent.jailed import JailedProgram, WorkerFailed
-from lare.latent.reflect import Policy, episodes_of, gather
+from lare.latent.reflect import EPISODES, gather
 from lare.latent.verify import Verdict, random_steps, verify
 from lare.llm import prompts
 from lare.llm.model import Model, recorded_model
 from lare.llm.prompts import Kind, Message, Stage
 from lare.llm.recording import Recorder
 from lare.llm.reply import MalformedReply, parse
+from lare.tasks.play import Policy, episodes_of
 from lare.tasks.spec import TaskSpec, the_role
 
 CANDIDATES = 5
@@ -150,7 +151,7 @@ class Conversation:
         Whatever goes wrong on the way, there is a verified function to go back to; whoever stops it takes that.
         """
         try:
-            episodes = episodes_of(self.task, policy)
+            episodes = episodes_of(self.task, EPISODES, policy)
             evidence = gather(self.made(best), self.task, episodes)
         except (LareError, KeyboardInterrupt) as error:
             self.said(f"no reflection: {str(error) or 'stopped'}")

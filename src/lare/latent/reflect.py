@@ -4,17 +4,14 @@ The judge is the plainest decoder there is: a linear map from an episode's mean 
 regression and asked about the episodes that it has not seen.
 """
 
-import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium
 import numpy as np
 from jaxtyping import Float
 
 from lare.latent.function import LatentFunction
-from lare.tasks.environment import make
+from lare.tasks.play import Episode
 from lare.tasks.spec import TaskSpec
 
 EPISODES = 40
@@ -22,49 +19,13 @@ FOLDS = 8
 RIDGE = 1.0
 """Strength of the penalty, in units of one episode: factors are standardised."""
 
-Policy = Callable[[np.ndarray], np.ndarray]
-"""From one observation to one action of the environment."""
 
-
-@dataclass(frozen=True)
-class Episode:
-    """One whole episode."""
-
-    observation: Float[np.ndarray, "steps_and_one observation"]
-    action: Float[np.ndarray, "steps action"]
-    reward: Float[np.ndarray, " steps"]
-
-    @property
-    def total(self) -> float:
-        """R."""
-        return float(sum(self.reward))
-
-
-def episodes_of(task: TaskSpec, policy: Policy | None = None, count: int = EPISODES, seed: int = 0) -> list[Episode]:
-    """Episodes under a policy, or under random actions."""
-    with contextlib.closing(make(task.environment, task.max_episode_steps)) as environment:
-        environment.action_space.seed(seed)
-        return [episode_of(environment, policy, seed + number) for number in range(count)]
-
-
-def episode_of(environment: gymnasium.Env, policy: Policy | None, seed: int) -> Episode:
-    """One of them. What it observes is copied: the environment may write the next observation into the same memory."""
-    observation = np.array(environment.reset(seed=seed)[0], np.float32)
-    observations, actions, rewards, ended = [observation], [], [], False
-    while not ended:
-        action = environment.action_space.sample() if policy is None else policy(observation)
-        after, reward, terminated, truncated, _ = environment.step(action)
-        observation = np.array(after, np.float32)
-        observations.append(observation)
-        actions.append(np.array(action, np.float32))
-        rewards.append(float(reward))
-        ended = terminated or truncated
-    return Episode(np.stack(observations), np.stack(actions), np.array(rewards))
-
-
-def factors_of(function: LatentFunction, task: TaskSpec, episode: Episode) -> Float[np.ndarray, "steps factors"]:
-    """The factors of an episode's steps, by the observations that the task says are judged."""
-    return function.of_steps(episode.observation[:-1], episode.action, episode.observation[1:], task.judges)
+def factors_of(
+    function: LatentFunction, task: TaskSpec, episode: Episode
+) -> Float[np.ndarray, "steps_and_rows factors"]:
+    """The factors of an episode's steps (of all agents that acted), by the observations that the task says are judged."""
+    before, action, after = (part[episode.alive] for part in (episode.before, episode.action, episode.after))
+    return function.of_steps(before, action, after, task.judges)
 
 
 def held_out_fit(means: Float[np.ndarray, "episodes factors"], targets: Float[np.ndarray, " episodes"]) -> float:

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import hashlib
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +13,9 @@ from lare.latent.checks import Check, Failed, Trial, advice, examine, failed
 from lare.latent.jailed import JailedProgram, WorkerFailed
 from lare.latent.names import names_of
 from lare.llm.prompts import Kind
-from lare.tasks.environment import make
+from lare.tasks.play import rows_of, steps_of, team_of
 from lare.tasks.spec import TaskSpec, the_role
+from lare.tasks.table import make_host_env
 
 STEPS = 256
 """Random steps that a function is tried on."""
@@ -76,26 +78,21 @@ def random_steps(
     task: TaskSpec, steps: int = STEPS, seed: int = 0
 ) -> tuple[Float[np.ndarray, "steps observation"], Float[np.ndarray, "steps action"]]:
     """Steps of the task under uniformly random actions (the paper's pre-collected random state-action pairs)."""
-    return steps_in(task.environment, task.max_episode_steps, steps, seed)
+    return known_steps(task.model_dump_json(), steps, seed)
 
 
 @functools.lru_cache(maxsize=8)
-def steps_in(
-    name: str, max_episode_steps: int | None, steps: int, seed: int
+def known_steps(
+    task: str, steps: int, seed: int
 ) -> tuple[Float[np.ndarray, "steps observation"], Float[np.ndarray, "steps action"]]:
-    """The same by the environment. Read-only: they are given to everybody who asks."""
-    observations, actions = [], []
-    with contextlib.closing(make(name, max_episode_steps)) as environment:
-        environment.action_space.seed(seed)
-        observation, _ = environment.reset(seed=seed)
-        for _ in range(steps):
-            action = environment.action_space.sample()
-            observations.append(np.array(observation, np.float32))  # a copy: the environment may write into it again
-            actions.append(np.array(action, np.float32))
-            observation, _, terminated, truncated, _ = environment.step(action)
-            if terminated or truncated:
-                observation, _ = environment.reset()
-    recorded = np.asarray(observations, np.float32), np.asarray(actions, np.float32)
-    for array in recorded:
+    """The same by the task as JSON. Read-only: they are given to everybody who asks."""
+    role = TaskSpec.model_validate_json(task)
+    with contextlib.closing(make_host_env(role)) as env:
+        team, random = team_of(role, env.spec), np.random.default_rng(seed)
+        played = (step for number in itertools.count() for step in steps_of(env, None, random, seed + number))
+        per_step = 1 if role.judged_from == "state" else team.size
+        found = [rows_of(role, team, *step[:2]) for step in itertools.islice(played, -(-steps // per_step))]
+    observation, action = (np.concatenate(part)[:steps].astype(np.float32) for part in zip(*found, strict=True))
+    for array in (observation, action):
         array.setflags(write=False)
-    return recorded
+    return observation, action

@@ -5,13 +5,13 @@ A family of environments is one module that makes a `JaxEnv` or a `HostEnv` of a
 """
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Bool, Float
 
-Numbers = Array | np.ndarray
-"""Arrays of JAX in compiled code, of NumPy on the host."""
+Numbers = Any
+"""Arrays of JAX in compiled code, of NumPy on the host. (What steps on the host need not wait for JAX to be imported.)"""
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class EnvSpec:
     """Whether an agent may leave before the episode ends."""
     masks_actions: bool = False
     """Whether an action may be unavailable at a step."""
+    in_jax: bool = False
+    """Whether it is made of pure functions, so that many copies cost little."""
     measures: tuple[str, ...] = ()
     """Names of what is reported of an episode's last step beside the return."""
 
@@ -85,23 +87,58 @@ class Timestep(NamedTuple):
     """By the names of `EnvSpec.measures`; they count at the last step."""
 
 
+def team_mean(
+    values: Float[Numbers, "*batch agents"], alive: Bool[Numbers, "*batch agents"], team: Team
+) -> Float[Numbers, "*batch"]:
+    """The mean over a team's agents that are alive; 0 where none is.
+
+    This is the one place that says what a team earns by a step. Its return R is the sum of that over the episode.
+    """
+    values, alive = values[..., team.agents], alive[..., team.agents]
+    return (values * alive).sum(axis=-1) / array_module(values).maximum(alive.sum(axis=-1), 1)
+
+
+def in_units(action: Float[Numbers, "*batch agents action"], spec: EnvSpec) -> Float[Numbers, "*batch agents action"]:
+    """From [-1, 1] (beyond it is the bound) to the environment's units; a row with a single 1 where the largest number is."""
+    numpy = array_module(action)
+    if spec.discrete:
+        return numpy.eye(spec.action_size, dtype=np.float32)[numpy.argmax(action, axis=-1)]
+    scaled = spec.low + (numpy.clip(action, -1, 1) + 1) / 2 * (spec.high - spec.low)
+    return numpy.clip(scaled, spec.low, spec.high)  # rounding may have led beyond the bounds
+
+
+def array_module(array: Any) -> Any:
+    """NumPy for arrays of NumPy, `jax.numpy` for others."""
+    if isinstance(array, np.ndarray):
+        return np
+    import jax.numpy
+
+    return jax.numpy
+
+
 State = TypeVar("State")
 
 
+@runtime_checkable
 class JaxEnv(Protocol[State]):
     """An environment of pure functions, which may be compiled and mapped over keys, states and actions."""
 
     spec: EnvSpec
 
-    def reset(self, key: PRNGKeyArray) -> tuple[State, Timestep]:
+    def reset(self, key: Any) -> tuple[State, Timestep]:
         """A first state."""
         ...
 
-    def step(self, state: State, action: Float[Array, "agents action"], key: PRNGKeyArray) -> tuple[State, Timestep]:
+    def step(self, state: State, action: Float[Numbers, "agents action"], key: Any) -> tuple[State, Timestep]:
         """One step. Continuous actions are in the environment's units; choices are rows with a single 1."""
         ...
 
+    def frames(self, states: State, credit: Float[np.ndarray, "steps agents"] | None = None) -> list[np.ndarray]:
+        """An episode's states (leading axis: steps) as pictures (height, width, 3); with everybody's credit, if it is given."""
+        ...
 
+
+@runtime_checkable
 class HostEnv(Protocol):
     """An environment that steps in Python. What it raises is a `LareError` of one line."""
 

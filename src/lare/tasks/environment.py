@@ -1,5 +1,7 @@
 """Gymnasium environments, made so that what goes wrong is said in one line."""
 
+import contextlib
+import functools
 import logging
 import os
 import warnings
@@ -9,11 +11,17 @@ import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
 from lare.errors import LareError, shortened
-from lare.tasks import mujoco, particles
+from lare.tasks import mujoco
 from lare.tasks.spaces import as_rows
 
 mujoco.register()
-particles.register()
+
+
+class EnvironmentFault(LareError):
+    """An environment gave something that cannot be trained on."""
+
+    place: int | None = None
+    """Of the environment, where there are several side by side."""
 
 
 class Guarded(gymnasium.Wrapper, RecordConstructorArgs):
@@ -77,3 +85,17 @@ def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) 
             if isinstance(error, ModuleNotFoundError):
                 hint = " (a module in this folder is found with PYTHONPATH=.)"
             raise fault(f"environment {environment!r} cannot be made", error, hint) from error
+
+
+@functools.cache
+def limit_of(environment: str) -> int | None:
+    """The time limit that an environment has of itself. Made once: a run asks more than once."""
+    with contextlib.closing(make(environment)) as made:
+        return made.spec and made.spec.max_episode_steps
+
+
+def measured(info: dict, name: str) -> float:
+    """What the last step's `info` says of a measure of the task. Raises `LareError` where it says nothing."""
+    if name not in info:
+        raise LareError(f"the task measures {name!r}, but the last step's info has only {', '.join(sorted(info))}")
+    return number(info[name], f"the task measures {name!r}, and the last step's info has")

@@ -1,15 +1,16 @@
-"""A first spec of any Gymnasium environment: sizes from its spaces, texts from its documentation, rewards left out."""
+"""A first spec of any environment: sizes from its spaces, texts from its documentation, rewards left out."""
 
 import inspect
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import gymnasium
 
 from lare.errors import LareError
 from lare.tasks.environment import make
-from lare.tasks.spaces import Choice
-from lare.tasks.spec import FILL_IN
+from lare.tasks.spaces import OneHot
+from lare.tasks.spec import FILL_IN, PETTINGZOO
 
 HEADING = re.compile(r"^[ \t]*#+\s*(.+?)\s*$", re.MULTILINE)
 
@@ -32,15 +33,26 @@ ELSEWHERE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.I
 """What says nothing without a page around it."""
 
 
+WANTED = {
+    "description": "what is to be solved, and what the goal is; not a word about the reward",
+    "observation": "what each entry of the observation means, with its unit",
+    "action": "what each entry of the action means, with its unit",
+}
+
+
 @dataclass(frozen=True)
 class Draft:
     """A spec to be read by a person before it is used."""
 
+    name: str
+    """Of the task; a good one for the file too."""
     toml: str
     missing: tuple[str, ...]
     """Keys that have to be filled in."""
     left_out: int
     """Sentences and rows that spoke of rewards."""
+    teams: dict[str, str] = field(default_factory=dict)
+    """Specs of teams, by the names of the files that the spec says they are in."""
 
 
 def draft(environment_id: str) -> Draft:
@@ -49,6 +61,10 @@ def draft(environment_id: str) -> Draft:
     Raises:
         LareError: it cannot be made, or its spaces are not numbers.
     """
+    if environment_id.startswith(PETTINGZOO):
+        from lare.tasks.new_agents import draft_of_agents
+
+        return draft_of_agents(environment_id)
     environment = make(environment_id)
     try:
         for what, space in (("observation", environment.observation_space), ("action", environment.action_space)):
@@ -78,40 +94,51 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
         "observation": f"{entries(observation_size)}{flattened(raw.observation_space)}.",
         "action": f"{entries(action_size)}{chosen(environment.action_space)}{bounds(environment.action_space)}.",
     }
-    wanted = {
-        "description": "what is to be solved, and what the goal is; not a word about the reward",
-        "observation": "what each entry of the observation means, with its unit",
-        "action": "what each entry of the action means, with its unit",
-    }
     missing = tuple(key for key in texts if not texts[key])
-    bodies = {
-        key: "\n".join(part for part in (heads.get(key), text or f"{FILL_IN}: {wanted[key]}") if part)
-        for key, text in texts.items()
-    }
     # An id without a version means the latest one, which may be another one tomorrow.
     module, colon, _ = environment_id.rpartition(":")
     full_id = f"{module}{colon}{environment.spec.id}" if environment.spec else environment_id
     name = re.sub(r"[^\w.\-]+", "-", environment_id.rpartition(":")[2])
     limit = environment.spec.max_episode_steps if environment.spec else None
     lines = [
-        "# A first draft, from the documentation of the environment. Read it before you use it: a language model will",
-        "# know nothing but these texts. Whatever spoke of rewards was left out on purpose, so that the reward does not",
-        f"# leak into the request ({left_out} sentences or rows); say what the goal is, not how it is paid.",
+        *warning(left_out),
         f'name = "{name}"',
         f'environment = "{full_id}"',
         f"observation_size = {observation_size}",
         f"action_size = {action_size}",
         'judges = "after"',
         *([] if limit else ["max_episode_steps = 1000 # the environment has no limit of its own"]),
-        *(f"\n{key} = {quoted(body)}" for key, body in bodies.items()),
+        *bodies(texts, heads),
     ]
-    return Draft("\n".join(lines) + "\n", missing, left_out)
+    return Draft(name, "\n".join(lines) + "\n", missing, left_out)
+
+
+def warning(left_out: int) -> list[str]:
+    return [
+        "# A first draft, from the documentation of the environment. Read it before you use it: a language model will",
+        "# know nothing but these texts. Whatever spoke of rewards was left out on purpose, so that the reward does not",
+        f"# leak into the request ({left_out} sentences or rows); say what the goal is, not how it is paid.",
+    ]
+
+
+def bodies(texts: Mapping[str, str], heads: Mapping[str, str]) -> list[str]:
+    """The texts of a spec, what is missing marked."""
+    return [
+        f"\n{key} = "
+        + quoted("\n".join(part for part in (heads.get(key), text or f"{FILL_IN}: {WANTED[key]}") if part))
+        for key, text in texts.items()
+    ]
 
 
 def documented(environment: gymnasium.Env) -> dict[str, str]:
-    """The sections of an environment's documentation, by their headings in small letters; "" is what comes first."""
+    """The sections of an environment's documentation."""
     # Not inspect.getdoc: that of a base class says nothing about this environment.
-    text = FIGURE.sub("", inspect.cleandoc(type(environment).__doc__ or ""))
+    return sections_of(type(environment).__doc__ or "")
+
+
+def sections_of(documentation: str) -> dict[str, str]:
+    """The sections of a text, by their headings in small letters; "" is what comes first."""
+    text = FIGURE.sub("", inspect.cleandoc(documentation))
     parts = HEADING.split(text)
     sections = {"": parts[0]}
     for title, body in zip(parts[1::2], parts[2::2], strict=True):
@@ -191,11 +218,11 @@ def flattened(space: gymnasium.Space) -> str:
 
 
 def chosen(space: gymnasium.Space) -> str:
-    return ", all 0 but one: the action that is taken" if isinstance(space, Choice) else ""
+    return ", all 0 but one: the action that is taken" if isinstance(space, OneHot) else ""
 
 
 def bounds(space: gymnasium.Space) -> str:
-    if isinstance(space, Choice) or not isinstance(space, gymnasium.spaces.Box):
+    if isinstance(space, OneHot) or not isinstance(space, gymnasium.spaces.Box):
         return ""
     low, high = set(map(float, space.low)), set(map(float, space.high))
     each = "each " if space.shape != (1,) else ""

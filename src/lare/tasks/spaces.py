@@ -10,7 +10,7 @@ from gymnasium.wrappers import FlattenObservation
 from jaxtyping import Float
 
 
-class Choice(Box):
+class OneHot(Box):
     """One of n actions, as a row with a single 1. Other rows stand for the action at their largest number."""
 
     def __init__(self, n: int, start: int = 0, seed: int | np.random.Generator | None = None):
@@ -30,14 +30,14 @@ class Choice(Box):
         return self.start + int(np.argmax(row))
 
 
-class ChoiceAction(gymnasium.ActionWrapper, RecordConstructorArgs):
+class OneHotAction(gymnasium.ActionWrapper, RecordConstructorArgs):
     """Lets an environment of discrete actions take rows."""
 
     def __init__(self, env: gymnasium.Env):
         RecordConstructorArgs.__init__(self)  # without which Gymnasium could not make the same environment again
         super().__init__(env)
         assert isinstance(env.action_space, Discrete)
-        self.choice = Choice(int(env.action_space.n), int(env.action_space.start))
+        self.choice = OneHot(int(env.action_space.n), int(env.action_space.start))
         self.action_space = self.choice
 
     def action(self, action: Float[np.ndarray, " n"]) -> int:
@@ -47,7 +47,7 @@ class ChoiceAction(gymnasium.ActionWrapper, RecordConstructorArgs):
 def as_rows(environment: gymnasium.Env) -> gymnasium.Env:
     """The environment with observations and actions that are rows of numbers, where they can be."""
     if isinstance(environment.action_space, Discrete):
-        environment = ChoiceAction(environment)
+        environment = OneHotAction(environment)
     observations = environment.observation_space
     if observations.is_np_flattenable and not (isinstance(observations, Box) and len(observations.shape) == 1):
         environment = FlattenObservation(environment)

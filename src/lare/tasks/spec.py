@@ -1,21 +1,14 @@
 """A task: an environment and the texts that describe it, read from TOML and checked against the environment."""
 
-import contextlib
-import functools
 import hashlib
 import tomllib
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import gymnasium
-from gymnasium.spaces import Box
 from pydantic import ConfigDict, Field, model_validator
 
 from lare.errors import Checked, LareError, did_you_mean
-from lare.tasks.environment import make
-from lare.tasks.particles import NAMES, NAMESPACE, TEAMS
-from lare.tasks.spaces import Choice
 
 Judges = Literal["before", "after", "both"]
 """Which observation `phi` judges a step by: that before the action, that which the action led to, or both, one after
@@ -25,6 +18,12 @@ JudgedFrom = Literal["observation", "state"]
 """What a step is judged by: each agent's own observation and action, or the global state and all actions side by side."""
 
 SHIPPED = files("lare.tasks") / "specs"
+
+PETTINGZOO = "pettingzoo/"
+"""What the environment of a spec begins with where it is a PettingZoo environment; the rest is MODULE:NAME."""
+
+OF_THE_ENVIRONMENT = ("environment", "arguments", "max_episode_steps", "judged_from", "judges")
+"""Keys that a team has from its task, unless its own spec says something else."""
 
 FILL_IN = "FILL IN"
 """Stands in a new spec where nobody has said something yet."""
@@ -38,7 +37,8 @@ class TaskSpec(Checked):
     name: Annotated[str, Field(min_length=1, pattern=r"^[\w.\-]+$")]
     """What the task is called, in commands and in the names of runs."""
     environment: Annotated[str, Field(min_length=1)]
-    """Gymnasium id; `module:id` imports the module that registers it first."""
+    """Gymnasium id, where `module:id` imports the module that registers it first; or the name of another family's environment,
+    as `particles/CN-6`."""
     observation_size: Annotated[int, Field(ge=1)]
     action_size: Annotated[int, Field(ge=1)]
     judges: Judges = "after"
@@ -60,6 +60,8 @@ class TaskSpec(Checked):
     """Whether `phi` judges each agent's step by what the agent observes, or the whole team's by the global state."""
     teams: tuple["TaskSpec", ...] = ()
     """Where several teams learn, each for itself: a spec for each, with texts of its own. In TOML, their names."""
+    team: str | None = None
+    """The team that this spec speaks of, where it is one of several of its environment."""
 
     @model_validator(mode="after")
     def is_filled_in(self) -> "TaskSpec":
@@ -69,37 +71,28 @@ class TaskSpec(Checked):
         return self
 
     @model_validator(mode="after")
-    def has_the_teams_of_its_environment(self) -> "TaskSpec":
-        wanted = [f"{self.environment}-{team}" for team in TEAMS.get(self.particles or "", ())]
-        if [role.environment for role in self.teams] != wanted:
-            specs = f"the specs of {', '.join(wanted)}, in this order" if wanted else "left out"
-            raise ValueError(f"the teams of {self.environment} must be {specs}")
-        for key in ("max_episode_steps", "measures") if self.particles else ():
-            if getattr(self, key):
-                raise ValueError(f"{key} makes no difference to a particle task: leave it out")
+    def has_teams_of_its_environment(self) -> "TaskSpec":
+        for role in self.teams:
+            if role.environment != self.environment or role.team is None:
+                raise ValueError(
+                    f"{role.name} is no team of {self.environment}: it needs the same environment, and a team"
+                )
         return self
 
     @property
-    def particles(self) -> str | None:
-        """Which particle task this is (`particles/table.py`), for those that many agents learn together."""
-        name = self.environment.removeprefix(NAMESPACE)
-        return name if name != self.environment and name in NAMES else None
+    def family(self) -> str:
+        """What stands before the first slash of the environment: see `table.py`."""
+        return self.environment.partition("/")[0] if "/" in self.environment else ""
 
     @property
-    def whole(self) -> str | None:
-        """The task that this is one team of."""
-        name = self.environment.removeprefix(NAMESPACE)
-        named = [task for task, teams in TEAMS.items() if name in [f"{task}-{team}" for team in teams]]
-        return named[0] if named and name != self.environment else None
+    def environment_name(self) -> str:
+        """What stands behind it."""
+        return self.environment.partition("/")[2]
 
     @property
     def roles(self) -> tuple["TaskSpec", ...]:
         """The specs that latent functions are designed for: those of the teams, or this one."""
         return self.teams or (self,)
-
-    def team(self, role: "TaskSpec") -> str:
-        """What a team is called within the task."""
-        return role.environment.removeprefix(f"{self.environment}-")
 
     @property
     def digest(self) -> str:
@@ -165,7 +158,8 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     if not (teams is None or (isinstance(teams, list) and all(map(other, teams)))):
         raise LareError(f"task {task!r}: teams = {teams!r} must be a list of other tasks, without a circle")
     if "teams" in values:
-        values["teams"] = [read_values(beside(task, team), (*seen, task)) for team in values["teams"]]
+        shared = {key: values[key] for key in OF_THE_ENVIRONMENT if key in values}
+        values["teams"] = [shared | read_values(beside(task, team), (*seen, task)) for team in values["teams"]]
     parent = values.pop("like", None)
     return values if parent is None else read_values(beside(task, parent), (*seen, task)) | values
 
@@ -203,51 +197,6 @@ def the_role(spec: TaskSpec) -> TaskSpec:
 
 def check_against_environment(spec: TaskSpec) -> None:
     """Make the environment once and compare. Raises `LareError` at the first thing that does not fit."""
-    environment = make(spec.environment, spec.max_episode_steps)
-    try:
-        check_spaces(spec, environment)
-    finally:
-        environment.close()
-    time_limit(spec)
+    from lare.tasks.table import env_spec  # which knows all families, as this file need not
 
-
-def check_spaces(spec: TaskSpec, environment: gymnasium.Env) -> None:
-    for key, space in (("observation", environment.observation_space), ("action", environment.action_space)):
-        if not isinstance(space, Box) or len(space.shape) != 1:
-            raise LareError(
-                f"task {spec.name!r}: the {key} space of {spec.environment} is {space}, not a Box of one axis"
-            )
-        size = getattr(spec, f"{key}_size")
-        if size != space.shape[0]:
-            raise LareError(
-                f"task {spec.name!r}: {key}_size = {size}, but {spec.environment} has {key}s of size {space.shape[0]}"
-            )
-    action = environment.action_space
-    assert isinstance(action, Box)
-    if not action.is_bounded():
-        raise LareError(f"task {spec.name!r}: the actions of {spec.environment} have no bounds: {action}")
-
-
-def is_discrete(spec: TaskSpec) -> bool:
-    """Whether the actions are a choice among `action_size`."""
-    environment = make(spec.environment, spec.max_episode_steps)
-    environment.close()
-    return isinstance(environment.action_space, Choice)
-
-
-def time_limit(spec: TaskSpec) -> int:
-    """The most steps that an episode can have. Raises `LareError` where neither spec nor environment sets a limit."""
-    limit = spec.max_episode_steps or limit_of(spec.environment)
-    if limit is None:
-        raise LareError(
-            f"task {spec.name!r}: {spec.environment} has no time limit, so an episode may never pay; "
-            "set max_episode_steps in the spec"
-        )
-    return limit
-
-
-@functools.cache
-def limit_of(environment: str) -> int | None:
-    """The time limit that an environment has of itself. Made once: a run asks more than once."""
-    with contextlib.closing(make(environment)) as made:
-        return made.spec and made.spec.max_episode_steps
+    env_spec(spec)

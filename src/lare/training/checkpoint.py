@@ -12,7 +12,7 @@ import contextlib
 import json
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -25,13 +25,16 @@ from lare.files import write_atomically
 
 STATE = "state.npz"
 
+BY_ROW = ".replay.columns"
+"""The part of the state that is saved by row."""
+
 DAMAGED = (OSError, ValueError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """What reading a file that is not whole may raise."""
 
 
 @runtime_checkable
 class WithReplay(Protocol):
-    """Any training state with a replay: arrays with a seed axis first and, if they are saved by row, rows behind it.
+    """Any training state with a replay: `replay.columns` are arrays of [seeds envs rows ...], which are saved by row.
 
     `replay.next_row` is the number of rows ever written; they stand at their number modulo the capacity.
     """
@@ -52,36 +55,35 @@ def opened(path: Path) -> Iterator[Any]:
         yield saved
 
 
-def named_leaves(learner: Any, by_row: Sequence[str]) -> dict[str, Any]:
+def named_leaves(learner: Any) -> dict[str, Any]:
     """Every array of the state by its place, but for those that are saved by row."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(learner)
     named = {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
-    return {name: leaf for name, leaf in named.items() if name not in {f".replay.{field}" for field in by_row}}
+    return {name: leaf for name, leaf in named.items() if not name.startswith(BY_ROW)}
 
 
 @jax.jit
 def take(buffer: jax.Array, index: jax.Array) -> jax.Array:
-    return jax.vmap(lambda rows, where: rows[where])(buffer, index)
+    """Rows of every environment of every seed."""
+    return jax.vmap(jax.vmap(lambda rows, where: rows[where]))(buffer, index)
 
 
 def save(
     directory: Path,
     learner: WithReplay,
-    by_row: Sequence[str],
     host: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
 ) -> None:
     """Write a checkpoint.
 
     Args:
-        by_row: the fields of the replay whose rows are written as they come.
         host: what else is to be remembered, as JSON.
         arrays: the same, as arrays.
     """
     directory.mkdir(exist_ok=True)
     for left in directory.glob("*.new"):  # by a process that was killed while it wrote
         left.unlink(missing_ok=True)
-    held, rows = learner.replay, learner.replay.reward.shape[1]
+    held, rows = learner.replay, capacity(learner)
     end = np.asarray(held.next_row)
     start, segments = np.zeros_like(end), []
     if (directory / STATE).exists():
@@ -92,13 +94,13 @@ def save(
     start = np.minimum(start, end)
     count = end - start + 1
     width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations
-    index = jnp.asarray((start[:, None] + np.arange(width)) % rows)
-    segment = {field: np.asarray(take(getattr(held, field), index))[:, : count.max()] for field in by_row}
+    index = jnp.asarray((start[..., None] + np.arange(width)) % rows)
+    segment = {name: np.asarray(take(column, index))[:, :, : count.max()] for name, column in held.columns.items()}
     number = segments[-1]["number"] + 1 if segments else 0
     write_atomically(directory / f"rows-{number}.npz", lambda file: np.savez(file, allow_pickle=False, **segment))
     segments.append({"number": number, "start": start.tolist(), "count": count.tolist()})
-    alive = [one for one in segments if any(np.add(one["start"], one["count"]) > end - rows)]
-    state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner, by_row).items()} | dict(arrays)
+    alive = [one for one in segments if np.any(np.add(one["start"], one["count"]) > end - rows)]
+    state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner).items()} | dict(arrays)
     state |= {"host": np.array(json.dumps(host)), "segments": np.array(json.dumps(alive))}
     write_atomically(directory / STATE, lambda file: np.savez(file, allow_pickle=False, **state))
     for one in segments:
@@ -106,7 +108,12 @@ def save(
             (directory / f"rows-{one['number']}.npz").unlink(missing_ok=True)
 
 
-def load(directory: Path, template: Some, by_row: Sequence[str]) -> tuple[Some, dict[str, Any], dict[str, np.ndarray]]:
+def capacity(learner: WithReplay) -> int:
+    """Rows of each environment."""
+    return next(iter(learner.replay.columns.values())).shape[2]
+
+
+def load(directory: Path, template: Some) -> tuple[Some, dict[str, Any], dict[str, np.ndarray]]:
     """Read a checkpoint into a learner of the structure of `template` (whose leaves may be only shapes).
 
     Returns it, and `host` and `arrays` as saved.
@@ -121,7 +128,7 @@ def load(directory: Path, template: Some, by_row: Sequence[str]) -> tuple[Some, 
         with opened(path) as saved:
             state = {name: saved[name] for name in saved.files}
         host, segments = json.loads(str(state.pop("host"))), json.loads(str(state.pop("segments")))
-        learner = with_rows(fill(template, state, by_row), by_row, directory, segments)
+        learner = with_rows(fill(template, state), directory, segments)
     except DAMAGED as error:
         raise LareError(f"the checkpoint {path} cannot be read: {error}") from error
     return learner, host, {name: array for name, array in state.items() if not name.startswith(".")}
@@ -136,8 +143,8 @@ def saved_step(directory: Path) -> int | None:
         return None
 
 
-def fill(template: Some, state: Mapping[str, np.ndarray], by_row: Sequence[str]) -> Some:
-    known = named_leaves(template, by_row)
+def fill(template: Some, state: Mapping[str, np.ndarray]) -> Some:
+    known = named_leaves(template)
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     filled = []
     for path, leaf in leaves:
@@ -148,16 +155,18 @@ def fill(template: Some, state: Mapping[str, np.ndarray], by_row: Sequence[str])
     return jax.tree.unflatten(structure, filled)
 
 
-def with_rows(learner: Some, by_row: Sequence[str], directory: Path, segments: list[dict[str, Any]]) -> Some:
-    held, rows = learner.replay, learner.replay.reward.shape[1]
-    for field in by_row:  # one after the other, so that only one of them is in memory twice
-        buffer = np.zeros(getattr(held, field).shape, getattr(held, field).dtype)
+def with_rows(learner: Some, directory: Path, segments: list[dict[str, Any]]) -> Some:
+    rows, columns = capacity(learner), dict(learner.replay.columns)
+    for name, column in columns.items():  # one after the other, so that only one of them is in memory twice
+        buffer = np.zeros(column.shape, column.dtype)
         for segment in segments:
             with opened(directory / f"rows-{segment['number']}.npz") as saved:
-                values = saved[field]
-            for seed, (start, count) in enumerate(zip(segment["start"], segment["count"], strict=True)):
+                values = saved[name]
+            counts = np.asarray(segment["count"])
+            for place in np.ndindex(counts.shape):
                 # Of a stretch longer than the buffer only the end is left, as it was when it was written.
-                where = np.arange(start, start + count)[-rows:]
-                buffer[seed, where % rows] = values[seed, :count][-rows:]
-        held = held._replace(**{field: jnp.asarray(buffer)})
-    return learner._replace(replay=held)
+                first, count = int(np.asarray(segment["start"])[place]), int(counts[place])
+                where = np.arange(first, first + count)[-rows:]
+                buffer[(*place, where % rows)] = values[place][:count][-rows:]
+        columns[name] = jnp.asarray(buffer)
+    return learner._replace(replay=learner.replay._replace(columns=columns))

@@ -1,201 +1,333 @@
-"""The training state of a single agent's run: what is stored, what the decoder is fitted to, what the algorithm is paid.
+"""The training state: what is stored, what the decoders are fitted to, what the algorithm is paid.
 
-For a single agent this is the one place where credit and algorithm meet (for many it is `teams.py`): `credit` does not know
-what its rewards are for, the algorithm not where they come from. What differs between algorithms, when to update and how
-to act, is in `off_policy.py` and `on_policy.py`.
+This is the one place where credit and algorithm meet: `credit` does not know what its rewards are for, the algorithm not
+where they come from. A team is agents that share a return, and each team has a decoder of its own. How the algorithms update
+stands in `off_policy.py`, `on_policy.py` and `sequences.py`, by what they consume.
 
-Functions are written for one seed; sessions give them their leading seed axis.
+Functions are written for one seed; `compiled.py` gives them their leading seed axis.
 """
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from lare.algorithms import ppo, sac, td3
 from lare.credit import accuracy, decomposition
 from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import Decomposition, Episodes
-from lare.credit.methods import Encoder, Method, Reward
-from lare.normalise import Moments, Scale, magnitude, no_moments, no_scale, observe_scale, within_range
-from lare.training import replay
-from lare.training.credit_draws import CreditDraws, draw_credit
-from lare.training.recipe import Recipe
-from lare.training.replay import Draw, Replay, Step
+from lare.credit.methods import Encoder, Fit, Reward
+from lare.data import replay
+from lare.data.replay import Draw, Replay
+from lare.data.sampling import CreditDraw, draw_packed, draw_padded, draw_parts
+from lare.data.trajectory import Trajectory
+from lare.normalise import Scale, magnitude, new_scale, observe_scale, within_range
+from lare.tasks.env import team_mean
+from lare.training.config import TrainConfig
+
+PART = 2400
+"""Rows of features, about, over which one part of a decoder's gradient is computed. More fall out of the cache, fewer keep
+the matrix products waiting; on one core 256 episodes of six agents at once took 1.5 times as long."""
 
 
 class Learner(NamedTuple):
     """The whole training state of one seed."""
 
-    algorithm: td3.TD3 | sac.SAC | ppo.PPO
-    credit: Decomposition | None
-    scale: Scale
-    observations: Moments | None
-    """What an on-policy algorithm's observations are normalised by."""
+    algorithm: Any
+    """What the algorithm learns."""
+    credit: tuple[Decomposition, ...]
+    """One for each team; none for a method that fits nothing."""
+    scale: tuple[Scale, ...]
+    """Of each team's R/T."""
     replay: Replay
 
 
-def init(key: PRNGKeyArray, recipe: Recipe) -> Learner:
-    algorithm_key, credit_key = jax.random.split(key)
-    sizes = recipe.observation_size, recipe.action_size
-    observations = None
-    match recipe.algorithm:
-        case ppo.PPOSettings():
-            algorithm = ppo.init(algorithm_key, *sizes, recipe.discrete, recipe.algorithm)
-            observations = no_moments(recipe.observation_size)
-        case sac.SACSettings():
-            algorithm = sac.init(algorithm_key, *sizes, recipe.algorithm)
-        case td3.TD3Settings():
-            algorithm = td3.init(algorithm_key, *sizes, recipe.algorithm)
-    return Learner(
-        algorithm,
-        None
-        if recipe.method.reward is not Reward.PROXY
-        else decomposition.init(
-            credit_key, recipe.features, recipe.method, recipe.credit, steps=recipe.longest_episode, agents=1
-        ),
-        no_scale(),
-        observations,
-        replay.empty(recipe.capacity, recipe.observation_size, recipe.action_size, recipe.factors),
+class Paid(NamedTuple):
+    """What rewards are computed by."""
+
+    credit: tuple[Decomposition, ...]
+    scale: tuple[Scale, ...]
+
+
+def init_credit(keys: Sequence[PRNGKeyArray], config: TrainConfig) -> tuple[Decomposition, ...]:
+    """Untrained decoders, one for each team."""
+    if config.method.reward is not Reward.PROXY:
+        return ()
+    env = config.env
+    return tuple(
+        decomposition.init(
+            key,
+            size,
+            config.method,
+            config.credit,
+            steps=env.max_steps,
+            agents=1 if config.of_state else team.size,
+            envs=config.environments,
+        )
+        for key, size, team in zip(keys, config.features, env.teams, strict=True)
     )
 
 
-def features(steps: Step | Draw, method: Method) -> Float[Array, "batch features"]:
-    """What the method's decoder sees of some steps."""
-    if method.latent:
-        return jnp.asarray(steps.factors)
+def init(key: PRNGKeyArray, config: TrainConfig, algorithm: Any) -> Learner:
+    """An untrained learner. `algorithm` makes the algorithm's part from a key."""
+    teams = len(config.env.teams)
+    algorithm_key, *keys = jax.random.split(key, 1 + teams)
+    return Learner(
+        algorithm(algorithm_key),
+        init_credit(keys, config),
+        tuple(new_scale() for _ in config.env.teams),
+        replay.empty(config.columns, config.environments, config.capacity, teams),
+    )
+
+
+def features(steps: Draw, config: TrainConfig, place: int) -> Float[Array, "*batch rows features"]:
+    """What a team's decoder sees of some steps."""
+    before, after, rows = steps.before, steps.after, config.judged(place)
+    if config.method.latent:
+        return before["factors"][..., rows, : config.factors[place]]
     # A Gaussian may choose beyond the bounds; what happened is that the bound was taken.
-    rows = [steps.observation, jnp.clip(steps.action, -1, 1)]
-    if method.encoder is Encoder.RAW:
-        rows.append(steps.observation - steps.next_observation)
-    return jnp.concatenate(rows, axis=-1)
+    if config.of_state:
+        found = [after["state"] if config.method.encoder is Encoder.RAW else before["state"]]
+        if config.method.encoder is Encoder.STATE_ACTION:
+            action = jnp.clip(before["action"], -1, 1)
+            found.append(action.reshape(*action.shape[:-2], -1))
+        return jnp.concatenate(found, axis=-1)[..., None, :]
+    shown, led_to = (part["observation"][..., rows, :] for part in (before, after))
+    if config.method.encoder is Encoder.RAW and not config.raw_differences:
+        return led_to
+    found = [shown, jnp.clip(before["action"][..., rows, :], -1, 1)]
+    return jnp.concatenate([*found, shown - led_to] if config.raw_differences else found, axis=-1)
 
 
-def store(learner: Learner, steps: Step, recipe: Recipe) -> Learner:
+def alive(steps: Draw, config: TrainConfig) -> Bool[Array, "*batch agents"]:
+    """Which agents acted."""
+    if "alive" in steps.before:
+        return steps.before["alive"]
+    return jnp.ones((*steps.finished.shape, config.env.agents), bool)
+
+
+def alive_rows(steps: Draw, config: TrainConfig, place: int) -> Bool[Array, "*batch rows"] | None:
+    """Which of a team's judged rows count; None where all always do."""
+    if "alive" not in steps.before or config.of_state:
+        return None
+    return steps.before["alive"][..., config.judged(place)]
+
+
+def store(
+    learner: Learner, steps: Trajectory, factors: Float[Array, "time envs rows factors"], config: TrainConfig
+) -> Learner:
     """Put new steps into the replay and into the running statistics."""
-    before = learner.replay.episodes
-    held = replay.extend(learner.replay, steps)
-    episode = before + jnp.arange(len(steps.reward))
-    finished = episode < held.episodes
-    first = held.first[episode % len(held.first)]
-    length = jnp.where(finished, replay.end_of(held, episode) - first, 1)
-    mean_reward = held.episode_return[episode % len(held.first)] / length
-    credit = learner.credit
-    if credit is not None:
-        seen = features(steps, recipe.method)
-        credit = decomposition.observe_steps(credit, seen)
-        credit = decomposition.observe_returns(credit, mean_reward, finished)
-        if recipe.method.fit is not None and recipe.method.fit.closed_form:
-            ended = jnp.asarray(steps.ended)
-            at_its_end = mean_reward[jnp.cumsum(ended) - 1]
-            way, settings = recipe.method.fit, recipe.credit
-            credit = decomposition.fit_in_closed_form(credit, seen, at_its_end, ended, way, settings)
-    return learner._replace(credit=credit, scale=observe_scale(learner.scale, mean_reward, finished), replay=held)
+    held = replay.extend(learner.replay, *rows_of(steps, factors, config), team_rewards(steps, config), steps.ended)
+    ended = jnp.asarray(steps.ended)
+    new = replay.read(held, replay.newest(held, len(ended)))
+    new = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), new)
+    scale = tuple(
+        observe_scale(one, new.mean_reward[..., place].ravel(), ended.ravel())
+        for place, one in enumerate(learner.scale)
+    )
+    credit = tuple(with_steps(one, new, ended, config, place) for place, one in enumerate(learner.credit))
+    return learner._replace(credit=credit, scale=scale, replay=held)
 
 
-def forget_episode(learner: Learner) -> Learner:
-    """Without the episode that is under way."""
-    credit = None if learner.credit is None else decomposition.forget_episode(learner.credit)
-    return learner._replace(credit=credit, replay=replay.drop_running(learner.replay))
+def rows_of(steps: Trajectory, factors: Array, config: TrainConfig) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The replay's columns of new steps, and what the steps led to."""
+    there = {
+        **{name: getattr(steps.before, name) for name in replay.SHOWN},
+        "action": steps.action,
+        "factors": factors,
+        "reward": steps.after.reward,
+        "terminated": steps.after.terminated,
+    }
+    columns = config.columns
+    before = {name: there[name] for name in columns}
+    return before, {name: getattr(steps.after, name) for name in replay.SHOWN if name in columns}
+
+
+def team_rewards(steps: Trajectory, config: TrainConfig) -> Float[Array, "time envs teams"]:
+    """What each team has earned by each step."""
+    of_each = (team_mean(steps.after.reward, steps.before.alive, team) for team in config.env.teams)
+    return jnp.stack(list(of_each), axis=-1)
+
+
+def with_steps(
+    credit: Decomposition, steps: Draw, ended: Bool[Array, "time envs"], config: TrainConfig, place: int
+) -> Decomposition:
+    """A team's decoder with new steps in its statistics; one in closed form is fitted to the episodes that have ended."""
+    rows, mask, mean_reward = (
+        features(steps, config, place),
+        alive_rows(steps, config, place),
+        steps.mean_reward[..., place],
+    )
+    credit = decomposition.observe_steps(credit, rows, mask)
+    credit = decomposition.observe_returns(credit, mean_reward.ravel(), ended.ravel())
+    fit = config.method.fit
+    if fit is not None and fit.closed_form:
+        mean_row = jnp.mean(rows, axis=-2) if mask is None else mean_of_rows(rows, mask)
+        credit = decomposition.fit_in_closed_form(credit, mean_row, mean_reward, ended, fit, config.credit)
+    return credit
+
+
+def mean_of_rows(
+    rows: Float[Array, "*batch rows features"], mask: Bool[Array, "*batch rows"]
+) -> Float[Array, "*batch features"]:
+    """The mean over the agents that are alive; 0 where none is."""
+    return jnp.einsum("...rf,...r->...f", rows, shares(mask))
+
+
+def shares(mask: Bool[Array, "*batch rows"]) -> Float[Array, "*batch rows"]:
+    """1/n for each of n agents that are alive, else 0."""
+    return mask / jnp.maximum(jnp.sum(mask, axis=-1, keepdims=True), 1)
+
+
+def forget_episodes(learner: Learner, dropped: Bool[Array, " envs"]) -> Learner:
+    """Without the episodes that are under way in some of the environments."""
+    credit = tuple(decomposition.forget_episodes(one, dropped) for one in learner.credit)
+    return learner._replace(credit=credit, replay=replay.drop_running(learner.replay, dropped))
+
+
+def draw_credit(held: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditDraw | None:
+    """Decide for some updates of the decoders which steps each of them reads; None for a method without such updates."""
+    fit, credit, longest = config.method.fit, config.credit, config.env.max_steps
+    if fit is None or not config.method.descends:
+        return None
+    if fit is Fit.SUBTRAJECTORIES:
+        return draw_padded(held, key, updates, credit.episodes, longest)
+    if fit is not Fit.ALL_STEPS:
+        drawn = min(credit.drawn_steps, longest)
+        return draw_parts(held, key, updates, parts_count(config), drawn)
+    if config.env.fixed_length:
+        return draw_padded(held, key, updates, parts_count(config), longest)
+    return draw_packed(held, key, updates, credit.steps, longest)
+
+
+def parts_count(config: TrainConfig) -> int:
+    """Episodes of an update: of so many steps, whole where all episodes are equally long, else as many as are drawn of each."""
+    longest = config.env.max_steps
+    return max(1, config.credit.steps // (longest if config.env.fixed_length else config.credit.drawn_steps))
 
 
 def fit(
-    credit: Decomposition, held: Replay, draws: CreditDraws, key: PRNGKeyArray, recipe: Recipe
+    credit: tuple[Decomposition, ...], held: Replay, draw: CreditDraw, key: PRNGKeyArray, config: TrainConfig
+) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
+    """One update of every team's decoder."""
+    assert config.method.fit is not None
+    steps, chosen = replay.read(held, draw.steps), draw.episodes
+    fitted, measured = [], []
+    for place, (one, own) in enumerate(zip(credit, jax.random.split(key, len(credit)), strict=True)):
+        mask = alive_rows(steps, config, place)
+        rows = features(steps, config, place)
+        batch = Episodes(
+            rows,
+            draw.episode,
+            chosen.length,
+            chosen.mean_reward[..., place],
+            chosen.mask,
+            None if mask is None else shares(mask),
+        )
+        new, metrics = update_decoder(one, batch, own, config)
+        fitted.append(new)
+        measured.append(metrics)
+    return tuple(fitted), by_team(measured, config)
+
+
+def update_decoder(
+    credit: Decomposition, batch: Episodes, key: PRNGKeyArray, config: TrainConfig
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """One update of the decoder."""
-    assert recipe.method.fit is not None
-    seen, chosen = features(replay.read(held, draws.steps), recipe.method), draws.episodes
-    episodes = Episodes(seen, draws.episode, chosen.length, chosen.mean_reward, chosen.counts)
-    return decomposition.update(credit, episodes, key, recipe.method.fit, recipe.credit)
+    """One gradient step; a large batch of equally long episodes part by part."""
+    assert config.method.fit is not None
+    rows, count = batch.features[..., 0].size, len(batch.length)
+    parts = 1
+    if config.env.fixed_length and rows > PART:
+        fitting = max(1, PART * count // rows)
+        parts = min(parts for parts in range(1, count + 1) if count % parts == 0 and count // parts <= fitting)
+    if parts == 1:
+        return decomposition.update(credit, batch, key, config.method.fit, config.credit)
+    # Every part counts its episodes from 0.
+    batch = batch._replace(episode=batch.episode % (count // parts))
+    batch = jax.tree.map(lambda whole: whole.reshape(parts, -1, *whole.shape[1:]), batch)
+    return decomposition.update_in_parts(credit, batch, key, config.method.fit, config.credit)
 
 
 def fit_often(
-    learner: Learner, key: PRNGKeyArray, updates: int, recipe: Recipe
-) -> tuple[Learner, dict[str, Float[Array, ""]]]:
-    """Some updates of the decoder, one behind the other; the mean of each metric over them."""
+    learner: Learner, key: PRNGKeyArray, config: TrainConfig
+) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
+    """`fit_updates` updates of the decoders, one behind the other; the mean of each metric over them."""
     draw_key, key = jax.random.split(key)
-    draws = draw_credit(learner.replay, draw_key, updates, recipe)
-    if learner.credit is None or draws is None:
-        return learner, {}
+    draws = draw_credit(learner.replay, draw_key, config.fit_updates, config)
+    if draws is None:
+        return learner.credit, {}
 
-    def one(credit: Decomposition, turn: tuple[CreditDraws, PRNGKeyArray]):
-        return fit(credit, learner.replay, *turn, recipe)
+    def one(credit: tuple[Decomposition, ...], update: tuple[CreditDraw, PRNGKeyArray]):
+        return fit(credit, learner.replay, *update, config)
 
-    credit, measured = jax.lax.scan(one, learner.credit, (draws, jax.random.split(key, updates)))
-    return learner._replace(credit=credit), jax.tree.map(jnp.mean, measured)
-
-
-def rewards(batch: Draw, learner: Learner, recipe: Recipe) -> Float[Array, " batch"]:
-    """What the algorithm is trained on."""
-    match recipe.method.reward:
-        case Reward.TRUE:
-            reward = batch.reward
-        case Reward.EPISODIC:
-            reward = batch.episodic_reward
-        case _:
-            reward = proxy_rewards(batch, learner, recipe)
-    return reward / magnitude(learner.scale) if recipe.scale_rewards else reward
+    credit, measured = jax.lax.scan(one, learner.credit, (draws, jax.random.split(key, config.fit_updates)))
+    return credit, jax.tree.map(jnp.mean, measured)
 
 
-def proxy_rewards(batch: Draw, learner: Learner, recipe: Recipe) -> Float[Array, " batch"]:
-    """r_hat of a method that has one, always by the decoder as it stands."""
-    if recipe.method.reward is Reward.DESIGNED:
-        return batch.factors[:, 0]
-    if recipe.method.reward is Reward.UNIFORM:
+def rewards(steps: Draw, paid: Paid, config: TrainConfig) -> Float[Array, "*batch agents"]:
+    """What the algorithm is trained on: of each agent, proxy rewards always by the decoders as they stand."""
+    acting, parts = alive(steps, config), []
+    for place, team in enumerate(config.env.teams):
+        shape = (*steps.finished.shape, team.size)
+        match config.method.reward:
+            case Reward.TRUE:
+                part = steps.before["reward"][..., team.agents]
+            case Reward.EPISODIC:
+                part = steps.episodic_reward[..., place, None]
+            case _:
+                part = proxy_rewards(steps, paid, config, place)
+        part = jnp.broadcast_to(part, shape)
+        if config.method.shared:
+            part = jnp.broadcast_to(team_share(part, acting[..., team.agents]), shape)
+        if "alive" in steps.before:
+            part = jnp.where(acting[..., team.agents], part, 0)
+        parts.append(part / magnitude(paid.scale[place]) if config.scale_rewards else part)
+    return jnp.concatenate(parts, axis=-1)
+
+
+def team_share(part: Float[Array, "*batch team"], acting: Bool[Array, "*batch team"]) -> Float[Array, "*batch 1"]:
+    """The mean over those of a team that act."""
+    return jnp.sum(part * shares(acting), axis=-1, keepdims=True)
+
+
+def proxy_rewards(steps: Draw, paid: Paid, config: TrainConfig, place: int) -> Float[Array, "*batch rows"]:
+    """r_hat of a team, for a method that has one: of each of its agents, or one for all."""
+    if config.method.reward is Reward.DESIGNED:
+        return steps.before["factors"][..., config.judged(place), 0]
+    if config.method.reward is Reward.UNIFORM:
         # What an episode under way is worth is not known yet.
-        return jnp.where(batch.finished, within_range(learner.scale, batch.mean_reward), 0.5)
-    assert learner.credit is not None
-    return decomposition.proxy_rewards(learner.credit, features(batch, recipe.method), recipe.credit)
+        share = within_range(paid.scale[place], steps.mean_reward[..., place])
+        return jnp.where(steps.finished, share, 0.5)[..., None]
+    rows = features(steps, config, place)
+    r_hat = decomposition.proxy_rewards(paid.credit[place], rows.reshape(-1, *rows.shape[-2:]), config.credit)
+    return r_hat.reshape(rows.shape[:-1])
 
 
-def assess(learner: Learner, steps: int, recipe: Recipe) -> dict[str, Float[Array, ""]]:
-    """How near the newest proxy rewards come to the true ones, over the last `steps` steps."""
-    if not recipe.method.has_proxy:
+def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]:
+    """How near the newest proxy rewards come to the true ones, over the last steps of every environment."""
+    if not config.method.has_proxy:
         return {}
-    held = learner.replay
-    number = held.transitions - 1 - jnp.arange(steps)
-    counts = number >= replay.oldest_transition(held)
-    recent = replay.read(held, jnp.where(counts, number, replay.oldest_transition(held)))
-    r_hat = proxy_rewards(recent, learner, recipe)
-    return accuracy.metrics(r_hat, recent.reward, counts, recipe.method.in_units)
+    held, found = learner.replay, []
+    # What looks at whole episodes is given no others: those of the newest iteration.
+    count = config.rollout_steps if config.env.fixed_length else max(1, RECENT // config.environments)
+    index = replay.newest(held, min(replay.capacity(held) - 1, count))
+    oldest = replay.oldest_transition(held)[:, None]
+    there = index.number >= oldest
+    recent = replay.read(held, index._replace(number=jnp.maximum(index.number, oldest)))
+    paid = Paid(learner.credit, learner.scale)
+    for place, team in enumerate(config.env.teams):
+        true, acting = recent.before["reward"], alive(recent, config)
+        if config.of_state:
+            true, mask = team_mean(true, acting, team)[..., None], there[..., None]
+        else:
+            true, mask = true[..., team.agents], there[..., None] & acting[..., team.agents]
+        r_hat = jnp.broadcast_to(proxy_rewards(recent, paid, config, place), true.shape)
+        found.append(accuracy.metrics(r_hat.ravel(), true.ravel(), mask.ravel(), config.method.in_units))
+    return by_team(found, config)
 
 
-class Compiled(NamedTuple):
-    """How an algorithm is trained. Every array has a leading seed axis, but for `done`."""
-
-    store: Callable[[Learner, Step], Learner]
-    improve: Callable[..., tuple[Learner, dict[str, Float[Array, " seeds"]]]]
-    """From learner, keys, and the environment steps done before; the mean of each metric over its updates."""
-    assess: Callable[[Learner], dict[str, Float[Array, " seeds"]]]
-    actor: Callable[[Learner], Any]
-    """What is needed to act."""
-    act: Callable[[Any, np.ndarray], Float[Array, "seeds *episodes action"]]
-    """The deterministic policy, from actor and observations."""
-    explore: Callable[[Any, np.ndarray, np.ndarray], Float[Array, "seeds action"]]
-    """The policy that collects, from actor, observations and noise."""
-    noise: Callable[[Sequence[np.random.Generator]], Float[np.ndarray, "time seeds action"]]
-    """For the steps of a turn, from a generator for each seed."""
-
-
-def compiled(
-    recipe: Recipe,
-    improve: Callable[..., Any],
-    actor: Callable[[Learner], Any],
-    act: Callable[..., Array],
-    explore: Callable[..., Array],
-    noise: Callable[..., np.ndarray],
-) -> Compiled:
-    """`store` and `improve` consume the learner that they are given: its memory holds the new one."""
-    return Compiled(
-        store=jax.jit(jax.vmap(partial(store, recipe=recipe)), donate_argnums=0),
-        improve=jax.jit(jax.vmap(partial(improve, recipe=recipe), in_axes=(0, 0, None)), donate_argnums=0),
-        assess=jax.jit(jax.vmap(partial(assess, steps=RECENT, recipe=recipe))),
-        actor=actor,
-        act=jax.jit(jax.vmap(act)),
-        explore=jax.jit(jax.vmap(explore)),
-        noise=partial(noise, recipe=recipe),
-    )
+def by_team(measured: list[dict[str, Array]], config: TrainConfig) -> dict[str, Array]:
+    """The metrics of all teams: those of the first and, where there are several, each team's under its own name too."""
+    teams = zip(config.env.teams, measured, strict=True) if len(measured) > 1 else ()
+    return measured[0] | {f"{name}_{team.name}": value for team, own in teams for name, value in own.items()}

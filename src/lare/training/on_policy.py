@@ -1,98 +1,116 @@
-"""The training step of PPO: fit the decoder on the replay, relabel the newest steps by it, update the policy on them.
+"""Algorithms that consume rollouts: relabel the newest steps by the decoder as it stands, update the policy on them.
 
-Algorithm 1 of the LaRe paper, lines 6 to 8, for an algorithm that learns from what its newest policy met. The decoder goes
-on learning from all that is stored.
-
-Observations reach the networks by their running mean and deviation; those of a rollout are taken in when it has been learned
-from, so that the policy that is updated is the policy that acted.
+Algorithm 1 of the LaRe paper, lines 6 to 8, for PPO and IPPO. The decoder has been fitted on all that is stored.
 """
 
-from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar, Shaped
 
 from lare.algorithms import ppo
-from lare.algorithms.ppo import Policy
-from lare.normalise import Moments, observe, standardise
+from lare.data import replay
+from lare.data.trajectory import Trajectory
 from lare.training import learner as common
-from lare.training import replay
-from lare.training.learner import Compiled, Learner, fit_often, rewards
-from lare.training.recipe import Recipe
-
-Actor = tuple[Policy, Moments]
-"""A policy, and what its observations are normalised by."""
+from lare.training.config import TrainConfig
+from lare.training.learner import Learner, Paid
 
 
-def actor_of(learner: Learner) -> Actor:
-    assert isinstance(learner.algorithm, ppo.PPO)
-    assert learner.observations is not None
-    return learner.algorithm.online.actor, learner.observations
+def settings_of(config: TrainConfig) -> ppo.PPOSettings:
+    """The algorithm's hyperparameters."""
+    assert isinstance(config.hyperparameters, ppo.PPOSettings)
+    return config.hyperparameters
 
 
-def seen(observation: Float[Array, "*batch observation"], moments: Moments) -> Float[Array, "*batch observation"]:
-    """Observations as the networks get them: as they are, as long as there are no statistics."""
-    return jnp.where(moments.seen > 0, standardise(moments, observation), observation)
+def init(key: PRNGKeyArray, config: TrainConfig) -> ppo.PPO:
+    """The untrained algorithm."""
+    env = config.env
+    return ppo.init(key, policy_input_size(config), env.action_size, env.discrete, settings_of(config))
 
 
-def newest(held: replay.Replay, recipe: Recipe) -> Int[Array, " time"]:
-    """Numbers of the steps of the last rollout."""
-    return held.transitions - recipe.turn + jnp.arange(recipe.turn)
+def policy_input_size(config: TrainConfig) -> int:
+    """Size of the rows that actor and critic see."""
+    return config.env.observation_size + (config.env.agents if len(config.env.teams) > 1 else 0)
 
 
-def rollout(learner: Learner, recipe: Recipe) -> ppo.Rollout:
-    """The newest steps of the replay, a single lane, with what the method pays for them."""
-    held, (_, moments) = learner.replay, actor_of(learner)
-    number = newest(held, recipe)
-    steps = replay.read(held, number)
-    # Where a step's successor belongs to another episode, or to none yet, its own has ended.
-    episode = held.episode[number % replay.capacity(held)]
-    ended = jnp.append(episode[1:] != episode[:-1], ~held.running)
-    before, after = (seen(rows, moments) for rows in (steps.observation, steps.next_observation))
-    reward = rewards(steps, learner, recipe)
-    row = ppo.Rollout(before, steps.action, reward, after, steps.continues, ended.astype(jnp.float32))
-    return jax.tree.map(lambda leaf: leaf[:, None], row)
+def policy_input(
+    observation: Float[Array, "*batch agents observation"], config: TrainConfig
+) -> Float[Array, "*batch agents policy_input"]:
+    """What actor and critic see: the observation and, where there are several teams, which agent it is."""
+    if len(config.env.teams) == 1:
+        return observation
+    agents = config.env.agents
+    number = jnp.broadcast_to(jnp.eye(agents), (*observation.shape[:-1], agents))
+    return jnp.concatenate([observation, number], axis=-1)
+
+
+def actor(learner: Learner, done: int, config: TrainConfig) -> ppo.Actor:
+    """What is needed to act, of all seeds."""
+    return ppo.actor_of(learner.algorithm)
+
+
+def memory(config: TrainConfig) -> tuple[()]:
+    """What an actor remembers of an episode: nothing."""
+    return ()
+
+
+def act(
+    actor: ppo.Actor,
+    memory: tuple[()],
+    observation: Float[Array, "*batch agents observation"],
+    available: Array,
+    noise: Float[Array, "*batch agents action"] | None,
+    config: TrainConfig,
+) -> tuple[Float[Array, "*batch agents action"], tuple[()]]:
+    """The likeliest action or, with noise, an action of the policy."""
+    shown, choices = policy_input(observation, config), available if config.env.masks_actions else None
+    if noise is None:
+        return ppo.act(actor, shown, choices), memory
+    return ppo.explore(actor, shown, choices, noise), memory
+
+
+def rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> ppo.Rollout:
+    """The newest steps with what the method pays for them. A lane is an agent in an environment."""
+    stored = replay.read(learner.replay, replay.newest(learner.replay, config.rollout_steps))
+    reward = common.rewards(stored, Paid(learner.credit, learner.scale), config)  # [envs time agents]
+    agents, leave = config.env.agents, config.env.agents_leave
+
+    def each(values: Array) -> Float[Array, "time envs agents"]:
+        return jnp.broadcast_to(values[..., None], (*values.shape, agents)).astype(jnp.float32)
+
+    continues, ended = each(~jnp.asarray(steps.after.terminated)), each(jnp.asarray(steps.ended))
+    if leave:
+        stays = jnp.asarray(steps.after.alive)
+        continues, ended = continues * stays, jnp.maximum(ended, ~stays)
+
+    def lanes(rows: Shaped[Array, "time envs agents *rest"]) -> Shaped[Array, "time lanes *rest"]:
+        return rows.reshape(len(rows), -1, *rows.shape[3:])
+
+    return ppo.Rollout(
+        observation=lanes(policy_input(steps.before.observation, config)),
+        action=lanes(steps.action),
+        reward=lanes(jnp.swapaxes(reward, 0, 1)),
+        next_observation=lanes(policy_input(steps.after.observation, config)),
+        continues=lanes(continues),
+        ended=lanes(ended),
+        available=lanes(steps.before.available) if config.env.masks_actions else None,
+        mask=lanes(jnp.asarray(steps.before.alive).astype(jnp.float32)) if leave else None,
+    )
+
+
+def improve_one(
+    learner: Learner, steps: Trajectory, key: PRNGKeyArray, done: Int[Scalar, ""], config: TrainConfig
+) -> tuple[Learner, dict[str, Float[Array, ""]]]:
+    """Update the policy on the steps that have just been stored."""
+    remaining = 1 - done / config.steps
+    newest = rollout(learner, jax.tree.map(jnp.asarray, steps), config)
+    algorithm, measured = ppo.update(learner.algorithm, newest, key, remaining, settings_of(config))
+    return learner._replace(algorithm=algorithm), measured
 
 
 def improve(
-    learner: Learner, key: PRNGKeyArray, done: Int[Scalar, ""], recipe: Recipe
-) -> tuple[Learner, dict[str, Float[Array, ""]]]:
-    """Fit the decoder and update the policy on the steps that have just been stored."""
-    assert isinstance(recipe.algorithm, ppo.PPOSettings)
-    assert isinstance(learner.algorithm, ppo.PPO)
-    fit_key, key = jax.random.split(key)
-    algorithm = learner.algorithm
-    learner, fitted = fit_often(learner, fit_key, recipe.fit_updates, recipe)
-    left = 1 - done / recipe.steps
-    algorithm, improved = ppo.update(algorithm, rollout(learner, recipe), key, left, recipe.algorithm)
-    _, moments = actor_of(learner)
-    taken_in = observe(moments, replay.read(learner.replay, newest(learner.replay, recipe)).observation)
-    return learner._replace(algorithm=algorithm, observations=taken_in), fitted | improved
-
-
-def act(actor: Actor, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch action"]:
-    """The likeliest action."""
-    policy, moments = actor
-    return policy.mode(seen(observation, moments))
-
-
-def explore(
-    actor: Actor, observation: Float[Array, " observation"], noise: Float[Array, " action"]
-) -> Float[Array, " action"]:
-    """An action of the policy, drawn by given noise."""
-    policy, moments = actor
-    return policy.drawn(seen(observation, moments), noise)
-
-
-def noise(random: Sequence[np.random.Generator], recipe: Recipe) -> Float[np.ndarray, "time seeds action"]:
-    """For the steps of a rollout: Gumbel's, by which the largest of the disturbed numbers is a choice; or normal."""
-    shape = (recipe.turn, recipe.action_size)
-    drawn = (one.gumbel(size=shape) if recipe.discrete else one.standard_normal(shape) for one in random)
-    return np.stack(list(drawn), 1).astype(np.float32)
-
-
-def compiled(recipe: Recipe) -> Compiled:
-    """The functions of a run."""
-    return common.compiled(recipe, improve, actor_of, act, explore, noise)
+    learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], done: Int[Scalar, ""], config: TrainConfig
+) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
+    """The same for all seeds."""
+    return jax.vmap(partial(improve_one, config=config), in_axes=(0, 0, 0, None))(learner, steps, keys, done)

@@ -18,14 +18,11 @@ def enough_memory(run: Run) -> Iterator[None]:
         yield
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
         if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
-            plan = run.config.settings
-            if run.config.task.particles:
-                holds, option = f"{plan.episodes:,} episodes", "agents.capacity"
-            else:
-                holds, option = f"{plan.rows(run.config.longest_episode):,} observations", "capacity"
+            settings = run.config.settings
+            rows = settings.rows(run.config.longest_episode) * settings.environments
             raise LareError(
-                f"the memory is full: {plan.seeds} seeds with a replay of {holds} each; fewer seeds or a smaller {option} "
-                "need less"
+                f"the memory is full: {settings.seeds} seeds with a replay of {rows:,} rows each; fewer seeds or a smaller "
+                "capacity need less"
             ) from error
         raise
 

@@ -23,7 +23,7 @@ class Listener(Protocol):
         """Training begins at a step (above 0 when a run is resumed), and is to go to `steps`."""
 
     def stepped(self, step: int) -> None:
-        """A turn has been made: a chunk of steps with its updates, or a rollout with its own."""
+        """An iteration has been made: some steps, and their updates."""
 
     def evaluated(self, metrics: Metrics) -> None:
         """New lines of metrics.jsonl, one for each seed; they and the checkpoint have been written."""
@@ -45,6 +45,7 @@ def summary(metrics: Metrics) -> str:
     parts = [f"{mean(metrics, 'time/steps_per_second') or 0:.0f} steps/s"]
     for key, label, form in (
         ("evaluation/return", "return", ".1f"),
+        ("evaluation/won", "won", ".2f"),
         ("credit/error", "credit error", ".3g"),
         ("credit/correlation", "correlation", ".2f"),
     ):

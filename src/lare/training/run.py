@@ -23,15 +23,15 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from lare.algorithms.table import ALGORITHMS, Kind
 from lare.errors import Checked, LareError
 from lare.files import write_atomically
 from lare.latent.evaluator import LatentRewardError
 from lare.latent.function import LatentFunction, load, per_role
 from lare.source import source
-from lare.tasks.spec import Judges, TaskSpec, is_discrete, time_limit
+from lare.tasks.spec import Judges, TaskSpec
+from lare.tasks.table import env_spec
 from lare.training.checkpoint import STATE
-from lare.training.settings import Plan
+from lare.training.settings import ResolvedSettings
 
 CONFIG, METRICS, FUNCTION, CHECKPOINT = "config.json", "metrics.jsonl", "latent_function.py", "checkpoint"
 FAILED_BATCH = "failed_batch.npz"
@@ -40,18 +40,21 @@ VERSIONS = ("jax", "optax", "gymnasium", "mujoco", "numpy")
 """Packages that results depend on."""
 
 
+FORMAT = 2
+"""Of config.json and of the checkpoint. What stands in them changed with every number."""
+
+
 class Config(Checked):
     """config.json."""
 
+    format: int
     lare: str
     """Version of the package, and the commit in a checkout."""
-    settings: Plan
+    settings: ResolvedSettings
     task: TaskSpec
     task_sha256: str
     longest_episode: int
     """The environment's time limit."""
-    discrete: bool
-    """Whether its actions are a choice."""
     function_sha256: tuple[str, ...]
     """Of the latent functions in use: one for each team, none for a method that needs none."""
     isolation: str | None
@@ -60,39 +63,20 @@ class Config(Checked):
     machine: str
 
 
-def describe(task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) -> Config:
-    """Everything that the run depends on. Raises `LareError` as `check_room`."""
-    check_room(task, plan)
+def describe(task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction]) -> Config:
+    """Everything that the run depends on."""
     return Config(
+        format=FORMAT,
         lare=source(),
-        settings=plan,
+        settings=settings,
         task=task,
         task_sha256=task.digest,
-        longest_episode=time_limit(task),
-        discrete=is_discrete(task),
+        longest_episode=env_spec(task).max_steps,
         function_sha256=tuple(function.digest for function in functions),
         isolation=isolation(task, functions[0]) if functions else None,
         versions={name: version(name) for name in VERSIONS} | {"python": platform.python_version()},
         machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}",
     )
-
-
-def check_room(task: TaskSpec, plan: Plan) -> None:
-    """Raise `LareError` where the replay could not hold what a turn stores, or a run is too short."""
-    if ALGORITHMS[plan.algorithm].kind is Kind.MANY_AGENTS:
-        if plan.rereads and plan.agents.capacity < plan.agents.episodes:
-            raise LareError(
-                f"agents.capacity = {plan.agents.capacity} is less than the {plan.agents.episodes} episodes of an update"
-            )
-        return
-    longest = time_limit(task)
-    if 2 * plan.steps < longest:
-        raise LareError(
-            f"steps = {plan.steps} are too few: an episode of {task.name} takes up to {longest}, and a run at least half of one"
-        )
-    if plan.rereads and plan.capacity < (needed := plan.rows_of_a_turn(longest)):
-        what = "a rollout" if ALGORITHMS[plan.algorithm].kind is Kind.ON_POLICY else "a chunk"
-        raise LareError(f"capacity = {plan.capacity} is too small: {what} of {task.name} takes up to {needed}")
 
 
 def isolation(task: TaskSpec, function: LatentFunction) -> str:
@@ -102,7 +86,7 @@ def isolation(task: TaskSpec, function: LatentFunction) -> str:
 
 def function_file(task: TaskSpec, role: TaskSpec) -> str:
     """Where the latent function of a role is kept."""
-    return FUNCTION if role is task else f"latent_function_{task.team(role)}.py"
+    return FUNCTION if role is task else f"latent_function_{role.team}.py"
 
 
 class Busy(LareError):
@@ -194,9 +178,9 @@ class Run:
             os.truncate(path, length)
 
 
-def create(directory: Path, task: TaskSpec, plan: Plan, functions: Sequence[LatentFunction]) -> Run:
+def create(directory: Path, task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction]) -> Run:
     """A new run directory. Raises `LareError` where there is something of that name."""
-    config = describe(task, plan, functions)
+    config = describe(task, settings, functions)
     taken = LareError(
         f"{directory} exists, and a run never overwrites another: choose another --out, or go on with --resume"
     )
@@ -219,9 +203,9 @@ def create(directory: Path, task: TaskSpec, plan: Plan, functions: Sequence[Late
     return Run(directory, config, tuple(functions))
 
 
-def default_directory(task: TaskSpec, plan: Plan) -> Path:
+def default_directory(task: TaskSpec, settings: ResolvedSettings) -> Path:
     """runs/TASK-METHOD-ALGORITHM-sSEED, with a number behind it as long as that is taken."""
-    name = f"{task.name}-{plan.method}-{plan.algorithm}-s{plan.seed}"
+    name = f"{task.name}-{settings.method}-{settings.algorithm}-s{settings.seed}"
     number = 1
     while (directory := Path("runs") / (name if number == 1 else f"{name}-{number}")).exists():
         number += 1
@@ -237,6 +221,11 @@ def read_config(directory: Path) -> Config:
         values = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(values, dict):
             raise LareError("it is JSON, but not an object")
+        if values.get("format") != FORMAT:
+            raise LareError(
+                f"the run is of another version of LaRe ({values.get('lare', 'unknown')}), whose files this one does not read: "
+                "use that version, or train it anew"
+            )
         return Config(**values)
     except (LareError, OSError, ValueError, TypeError) as error:
         raise LareError(f"{path}: {error}") from error

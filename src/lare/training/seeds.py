@@ -1,4 +1,4 @@
-"""The seed axis: a key for each seed, and a line of metrics for each."""
+"""The seed axis: the part of a state that belongs to one seed, and a line of metrics for each."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,14 +6,6 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jaxtyping import Array, Int, Key
-
-
-@jax.jit
-def seed_keys(seeds: Int[Array, " seeds"], number: int | Array) -> Key[Array, " seeds"]:
-    """A key for each seed that depends on the seed and `number` alone: there is no state to save."""
-    return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), number))(seeds)
-
 
 State = TypeVar("State")
 

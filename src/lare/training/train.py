@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,12 +12,14 @@ from lare.errors import LareError
 from lare.latent.design import CANDIDATES, design
 from lare.latent.function import LatentFunction, load, per_role
 from lare.tasks.spec import TaskSpec, load_task
-from lare.training import many_agents, single_agent
-from lare.training.environments import Diverged
+from lare.training import session as sessions
+from lare.training.collect_host import Diverged
+from lare.training.decide import decide
 from lare.training.process import enough_memory, stop_requests
 from lare.training.progress import Clock, Listener, TensorBoard, Terminal, summary_writer
 from lare.training.run import Run, create, default_directory, isolation, locked, open_run
-from lare.training.settings import Plan, Settings, decide, set_in_vain
+from lare.training.session import Session
+from lare.training.settings import ResolvedSettings, Settings, set_in_vain
 
 Given = LatentFunction | str | Path
 """A latent function, or the path of its file."""
@@ -57,35 +58,40 @@ def train(
     if tensorboard:
         summary_writer()  # before anything is made
     task = task if isinstance(task, TaskSpec) else load_task(task)
-    plan = decide(settings or Settings(), task)
-    functions = chosen_functions(task, plan, function)
-    run = create(Path(out) if out is not None else default_directory(task, plan), task, plan, functions)
+    given = settings or Settings()
+    resolved = decide(given, task)
+    functions = chosen_functions(task, resolved, function)
+    run = create(Path(out) if out is not None else default_directory(task, resolved), task, resolved, functions)
+    in_vain = list(set_in_vain(given, resolved, task).values())
+    said = in_vain[:1] if len(in_vain) < 2 else [f"{in_vain[0]} (and {len(in_vain) - 1} more)"]
     with locked(run), enough_memory(run):
-        return begin(run, tensorboard, listeners)
+        return begin(run, tensorboard, listeners, *said)
 
 
-def chosen_functions(task: TaskSpec, plan: Plan, given: Given | Sequence[Given] | None) -> tuple[LatentFunction, ...]:
+def chosen_functions(
+    task: TaskSpec, settings: ResolvedSettings, given: Given | Sequence[Given] | None
+) -> tuple[LatentFunction, ...]:
     """One for each role of the task, designed where none was given; none for a method that needs none."""
-    method = find_method(plan.method)
+    method = find_method(settings.method)
     if not method.latent:
         if given is not None:
             raise LareError(f"{method.name} needs no latent function, and one is given: leave it out")
         return ()
     if given is None:
-        asked = partial(design, kind=method.kind, draw=plan.draw, candidates=plan.candidates)
+        asked = partial(design, kind=method.kind, draw=settings.draw, candidates=settings.candidates)
         functions = [asked(role) for role in task.roles]
     else:
-        check_given(plan)
+        check_given(settings)
         each = per_role([given] if isinstance(given, Given) else given, task)
         functions = [one if isinstance(one, LatentFunction) else load(one, role) for one, role in each]
     for function in functions:
-        check_size(method, function.size_by(plan.judged_by(task)))
+        check_size(method, function.size_by(settings.judged_by(task)))
     return tuple(functions)
 
 
-def check_given(plan: Plan) -> None:
+def check_given(settings: ResolvedSettings) -> None:
     """Raise `LareError` where a recorded function is chosen although another one is given."""
-    if (plan.draw, plan.candidates) != (0, CANDIDATES):
+    if (settings.draw, settings.candidates) != (0, CANDIDATES):
         raise LareError("draw and candidates choose a recorded function, and a function is given: leave either out")
 
 
@@ -116,25 +122,20 @@ def resume(directory: str | Path, *, tensorboard: bool = False, listeners: Seque
             if run.metrics():  # what has been measured is never taken back
                 raise LareError(f"{run.directory} has no checkpoint any more: there is nothing to go on from")
             return begin(run, tensorboard, listeners)
-        restored, messages = kind_of(run).restore(run)
+        restored, messages = sessions.restore(run)
         run.truncate(restored.metrics_length)
         return finish(restored, tensorboard, listeners, *messages)
 
 
-def begin(run: Run, tensorboard: bool, listeners: Sequence[Listener] | None) -> Run:
+def begin(run: Run, tensorboard: bool, listeners: Sequence[Listener] | None, *messages: str) -> Run:
     """From the first step on. The untrained learner is saved, so that there is a checkpoint whatever happens."""
-    started = kind_of(run).start(run)
+    started = sessions.start(run)
     started.save()
-    return finish(started, tensorboard, listeners)
-
-
-def kind_of(run: Run) -> Any:
-    """The module whose sessions train such a run: `start` and `restore`."""
-    return many_agents if run.config.task.particles else single_agent
+    return finish(started, tensorboard, listeners, *messages)
 
 
 def finish(
-    session: single_agent.Session | many_agents.Session,
+    session: Session,
     tensorboard: bool,
     listeners: Sequence[Listener] | None,
     *messages: str,
@@ -173,14 +174,11 @@ def finish(
     return run
 
 
-def introduce(session: single_agent.Session | many_agents.Session, listener: Listener, messages: Sequence[str]) -> None:
+def introduce(session: Session, listener: Listener, messages: Sequence[str]) -> None:
     """What is to be said of a session before its next step."""
     run, settings = session.run, session.settings
     for message in messages:
         listener.said(message)
-    in_vain = list(set_in_vain(settings, run.config.task).values())
-    if in_vain:
-        listener.said(in_vain[0] + (f" (and {len(in_vain) - 1} more)" if len(in_vain) > 1 else ""))
     if run.function is not None:
         listener.said(f"the latent function runs in {isolation(run.config.task, run.function)}")
     if session.step < settings.warmup:
@@ -191,12 +189,13 @@ def introduce(session: single_agent.Session | many_agents.Session, listener: Lis
     listener.started(f"{run.config.task.name} {settings.method}", session.step, settings.steps)
 
 
-def check_losses(session: single_agent.Session | many_agents.Session) -> None:
+def check_losses(session: Session) -> None:
     """Raise `Diverged` where a loss is not finite: what is saved then is of no use."""
+    updates = np.asarray(session.latest.get("algorithm/updates", np.ones(len(session.run.seeds))))
     losses = (name for name in session.latest if name.startswith(("critic/loss", "credit/loss")))
     for name in losses:
-        for seed, value in zip(session.run.seeds, np.asarray(session.latest[name]), strict=True):
-            if not np.isfinite(value):
+        for seed, value, made in zip(session.run.seeds, np.asarray(session.latest[name]), updates, strict=True):
+            if made and not np.isfinite(value):
                 raise Diverged(
                     f"training diverged: {name} of seed {seed} is not finite at step {session.step}; "
                     "the last checkpoint is whole"

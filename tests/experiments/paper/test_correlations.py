@@ -14,7 +14,8 @@ from toys import toy_spec
 
 def test_steps_of_one_agent_follow_each_other():
     steps = correlations.random_steps(toy_spec(), 2)
-    assert len(steps.before) == len(steps.action) == len(steps.reward) == 2 * 20
+    assert steps.before.shape == steps.after.shape == (2 * 20, 2)
+    assert (steps.action.shape, steps.reward.shape) == ((2 * 20, 1), (2 * 20,))
     np.testing.assert_array_equal(steps.before[1:20], steps.after[:19])
     # What the toy pays, by what it shows before the step.
     np.testing.assert_allclose(steps.reward, -((steps.action[:, 0] - steps.before[:, 0]) ** 2), rtol=1e-4, atol=1e-6)

@@ -11,10 +11,10 @@ from lare.errors import LareError
 from lare.experiments import processes, statistics
 from lare.experiments.jobs import as_json, check, train_one
 from lare.experiments.paper.budgets import BUDGETS
-from lare.experiments.paper.exhibits import EXHIBITS, TABLE
+from lare.experiments.paper.exhibits import EXHIBITS, TABLE, TRAVELLED, WON
 from lare.experiments.paper.reproduce import NAMES, UNTRAINED, listed, reproduce
 from lare.experiments.paper.trained import jobs_of, verdict
-from lare.experiments.scores import ERROR
+from lare.experiments.scores import ERROR, RETURN, SUMMED_RETURN
 from lare.experiments.sweep import Share
 from lare.llm.recording import shipped_recordings
 from lare.training import train as training
@@ -30,16 +30,16 @@ def few_repetitions(monkeypatch):
 
 
 def write_run(value):
-    """Instead of training: metrics with a return and an error made up from plan and seed."""
+    """Instead of training: metrics with a return and an error made up from settings and seed."""
 
     def train(job, cores, running):
         job.directory.mkdir(parents=True)
-        (job.directory / "config.json").write_text(describe(job.task, job.plan, ()).model_dump_json())
+        (job.directory / "config.json").write_text(describe(job.task, job.resolved, ()).model_dump_json())
         lines = []
-        for step in (job.plan.steps // 2, job.plan.steps):
-            for seed in job.plan.all_seeds:
-                found = float(value(job.plan, seed))
-                measured = {"evaluation/return": found, "evaluation/x_position": found, ERROR: 0.1 * found}
+        for step in (job.resolved.steps // 2, job.resolved.steps):
+            for seed in job.resolved.all_seeds:
+                found = float(value(job.resolved, seed))
+                measured = dict.fromkeys((RETURN, SUMMED_RETURN, TRAVELLED, WON), found) | {ERROR: 0.1 * found}
                 lines.append({"step": step, "seed": seed, **measured, "credit/correlation": 0.5})
         (job.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
@@ -49,7 +49,7 @@ def write_run(value):
 @pytest.fixture
 def made_up(monkeypatch):
     """Each method has a return of its own, its place in the table of methods."""
-    monkeypatch.setattr(processes, "in_a_process", write_run(lambda plan, _: list(METHODS).index(plan.method)))
+    monkeypatch.setattr(processes, "in_a_process", write_run(lambda settings, _: list(METHODS).index(settings.method)))
 
 
 @pytest.mark.parametrize("exhibit", TABLE, ids=lambda exhibit: exhibit.name)
@@ -68,9 +68,9 @@ def test_every_run_of_an_exhibit_could_be_trained(exhibit, budget):
     """Settings that go together, and recordings that are there."""
     for of_task in jobs_of(exhibit, budget, Path("runs")).values():
         for job in (job for some in of_task.values() for job in some):
-            method = METHODS[job.plan.method]
+            method = METHODS[job.resolved.method]
             if method.encoder == "latent":
-                recorded = {recording.task for recording in shipped_recordings(method.kind, job.plan.draw)}
+                recorded = {recording.task for recording in shipped_recordings(method.kind, job.resolved.draw)}
                 # A task that is like another one has the same prompts.
                 assert {role.name.replace("Sparse", "") for role in job.task.roles} <= recorded
 
@@ -114,7 +114,7 @@ def test_figures_claims_and_verdicts(made_up, tmp_path):
 def test_draws_are_what_is_compared_where_there_are_several(tmp_path, monkeypatch):
     """Seeds differ by next to nothing, draws by much: three draws do not settle anything, however many seeds agree."""
     monkeypatch.setattr(
-        processes, "in_a_process", write_run(lambda plan, seed: plan.draw * 1000 + plan.candidates + seed)
+        processes, "in_a_process", write_run(lambda settings, seed: settings.draw * 1000 + settings.candidates + seed)
     )
     text = reproduce("candidates", BUDGETS["laptop"], Share(), tmp_path / "runs", tmp_path / "out").read_text()
     assert "| n = 5 is at least as good as n = 1 | 6 of 9 |" in text
@@ -142,11 +142,11 @@ def test_verdicts(for_it, against, everywhere, at_least, said):
 @pytest.mark.parametrize("budget", BUDGETS.values(), ids=BUDGETS)
 def test_no_two_contenders_share_a_run_by_chance(budget):
     """A directory is one run, whoever asks for it."""
-    plans = {}
+    found = {}
     for exhibit in TABLE:
         for of_task in jobs_of(exhibit, budget, Path("runs")).values():
             for job in (job for some in of_task.values() for job in some):
-                assert plans.setdefault(job.directory, job.plan) == job.plan
+                assert found.setdefault(job.directory, job.resolved) == job.resolved
 
 
 def test_what_is_shared_or_done_is_not_trained_again(made_up, monkeypatch, tmp_path):

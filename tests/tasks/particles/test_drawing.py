@@ -2,10 +2,11 @@ import jax
 import numpy as np
 import pytest
 from matplotlib.patches import Circle
-from PIL import Image
 
-from lare.tasks.particles.drawing import LANDMARK, OTHERS, TEAM, draw, film, pixels
+from lare.tasks.particles.drawing import LANDMARK, OTHERS, TEAM, draw, frames, pixels
+from lare.tasks.particles.env import Moment, ParticleJaxEnv
 from lare.tasks.particles.table import TASKS
+from lare.tasks.particles.world import State
 
 
 def circles(figure) -> list[Circle]:
@@ -47,8 +48,12 @@ def test_no_credit_at_all_can_be_drawn():
     assert pixels(draw(TASKS["CN-6"], start("CN-6"), np.zeros(6))).std() > 0
 
 
-def test_a_film_has_a_frame_a_step(tmp_path):
+def test_an_episode_is_a_picture_a_step_all_to_one_scale():
     positions = np.linspace(1, 2, 4)[:, None, None] * start("TriangleArea")
-    film(tmp_path / "episode.gif", TASKS["TriangleArea"], positions, np.arange(12.0).reshape(4, 3))
-    with Image.open(tmp_path / "episode.gif") as opened:
-        assert opened.n_frames == 4
+    credit = np.arange(12.0).reshape(4, 3)
+    found = frames(TASKS["TriangleArea"], positions, credit)
+    assert [picture.shape for picture in found] == [(400, 400, 3)] * 4
+    assert len({picture.tobytes() for picture in found}) == 4
+    np.testing.assert_array_equal(found[-1], pixels(draw(TASKS["TriangleArea"], positions[-1], credit[-1], 11.0)))
+    states = Moment(State(positions, 0 * positions), np.arange(4))
+    np.testing.assert_array_equal(ParticleJaxEnv("TriangleArea").frames(states, credit), found)

@@ -1,22 +1,18 @@
 """Table 1 of the paper: how much of the true reward is in states and in factors, and how many replies run as they come."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float
 
 from lare.experiments.credit import correlations
 from lare.experiments.paper.budgets import Budget
 from lare.experiments.paper.pages import Page, items, table
 from lare.latent.design import DesignFailed, design, examine
 from lare.latent.function import LatentFunction
-from lare.latent.reflect import episodes_of
 from lare.llm.recording import shipped_recordings
-from lare.tasks.particles.table import find_particle_task
-from lare.tasks.particles.task import ACTIONS, STEPS
-from lare.tasks.particles.world import State
+from lare.tasks.play import Episode, episodes_of
 from lare.tasks.spec import Judges, TaskSpec, load_task
 
 TITLE = "What states and factors know of the true reward"
@@ -117,32 +113,15 @@ def of_replies(task: TaskSpec, draws: int) -> str:
 
 
 def random_steps(task: TaskSpec, episodes: int) -> Steps:
-    """Whole episodes of uniformly random actions."""
-    return of_agents(task.particles, episodes) if task.particles else of_one(task, episodes)
+    """Whole episodes of uniformly random actions; of all agents, one behind the other."""
+    played = episodes_of(task, episodes)
 
+    def rows(part: Callable[[Episode], np.ndarray]) -> np.ndarray:
+        return np.concatenate([part(one)[one.alive] for one in played])
 
-def of_one(task: TaskSpec, episodes: int) -> Steps:
-    played = episodes_of(task, count=episodes)
-    rows = [(one.observation[:-1], one.action, one.observation[1:], one.reward.astype(np.float32)) for one in played]
-    return Steps(*map(np.concatenate, zip(*rows, strict=True)))
-
-
-def of_agents(name: str, episodes: int) -> Steps:
-    """Of all learning agents, one behind the other."""
-    task = find_particle_task(name)
-
-    def step(state: State, key: PRNGKeyArray) -> tuple[State, tuple[Array, ...]]:
-        choice_key, step_key = jax.random.split(key)
-        choice = jax.random.randint(choice_key, (task.agents,), 0, ACTIONS)
-        after = task.step(state, choice, step_key)
-        row = (task.observe(state), jax.nn.one_hot(choice, ACTIONS), task.observe(after), task.reward(after))
-        return after, row
-
-    @jax.jit
-    @jax.vmap
-    def episode(key: PRNGKeyArray) -> tuple[Array, ...]:
-        start, steps = jax.random.split(key)
-        return jax.lax.scan(step, task.reset(start), jax.random.split(steps, STEPS))[1]
-
-    played = episode(jax.random.split(jax.random.key(0), episodes))
-    return Steps(*(np.asarray(part).reshape(-1, *part.shape[3:]) for part in played))
+    return Steps(
+        rows(lambda one: one.before),
+        rows(lambda one: one.action),
+        rows(lambda one: one.after),
+        rows(lambda one: one.reward),
+    )

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from lare.algorithms.table import ALGORITHMS, Consumes
 from lare.credit.methods import find_method
 from lare.experiments import figures
 from lare.experiments.jobs import Job, job_of
 from lare.experiments.paper.budgets import Budget
-from lare.experiments.paper.exhibits import TRAVELLED, Claim, Contender, Exhibit
+from lare.experiments.paper.exhibits import TRAVELLED, WON, Claim, Contender, Exhibit
 from lare.experiments.paper.pages import Page, items, table
-from lare.experiments.scores import CORRELATION, ERROR, RETURN, Group
+from lare.experiments.scores import CORRELATION, ERROR, RETURN, SUMMED_RETURN, Group
 from lare.experiments.statistics import (
     REPETITIONS,
     Band,
@@ -25,8 +26,9 @@ from lare.experiments.statistics import (
     too_few,
 )
 from lare.tasks.spec import load_task
+from lare.tasks.table import env_spec
 from lare.training.run import Run, read_measured
-from lare.training.settings import Settings
+from lare.training.settings import Settings, usual_algorithm
 
 LEVEL = 0.025
 """A claim counts as decided where luck alone would give as many pairs at most so often."""
@@ -68,8 +70,9 @@ def jobs_of(exhibit: Exhibit, budget: Budget, root: Path) -> Jobs:
 
 def jobs_of_contender(one: Contender, budget: Budget, name: str, root: Path) -> Iterator[Job]:
     task = load_task(name)
-    steps = budget.steps_of_many if task.particles else budget.steps
+    steps = budget.steps_of_many if env_spec(task).agents > 1 else budget.steps
     usual = {"method": one.method, "algorithm": one.algorithm, "steps": steps, "seeds": budget.seeds}
+    usual |= budget.by_algorithm.get(one.algorithm or usual_algorithm(env_spec(task)), {})
     latent = find_method(one.method).latent
     for draw in range(min(budget.draws, one.draws) if latent else 1):
         job = job_of(root, task, Settings(**{**one.settings, **budget.settings, **usual, "draw": draw}))
@@ -87,7 +90,6 @@ def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
         for name, of_task in jobs.items()
     }
     every = [run for of_task in runs.values() for some in of_task.values() for run in some]
-    one_agent = not any(run.config.task.particles for run in every)
     found = {name: compare(of_task, exhibit.measure(name)) for name, of_task in runs.items()}
     pictures = {
         f"{exhibit.name}-{name}.svg": picture(one, exhibit, exhibit.measure(name)) for name, one in found.items()
@@ -101,19 +103,22 @@ def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
         table(["the paper", *found, "p", "here"], (claimed(*one, exhibit, found) for one in pairs(exhibit.claims))),
         JUDGED,
         "## What differs from the paper",
-        items(differences(exhibit, budget, len(runs), one_agent)),
+        items(differences(exhibit, budget, len(runs), every)),
     ]
     return Page(exhibit.name, "\n\n".join(parts), pictures)
 
 
-def differences(exhibit: Exhibit, budget: Budget, tasks: int, one_agent: bool) -> Iterator[str]:
+def differences(exhibit: Exhibit, budget: Budget, tasks: int, runs: Sequence[Run]) -> Iterator[str]:
     """From the paper, a sentence each."""
     if budget.name != "paper":
         yield f"Seeds: {budget.seeds} (the paper: 5)."
         if tasks < len(exhibit.tasks):
             yield f"Tasks: {tasks} of {len(exhibit.tasks)}."
-    steps, theirs = (budget.steps, 1_000_000) if one_agent else (budget.steps_of_many, 2_050_000)
-    if steps is not None:
+    steps = max(run.config.settings.steps for run in runs)
+    one_agent = not any(env_spec(run.config.task).agents > 1 for run in runs)
+    consumes = {ALGORITHMS[run.config.settings.algorithm].consumes for run in runs}
+    theirs = 1_000_000 if one_agent else 10_050_000 if Consumes.SEQUENCES in consumes else 2_050_000
+    if steps != theirs:
         yield f"Environment steps: {steps:,} (the paper: {theirs:,})."
     if budget.settings:
         yield "**Networks of a few units, small batches, two episodes in an evaluation: it runs, and learns nothing.**"
@@ -184,7 +189,13 @@ def mean_and_spread(runs: Sequence[Run], key: str, step: int) -> str:
 
 
 def meaning(key: str) -> str:
-    return {RETURN: "true return", ERROR: "error of the proxy reward", TRAVELLED: "metres travelled"}[key]
+    return {
+        RETURN: "true return",
+        SUMMED_RETURN: "true return, sum over the agents",
+        ERROR: "error of the proxy reward",
+        TRAVELLED: "metres travelled",
+        WON: "share of battles won",
+    }[key]
 
 
 def picture(found: Comparison, exhibit: Exhibit, key: str) -> str:

@@ -1,8 +1,5 @@
 """Pictures of particle tasks: a state, and an episode as a film."""
 
-from io import BytesIO
-from pathlib import Path
-
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib import colormaps
@@ -10,14 +7,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
-from PIL import Image
 
 from lare.tasks.particles.task import ParticleTask
 
 TEAM, OTHERS, LANDMARK = "#0072b2", "#d55e00", "#9a9a9a"
 """The first team, all others that move, and what stays."""
 CREDIT = colormaps["RdBu"]
-FRAMES_PER_SECOND = 8
 MARGIN = 1.08
 """How much further than the square the picture reaches."""
 
@@ -48,17 +43,6 @@ def frames(
         paint(axes, task, position, side, None if credit is None else credit[number], scale)
         found.append(pixels(figure))
     return found
-
-
-def film(
-    file: Path | BytesIO,
-    task: ParticleTask,
-    positions: Float[np.ndarray, "steps entities 2"],
-    credit: Float[np.ndarray, "steps agents"] | None = None,
-) -> None:
-    """An episode as a GIF."""
-    first, *others = (Image.fromarray(frame) for frame in frames(task, positions, credit))
-    first.save(file, format="GIF", save_all=True, append_images=others, duration=1000 // FRAMES_PER_SECOND, loop=0)
 
 
 def blank() -> tuple[Figure, Axes]:

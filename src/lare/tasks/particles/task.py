@@ -6,21 +6,13 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from lare.tasks.env import Team
 from lare.tasks.particles.world import State, World, move, push
 
 STEPS = 25
 """Length of every episode. Nothing ends one earlier."""
 ACTIONS = 5
 """Stay, left (-x), right (+x), down (-y), up (+y)."""
-
-
-@dataclass(frozen=True)
-class Team:
-    """Agents `start` to `stop` - 1, which want the same."""
-
-    name: str
-    start: int
-    stop: int
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,295 @@
+"""Whether our battles are those of SMAX in JaxMARL: both are played with the same choices and the same chance, and compared.
+
+    pip install jaxmarl==0.2.0        # brings flax and others: best into an environment of its own
+    python benchmarks/smax_oracle.py
+
+Whole battles. Ours makes each step from JaxMARL's state; a second one, which begins at JaxMARL's start and is never set right,
+shows what rounding grows to where units push each other. Our side mixes JaxMARL's heuristic, retreats and random legal
+choices; the enemy is JaxMARL's, whose choices go to both. Only where an enemy unit walks while it sees several of ours is its
+choice left out of the comparison: whom it walks to is another draw. JaxMARL's `max_steps` is one less than the limit,
+because it compares before it counts. Of each task, steps of one battle can be kept for the tests
+(`--pin tests/tasks/smax/pinned.npz`).
+"""
+
+import sys
+from collections import defaultdict
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from measure import write
+
+from lare.tasks.smax import NAMES, battle, enemy, observation
+from lare.tasks.smax.env import MOST, reward
+from lare.tasks.smax.scenarios import KINDS, Scenario, find_scenario
+
+streams = sys.stdout, sys.stderr
+from jaxmarl.environments.smax.heuristic_enemy import create_heuristic_policy  # noqa: E402
+from jaxmarl.environments.smax.heuristic_enemy_smax_env import HeuristicEnemySMAX  # noqa: E402
+from jaxmarl.environments.smax.smax_env import Scenario as Theirs  # noqa: E402
+
+sys.stdout, sys.stderr = streams  # which the import has replaced
+
+
+class Style(NamedTuple):
+    """How our side plays."""
+
+    random: float = 0.0
+    """The share of choices that are random legal ones; the others are those of JaxMARL's heuristic."""
+    kites: bool = False
+    """Whether a unit walks away from the enemy while its weapon is not ready."""
+    waits: bool = False
+    """Whether nobody does anything, the enemy neither: until the time is over."""
+
+
+STYLES = (Style(0.1), Style(0.4), Style(1.0), Style(), Style(0.05, kites=True), Style(kites=True))
+SHOWN = "observation", "state", "reward", "ends", "legal actions"
+PINNED = {"2s3z": "won", "3s_vs_5z": "lost", "1c3s5z": "lost"}
+"""The longest battle that ends so is kept for the tests."""
+
+
+def theirs(scenario: Scenario) -> HeuristicEnemySMAX:
+    """JaxMARL's, with the colossus appended to its kinds where the battle has one."""
+    table = list(KINDS.values())[: scenario.kinds]
+    figures = {
+        "unit_type_velocities": [kind.speed for kind in table],
+        "unit_type_attacks": [kind.damage for kind in table],
+        "unit_type_attack_ranges": [kind.reach for kind in table],
+        "unit_type_sight_ranges": [kind.sight for kind in table],
+        "unit_type_radiuses": [kind.radius for kind in table],
+        "unit_type_health": [kind.health for kind in table],
+        "unit_type_weapon_cooldowns": [kind.cooldown for kind in table],
+    }
+    # Its own kinds keep its own figures, so that ours are compared too.
+    arguments: dict[str, Any] = {}
+    if scenario.kinds > 6:
+        defaults = HeuristicEnemySMAX()._env
+        arguments = {
+            name: jnp.concatenate([getattr(defaults, name), jnp.array(values[6:], jnp.float32)])
+            for name, values in figures.items()
+        }
+        arguments["unit_type_names"] = [*defaults.unit_type_names, *list(KINDS)[6 : scenario.kinds]]
+        arguments["unit_type_shorthands"] = [*defaults.unit_type_shorthands, "c"]
+    kinds = jnp.asarray(scenario.kind, jnp.uint8)
+    their = Theirs(kinds, scenario.allies, scenario.enemies, False, False)
+    return HeuristicEnemySMAX(scenario=their, attack_mode="closest", max_steps=scenario.limit - 1, **arguments)
+
+
+@dataclass
+class Worst:
+    """The largest deviation of each thing, and how many were compared."""
+
+    deviation: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    differing: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    compared: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+
+    def close(self, name: str, one: Any, other: Any) -> None:
+        one, other = np.asarray(one, np.float64), np.asarray(other, np.float64)
+        assert one.shape == other.shape, name
+        self.compared[name] += one.size
+        self.deviation[name] = max(self.deviation[name], float(np.abs(one - other).max(initial=0)))
+
+    def same(self, name: str, one: Any, other: Any) -> None:
+        one, other = np.asarray(one), np.asarray(other)
+        assert one.shape == other.shape, name
+        self.compared[name] += one.size
+        self.differing[name] += int((one != other).sum())
+
+    def off(self, name: str) -> str:
+        """The largest deviation, or how many differ."""
+        return format(self.deviation[name], ".1e") if name in self.deviation else str(self.differing.get(name, ""))
+
+
+def drawn(key: jax.Array, units: int) -> jax.Array:
+    """What JaxMARL's `step_env` adds to the cooldowns, drawn as it draws it."""
+    key, _ = jax.random.split(key)
+    rows = []
+    for _ in range(battle.TICKS):
+        key, tick = jax.random.split(key)
+        draw = partial(jax.random.uniform, minval=-battle.TICK, maxval=2 * battle.TICK)
+        rows.append(jax.vmap(draw)(jax.random.split(tick, units)))
+    return jnp.stack(rows)
+
+
+class Match:
+    """Both games, compiled."""
+
+    def __init__(self, name: str):
+        self.scenario = find_scenario(name)
+        self.whole = theirs(self.scenario)
+        self.env = self.whole._env
+        self.policy = create_heuristic_policy(self.env, 0, attack_mode="closest")
+        self.choose, self.their_step, self.our_step = map(jax.jit, (self._choose, self._their_step, self._our_step))
+        self.drawn = jax.jit(partial(drawn, units=self.scenario.units))
+
+    def rows(self, of: dict, side: str) -> jax.Array:
+        count = self.scenario.allies if side == "ally" else self.scenario.enemies
+        return jnp.stack([of[f"{side}_{i}"] for i in range(count)])
+
+    def _choose(self, key, state, memories, style):
+        """What both sides do; the enemy always follows JaxMARL's heuristic."""
+        allies = self.scenario.allies
+        seen = self.env.get_obs(state)
+        keys = jax.random.split(key, 4)
+        ours, first = jax.vmap(self.policy)(jax.random.split(keys[0], allies), memories[0], self.rows(seen, "ally"))
+        legal = self.rows(self.env.get_avail_actions(state), "ally")
+        ours = jnp.where(style.kites & (state.unit_weapon_cooldowns[:allies] > 0), self._retreat(state), ours)
+        chance = jnp.argmax(jnp.where(legal, jax.random.uniform(keys[1], legal.shape), -1), axis=1)
+        ours = jnp.where(jax.random.uniform(keys[2], ours.shape) < style.random, chance, ours)
+        ours = jnp.where(state.unit_alive[:allies], ours, battle.STOP)  # its heuristic chooses for the dead too
+        enemies, second = self.whole.get_enemy_actions(keys[3], memories[1], self.rows(seen, "enemy"))
+        action = jnp.concatenate([ours, self.rows(enemies, "enemy")])
+        return jnp.where(style.waits, battle.STOP, action).astype(jnp.int32), (first, second)
+
+    def _retreat(self, state):
+        """Away from the enemies, the near ones most, and from the border."""
+        allies, position = self.scenario.allies, state.unit_positions
+        offset = position[:allies, None] - position[allies:]
+        nearness = state.unit_alive[allies:, None] / (jnp.sum(offset**2, axis=-1, keepdims=True) + 1)
+        inwards = (battle.FIELD / 2 - position[:allies]) / battle.FIELD
+        return jnp.argmax((jnp.sum(nearness * offset, axis=1) + inwards) @ battle.DIRECTIONS.T, axis=1)
+
+    def _their_step(self, key, state, action):
+        seen, state, paid, over, _ = self.env.step_env(key, state, dict(zip(self.env.agents, action, strict=True)))
+        legal = self.rows(self.env.get_avail_actions(state), "ally")
+        return state, self.rows(seen, "ally"), seen["world_state"], MOST / 2 * paid["ally_0"], over["__all__"], legal
+
+    def _our_step(self, key, state, memory, action, longer):
+        scenario = self.scenario
+        choice, memory = enemy.act(scenario, state, memory, key)
+        sight = jnp.asarray(scenario.each("sight"))[:, None]
+        near = (battle.distances(state.position) < sight) & battle.alive(state)
+        sees = jnp.sum(near[scenario.allies :, : scenario.allies], axis=1)
+        after = battle.advance(scenario, state, action, longer)
+        ours, theirs = battle.defeated(scenario, after)
+        over = ours | theirs | (after.step >= scenario.limit)
+        seen, field = observation.observe(scenario, after), observation.field(scenario, after)
+        shown = seen, field, reward(scenario, state, after), over, battle.legal(scenario, after)
+        return after, memory, choice, sees, shown
+
+    def begin(self, key: jax.Array, worst: Worst):
+        """JaxMARL's start, and ours from the same draws."""
+        scenario = self.scenario
+        _, state = self.env.reset(key)
+        _, *keys = jax.random.split(key, 3)
+        sides = zip(keys, (scenario.allies, scenario.enemies), strict=True)
+        noise = [jax.random.uniform(one, (count, 2), minval=-2, maxval=2) for one, count in sides]
+        middle = np.repeat(np.array([battle.OURS, battle.THEIRS]), [scenario.allies, scenario.enemies], axis=0)
+        placed = battle.push(scenario, jnp.concatenate(noise) + middle, jnp.ones(scenario.units, bool))
+        worst.close("position at the start", placed, state.unit_positions)
+        mine = battle.start(scenario, key)._replace(position=state.unit_positions)
+        worst.same("health", mine.health, state.unit_health)
+        return state, mine
+
+    def play(self, seed: int, style: Style, worst: Worst, alone: Worst) -> tuple[str, dict[str, np.ndarray]]:
+        """One battle to its end: how it ended, and all of JaxMARL's."""
+        scenario, allies = self.scenario, self.scenario.allies
+        start, key = jax.random.split(jax.random.key(seed))
+        state, mine = self.begin(start, worst)
+        memory = enemy.remember(scenario, mine)
+        one = jax.tree.map(lambda leaf: leaf[0], self.whole.get_enemy_policy_initial_state(start))
+        memories = tuple(
+            jax.tree.map(lambda leaf, count=count: jnp.stack([leaf] * count), one)
+            for count in (allies, scenario.enemies)
+        )
+        kept: dict[str, list] = defaultdict(list)
+        free, over = mine, False
+        while not over:
+            key, choice_key, step_key = jax.random.split(key, 3)
+            action, memories = self.choose(choice_key, state, memories, style)
+            lived, longer = np.asarray(state.unit_alive), self.drawn(step_key)
+            mine = mine._replace(
+                position=state.unit_positions, health=state.unit_health, cooldown=state.unit_weapon_cooldowns
+            )
+            for name in ("position", "health", "cooldown"):
+                kept[f"before/{name}"].append(getattr(mine, name))
+            state, *their_shown = self.their_step(step_key, state, action)
+            free, *_, free_shown = self.our_step(choice_key, free, memory, action, longer)
+            mine, memory, choice, sees, our_shown = self.our_step(choice_key, mine, memory, action, longer)
+
+            theirs = np.asarray(action)[allies:]
+            attacks = (theirs >= battle.ATTACK) | (np.asarray(choice) >= battle.ATTACK)
+            decided = lived[allies:] & (attacks | (np.asarray(sees) <= 1))
+            if not style.waits:
+                worst.same("the enemy's choices", np.asarray(choice)[decided], theirs[decided])
+                worst.compared["walks towards one of several, left out"] += int((lived[allies:] & ~decided).sum())
+            for one, after, shown in ((worst, mine, our_shown), (alone, free, free_shown)):
+                one.same("health", after.health, state.unit_health)
+                one.same("who lives", battle.alive(after), state.unit_alive)
+                one.same("who may attack", after.cooldown <= 0, state.unit_weapon_cooldowns <= 0)
+                one.close("cooldown", after.cooldown, state.unit_weapon_cooldowns)
+                one.close("position", after.position, state.unit_positions)
+                for name, ours, their in zip(SHOWN, shown, their_shown, strict=True):
+                    (one.same if name in ("ends", "legal actions") else one.close)(name, ours, their)
+            for name, their in zip(SHOWN, their_shown, strict=True):
+                kept[name].append(their)
+            over = bool(their_shown[3])
+            kept["action"].append(action)
+            kept["longer"].append(used(scenario, longer, state.unit_weapon_cooldowns))
+            kept["health"].append(state.unit_health)
+            kept["cooldown"].append(state.unit_weapon_cooldowns)
+            kept["position"].append(state.unit_positions)
+        ours_dead, theirs_dead = map(bool, battle.defeated(scenario, mine))
+        end = "won" if theirs_dead and not ours_dead else "lost" if ours_dead else "time"
+        return end, {name: np.stack([np.asarray(one) for one in rows]) for name, rows in kept.items()}
+
+
+def used(scenario: Scenario, longer: jax.Array, cooldown: jax.Array) -> np.ndarray:
+    """Of the draws of a step's ticks, that of each unit's attack; nobody attacks twice in a step. 0 where there was none."""
+    left = battle.TICK * (battle.TICKS - 1 - np.arange(battle.TICKS))[:, None]
+    off = np.abs(scenario.each("cooldown") + np.asarray(longer) - left - np.asarray(cooldown))
+    chosen = np.take_along_axis(np.asarray(longer), off.argmin(0)[None], axis=0)[0]
+    return np.where(off.min(0) < 1e-5, chosen, 0).astype(np.float32)
+
+
+def pinned(kept: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What the tests need of a battle: some of its steps, each with what was put in and what came of it."""
+    last = len(kept["action"]) - 1
+    some = np.unique(np.linspace(0, last, 16).astype(int))
+    few = np.isin(some, some[[3, 8, -1]])
+    narrow = {"action": np.uint8, "legal actions": bool, "reward": np.float32}
+    rows = {name: row[some].astype(narrow.get(name, row.dtype)) for name, row in kept.items()}
+    rows |= {name: rows[name][few] for name in ("observation", "state")}
+    return {"step": some, "few": few} | {name.replace(" ", "_"): row for name, row in rows.items()}
+
+
+def main(battles: int = 12, tasks: tuple[str, ...] = NAMES, pin: Path | None = None) -> None:
+    """Play and compare.
+
+    Args:
+        battles: of each task; there is one more, in which all stand and wait.
+        tasks: which.
+        pin: where to keep a battle of each task for the tests.
+    """
+    figures, keep = {}, {}
+    for name in tasks:
+        match, worst, alone, ends, steps = Match(name), Worst(), Worst(), defaultdict(int), 0
+        for seed in range(battles + 1):
+            style = STYLES[seed % len(STYLES)] if seed < battles else Style(waits=True)
+            end, kept = match.play(seed, style, worst, alone)
+            ends[end] += 1
+            steps += len(kept["action"])
+            if end == PINNED[name] and len(kept["action"]) > len(keep.get(name, {"action": ()})["action"]):
+                keep[name] = kept
+        figures[name] = {"battles": dict(ends), "steps": steps, **vars(worst), "never set right": vars(alone)}
+        print(f"\n{name}: {steps} steps, {dict(ends)}")
+        print(f"{'compared':42s} {'numbers':>9s} {'off by':>9s}   never set right")
+        for what, count in worst.compared.items():
+            print(f"{what:42s} {count:9d} {worst.off(what):>9s} {alone.off(what):>9s}")
+    if pin:
+        flat = {f"{name}/{key}": row for name, kept in keep.items() for key, row in pinned(kept).items()}
+        np.savez_compressed(pin, allow_pickle=False, **flat)
+    write(
+        "smax_oracle",
+        {"styles": [style._asdict() for style in STYLES], "jaxmarl": version("jaxmarl"), "tasks": figures},
+    )
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

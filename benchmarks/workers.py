@@ -1,0 +1,50 @@
+"""What worker processes save: lanes that step in this process against lanes that step in processes of their own.
+
+    python benchmarks/workers.py
+
+One environment takes 20 ms of a core for a step, another none: the second says what it costs to ask a worker. All take
+turns; what else runs on the machine takes from both.
+"""
+
+from functools import partial
+
+import numpy as np
+import tyro
+from burning import Burns
+from measure import interleave, show, summary, write
+
+from lare.tasks.workers import Envs, LocalEnvs, WorkerEnvs
+
+REFERENCE = "one process"
+
+
+def turn(envs: Envs, steps: int) -> None:
+    action = np.zeros((len(envs.batch.alive), envs.spec.agents, envs.spec.action_size), np.float32)
+    for _ in range(steps):
+        envs.step(action)
+
+
+def main(lanes: int = 4, processes: int = 2, burn_ms: float = 20, steps: int = 25, rounds: int = 5) -> None:
+    """Measure.
+
+    Args:
+        lanes: environments.
+        processes: among which they are dealt.
+        burn_ms: of a core, for a step of the first environment.
+        steps: of every lane in a turn.
+        rounds: how often each has its turn.
+    """
+    found = {}
+    for title, seconds, many in ((f"{burn_ms:g} ms a step", burn_ms / 1000, steps), ("0 ms a step", 0.0, 40 * steps)):
+        makers = [partial(Burns, seconds)] * lanes
+        with LocalEnvs(makers) as near, WorkerEnvs(makers, processes) as far:
+            contenders = {REFERENCE: near, f"{processes} workers": far}
+            taken = interleave({name: partial(turn, envs, many) for name, envs in contenders.items()}, rounds)
+        found[title] = summary(taken, many, REFERENCE)
+        show(f"{lanes} lanes, {title}", found[title], REFERENCE)
+        print(f"{1 / found[title][f'{processes} workers']['ratio']:.2f} times as fast")
+    write("workers", {"lanes": lanes, "processes": processes, "steps": steps, "rounds": rounds, "a step of all": found})
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)

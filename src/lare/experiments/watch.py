@@ -1,0 +1,143 @@
+"""Episodes of a run's policy, played anew, with everybody's credit: what films, credit maps and statistics are made of."""
+
+import contextlib
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lare.data import replay
+from lare.data.replay import Index
+from lare.data.trajectory import Trajectory
+from lare.tasks.env import HostEnv, JaxEnv
+from lare.tasks.table import make_env, make_host_env
+from lare.tasks.workers import LocalEnvs
+from lare.training import learner as learning
+from lare.training.annotate import annotate
+from lare.training.collect_device import play
+from lare.training.collect_host import Lanes
+from lare.training.compiled import compiled, module_of, new_memory
+from lare.training.config import TrainConfig
+from lare.training.learner import Learner, Paid
+from lare.training.run import Run
+from lare.training.seeds import of_seed
+from lare.training.session import load_learner
+from lare.training.streams import device_noise
+
+
+@dataclass(frozen=True)
+class Watched:
+    """Whole episodes of the first seed's policy."""
+
+    config: TrainConfig
+    steps: Trajectory
+    """[time episodes ...]."""
+    mask: Bool[np.ndarray, "time episodes"]
+    """Whether the episode had not ended before the step."""
+    factors: Float[np.ndarray, "time episodes rows factors"]
+    proxy: Float[np.ndarray, "time episodes agents"] | None
+    """By the decoders of the last checkpoint; None for a method without."""
+    state: Any
+    """The states after each step, where the environment is made of pure functions."""
+
+    @property
+    def reward(self) -> Float[np.ndarray, "time episodes agents"]:
+        """True."""
+        return np.asarray(self.steps.after.reward)
+
+    @property
+    def credit(self) -> Float[np.ndarray, "time episodes agents"]:
+        """Proxy rewards, or the true ones of a method without."""
+        return self.reward if self.proxy is None else self.proxy
+
+    def of_episode(self, values: np.ndarray, place: int = 0) -> np.ndarray:
+        """What belongs to one episode, [time ...]."""
+        return values[: int(self.mask[:, place].sum()), place]
+
+
+def watch(run: Run, episodes: int = 1, random: bool = False, key: int = 0) -> Watched:
+    """Play episodes as in training, or by random actions."""
+    config, learner, _, _ = load_learner(run)
+    one = jax.tree.map(lambda leaf: leaf[:1], learner)
+    actor = module_of(config).actor(one, run.config.settings.steps, config)
+    if random:
+        actor = jax.tree.map(jnp.zeros_like, actor)  # networks of zeros prefer nothing
+    env = make_env(run.config.task)
+    if isinstance(env, HostEnv):
+        env.close()
+        steps, mask, state = *on_host(run, config, actor, episodes), None
+    else:
+        steps, mask, state = on_device(env, config, actor, episodes, key)
+    factors = annotate(run, config, steps)
+    proxy = proxy_of(of_seed(learner), steps, factors, config) if config.method.has_proxy else None
+    return Watched(config, steps, mask, factors, proxy, state)
+
+
+def on_device(env: JaxEnv, config: TrainConfig, actor: Any, episodes: int, key: int) -> tuple[Any, Any, Any]:
+    """Whole episodes, in one compiled call."""
+    keys = jax.random.key(key)[None]
+    played = jax.jit(partial(play, env, count=episodes, config=config, greedy=False))(actor, keys)
+    steps, mask, state = jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], tuple(played))
+    return steps, mask, state
+
+
+def on_host(run: Run, config: TrainConfig, actor: Any, episodes: int) -> tuple[Trajectory, np.ndarray]:
+    """As many steps of each environment as an episode can have; what comes behind an end is masked."""
+    functions, env = compiled(config), config.env
+    memory = [new_memory(config, 1, episodes)]
+    steps, random = [], jax.random.key(0)
+    with contextlib.closing(LocalEnvs([partial(make_host_env, run.config.task)] * episodes)) as envs:
+        collector = Lanes(envs, run.seeds[:1], episodes)
+        collector.begin()
+        ended = np.zeros((1, episodes), bool)
+        while not ended.all():
+            random, now = jax.random.split(random)
+            shape = 1, episodes, env.agents, config.noise_size
+            shown = collector.shown
+            given = (
+                actor,
+                memory[0],
+                shown.observation,
+                shown.available,
+                device_noise(now, config.noise, shape),
+                collector.new,
+            )
+            action, memory[0] = functions.explore(*given)
+            one = collector.collect(lambda *_, action=action: np.asarray(action), np.zeros(1))
+            steps.append(jax.tree.map(lambda leaf: leaf[:, 0], one))
+            ended |= steps[-1].ended
+    played = jax.tree.map(lambda *rows: np.concatenate(rows), *steps)
+    before = np.cumsum(played.ended, axis=0) - played.ended
+    return played, before == 0
+
+
+def proxy_of(
+    learner: Learner, steps: Trajectory, factors: np.ndarray, config: TrainConfig
+) -> Float[np.ndarray, "time episodes agents"]:
+    """What a single seed's decoders say of episodes: these alone are put into a replay, and read."""
+    time, episodes = np.shape(steps.after.terminated)
+    held = replay.empty(config.columns, episodes, 2 * time + 2, len(config.env.teams))
+
+    @jax.jit
+    def decoded(steps: Trajectory, factors: Any) -> Any:
+        rows = learning.rows_of(steps, factors, config)
+        whole = replay.extend(held, *rows, learning.team_rewards(steps, config), steps.ended)
+        drawn = replay.read(whole, replay.newest(whole, time))
+        return jnp.swapaxes(learning.rewards(drawn, Paid(learner.credit, learner.scale), config), 0, 1)
+
+    return np.asarray(decoded(jax.tree.map(jnp.asarray, steps), jnp.asarray(factors)))
+
+
+def newest_episode(learner: Learner) -> Index | None:
+    """The steps of the last episode of a seed's first environment that has ended; None as long as there is none."""
+    held = learner.replay
+    if not int(replay.finished(held)[0]):
+        return None
+    env, episode = jnp.zeros((), int), held.episodes[0] - 1
+    begin = int(held.first[0, episode % held.first.shape[-1]])
+    number = jnp.arange(begin, int(replay.end_of(held, env, episode)))
+    return Index(jnp.zeros_like(number), number)

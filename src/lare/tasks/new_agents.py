@@ -1,0 +1,180 @@
+"""A first spec of a PettingZoo environment, and one for each of its teams where agents are of several kinds."""
+
+import inspect
+import json
+import re
+import sys
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from typing import Any
+
+from lare.tasks import agents as rows_of
+from lare.tasks.agents import Agent, kind
+from lare.tasks.env import Team
+from lare.tasks.new import (
+    Draft,
+    bodies,
+    bounds,
+    ending,
+    entries,
+    flattened,
+    plain,
+    sections_of,
+    warning,
+    without_rewards,
+)
+from lare.tasks.pettingzoo import ParallelHost, construct, limit_of
+from lare.tasks.spec import PETTINGZOO, TaskSpec
+
+MAKERS = ("parallel_env", "env", "raw_env")
+"""Names by which an environment is made; the module's says more."""
+
+BESIDE = re.compile(r"^(This environment is part of|Please read that page)|\bobservations?( space)?: |\baction space: ")
+"""What belongs to other keys, or to nobody."""
+
+
+def draft_of_agents(environment_id: str) -> Draft:
+    """Write down what a PettingZoo environment says of itself. Raises `LareError` where it cannot be made."""
+    environment = construct(environment_id, {})
+    limit = limit_of(environment, {})
+    kinds = list(dict.fromkeys(kind(name) for name in getattr(environment, "possible_agents", None) or ()))
+    module, _, maker = environment_id.removeprefix(PETTINGZOO).partition(":")
+    name = re.sub(r"[^\w.\-]+", "-", module.rpartition(".")[2] if maker in MAKERS else maker)
+    several = len(kinds) > 1
+    teams = tuple(stub(one, environment_id, team=one, agents=patterns(one)) for one in kinds) if several else ()
+    host = ParallelHost(environment, stub(name, environment_id, teams=teams, max_episode_steps=limit or 1000))
+    try:
+        texts, left_out = documented(environment.unwrapped if hasattr(environment, "unwrapped") else environment)
+        sizes = [f"observation_size = {host.spec.observation_size}", f"action_size = {host.spec.action_size}"]
+        specs = {
+            f"{name}-{team.name}.toml": write_team(environment_id, host, team, texts, left_out, sizes)
+            for team in host.spec.teams
+            if several
+        }
+    finally:
+        host.close()
+    if several:
+        own = {"description": texts["description"], "observation": "See the teams.", "action": "See the teams."}
+        heads: dict[str, str] = {}
+        head = [
+            "# Agents of each kind are a team, which learns for itself. If all of them are one team, leave this line out, and",
+            "# say below what the files of the teams say of observations and actions.",
+            f"teams = {json.dumps(list(specs))}",
+        ]
+    else:
+        own, heads, head = texts, heads_of(host, host.spec.teams[0]), []
+    arguments = defaults(environment)
+    lines = [
+        *warning(left_out),
+        f'name = "{name}"',
+        f'environment = "{environment_id}"',
+        *head,
+        *sizes,
+        'judges = "after"',
+        *([] if limit else ["max_episode_steps = 1000 # the environment tells no limit of its own"]),
+        *([f"# arguments = {{ {arguments} }} # unless this says something else"] if arguments else []),
+        *bodies(own, heads),
+    ]
+    missing = tuple(key for key in texts if not texts[key])
+    return Draft(name, "\n".join(lines) + "\n", missing, left_out, specs)
+
+
+def stub(name: str, environment: str, **keys: Any) -> TaskSpec:
+    """A spec that only tells which agents there are: its sizes are what the draft is to find out."""
+    texts = dict.fromkeys(("description", "observation", "action"), "-")
+    return TaskSpec(name=name, environment=environment, observation_size=1, action_size=1, **texts, **keys)
+
+
+def patterns(name: str) -> tuple[str, ...]:
+    """What matches the agents of a kind: one without a number is called like its kind."""
+    return (name, f"{name}_[0-9]*", f"{name}[0-9]*")
+
+
+def documented(environment: Any) -> tuple[dict[str, str], int]:
+    """Texts by their keys, and how much was left out. Environments document themselves in their class, or in its module."""
+    own = type(environment)
+    module = sys.modules.get(own.__module__)
+    sections = sections_of(max(vars(own).get("__doc__") or "", getattr(module, "__doc__", None) or "", key=len))
+    titled = next((body for title, body in sections.items() if title and body.strip()), "")
+    about = plain(rows_out(sections.get("description") or "\n\n".join(filter(None, (sections[""], titled)))))
+    found = {"description": [line for line in about if not BESIDE.search(line)]}
+    for key in ("observation", "action"):
+        names = (f"{key} space", key, f"{key}s")
+        section = next((sections[name] for name in names if sections.get(name, "").strip()), "")
+        found[key] = plain(section) or [line for line in about if re.search(rf"\b{key}s?( space)?: ", line)]
+    texts, left_out = {}, 0
+    for key, lines in found.items():
+        texts[key], dropped = without_rewards(lines)
+        left_out += dropped
+    if texts["description"]:
+        texts["description"] += ending(sections)
+    return texts, left_out
+
+
+def rows_out(text: str) -> str:
+    """PettingZoo's pages begin with a table of what its own library does with them."""
+    return "\n".join(line for line in text.splitlines() if not line.strip().startswith("|"))
+
+
+def write_team(
+    environment_id: str, host: ParallelHost, team: Team, texts: dict[str, str], left_out: int, sizes: Sequence[str]
+) -> str:
+    own = dict(texts)
+    others = {other.name for other in host.spec.teams} - {team.name}
+    for key in ("observation", "action"):
+        speaks = [line for line in texts[key].splitlines() if line.split(" ")[0].lower() not in others]
+        own[key] = "\n".join(speaks)
+    if own["description"]:
+        own["description"] += f"\nYou judge each agent that is called {team.name}, from what it observes itself."
+    members = [str(one.name) for one in host.agents[team.agents]]
+    lines = [
+        *warning(left_out),
+        f'name = "{team.name}"',
+        f'team = "{team.name}"',
+        f'environment = "{environment_id}"',
+        f"agents = {json.dumps([one for one in patterns(team.name) if matched(one, members)])}",
+        *sizes,
+        'judges = "after"',
+        *bodies(own, heads_of(host, team)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def matched(pattern: str, names: Sequence[str]) -> bool:
+    return any(fnmatchcase(name, pattern) for name in names)
+
+
+def heads_of(host: ParallelHost, team: Team) -> dict[str, str]:
+    """What the spaces say: of the first agent of a team, and of all beside it."""
+    first = host.agents[team.start]
+    return {
+        "observation": f"{entries(host.spec.observation_size)}{flattened(first.observation)}{padding(host, first)}.",
+        "action": f"{entries(host.spec.action_size)}{chosen(host, first)}.",
+    }
+
+
+def padding(host: ParallelHost, one: Agent) -> str:
+    if not rows_of.unlike(host.agents):
+        return ""
+    most = max(other.observation_size for other in host.agents)
+    zeros = f", then {most - one.observation_size} zeros" if most > one.observation_size else ""
+    names = ", ".join(str(other.name) for other in host.agents)
+    return f": {one.observation_size} of {one.name}'s own{zeros}, then all 0 but one: which agent it is ({names})"
+
+
+def chosen(host: ParallelHost, one: Agent) -> str:
+    if not one.discrete:
+        return bounds(one.action)
+    fewer = f"; {one.name} has only the first {one.action_size}" if one.action_size < host.spec.action_size else ""
+    return f", all 0 but one: the action that is taken{fewer}"
+
+
+def defaults(environment: Any) -> str:
+    """Arguments of the environment's class that TOML can say, as a table."""
+    raw = getattr(environment, "unwrapped", environment)
+    try:
+        parameters = inspect.signature(type(raw).__init__).parameters.values()
+    except (TypeError, ValueError):
+        return ""
+    told = [one for one in parameters if isinstance(one.default, bool | int | float | str)]
+    return ", ".join(f"{one.name} = {json.dumps(one.default)}" for one in told if one.name != "render_mode")

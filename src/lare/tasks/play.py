@@ -1,0 +1,89 @@
+"""Episodes of a task as one of its roles is judged: before training, to verify a latent function and to see what it says."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lare.tasks.env import EnvSpec, HostEnv, Team, Timestep, in_units, team_mean
+from lare.tasks.spec import TaskSpec
+from lare.tasks.table import make_host_env
+
+Policy = Callable[[np.ndarray], np.ndarray]
+"""From one observation of a single agent to one action of the environment."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One whole episode. A step has one row for each agent of the role's team, or a single one where the state is judged."""
+
+    before: Float[np.ndarray, "steps rows observation"]
+    action: Float[np.ndarray, "steps rows action"]
+    """In the environment's units."""
+    after: Float[np.ndarray, "steps rows observation"]
+    alive: Bool[np.ndarray, "steps rows"]
+    """Whether a row's agent acted."""
+    reward: Float[np.ndarray, "steps rows"]
+    """True; the team's where the state is judged."""
+    team_reward: Float[np.ndarray, " steps"]
+
+    @property
+    def total(self) -> float:
+        """R."""
+        return float(sum(self.team_reward))
+
+
+def team_of(role: TaskSpec, spec: EnvSpec) -> Team:
+    """The team that a spec speaks of; the first where it names none."""
+    return next((team for team in spec.teams if team.name == role.team), spec.teams[0])
+
+
+def rows_of(
+    role: TaskSpec, team: Team, shown: Timestep, action: Float[np.ndarray, "*batch agents action"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a role's function is given of some steps: observations and actions, [*batch rows ...]."""
+    of_team = action[..., team.agents, :]
+    if role.judged_from == "observation":
+        return shown.observation[..., team.agents, :], of_team
+    return shown.state[..., None, :], of_team.reshape(*of_team.shape[:-2], 1, -1)
+
+
+def episodes_of(role: TaskSpec, count: int, policy: Policy | None = None, seed: int = 0) -> list[Episode]:
+    """Episodes under a policy of a single agent, or under uniformly random actions."""
+    with contextlib.closing(make_host_env(role)) as env:
+        random = np.random.default_rng(seed)
+        return [episode_of(env, role, policy, random, seed + number) for number in range(count)]
+
+
+def episode_of(env: HostEnv, role: TaskSpec, policy: Policy | None, random: np.random.Generator, seed: int) -> Episode:
+    """One of them."""
+    team, columns = team_of(role, env.spec), []
+    for before, action, after in steps_of(env, policy, random, seed):
+        shown, taken = rows_of(role, team, before, action)
+        paid = np.asarray(team_mean(after.reward, before.alive, team))
+        alive, reward = before.alive[team.agents], after.reward[team.agents]
+        if role.judged_from == "state":
+            alive, reward = np.ones(1, bool), paid[None]
+        columns.append((shown, taken, rows_of(role, team, after, action)[0], alive, reward, paid))
+    return Episode(*(np.stack(part) for part in zip(*columns, strict=True)))
+
+
+def steps_of(
+    env: HostEnv, policy: Policy | None, random: np.random.Generator, seed: int
+) -> Iterator[tuple[Timestep, np.ndarray, Timestep]]:
+    """The steps of one episode: what each set out from, what was done, what it led to."""
+    timestep, ended = env.reset(seed), False
+    while not ended:
+        before = timestep
+        action = random_action(env.spec, before, random) if policy is None else policy(before.observation[0])[None]
+        timestep = env.step(action)
+        yield before, action, timestep
+        ended = bool(timestep.terminated or timestep.truncated)
+
+
+def random_action(spec: EnvSpec, shown: Timestep, random: np.random.Generator) -> Float[np.ndarray, "agents action"]:
+    """Uniform within the bounds, or over the choices that each agent has."""
+    drawn = random.uniform(-1, 1, (spec.agents, spec.action_size)).astype(np.float32)
+    return in_units(np.where(shown.available, drawn, -np.inf) if spec.discrete else drawn, spec)

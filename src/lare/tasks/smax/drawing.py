@@ -1,0 +1,90 @@
+"""Pictures of battles: a state, and an episode as a film."""
+
+from operator import itemgetter
+
+import jax
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle, Wedge
+
+from lare.tasks.smax.battle import ATTACK, FIELD, Battle
+from lare.tasks.smax.env import SMAX, State
+from lare.tasks.smax.scenarios import Scenario
+
+OURS, THEIRS, FALLEN = "#0072b2", "#d55e00", "#bbbbbb"
+
+
+def draw(env: SMAX, state: State, before: State | None = None, credit: float | None = None) -> Figure:
+    """A state: each unit a disc, filled as far as it is in health. From that before it, lines say who hit whom in between."""
+    figure, axes = blank()
+    last = None if before is None else before.battle
+    paint(axes, env.scenario, state.battle, last, credit)
+    return figure
+
+
+def frames(
+    env: SMAX, states: State, credit: Float[np.ndarray, " steps"] | None = None
+) -> list[UInt8[np.ndarray, "height width 3"]]:
+    """An episode as pictures.
+
+    Args:
+        env: what was played.
+        states: one for each picture, on a leading axis.
+        credit: of the step that led to each of them, shown as a number.
+    """
+    figure, axes = blank()
+    battles = jax.tree.map(np.asarray, states.battle)
+    found, before = [], None
+    for step in range(len(battles.step)):
+        axes.clear()
+        battle = jax.tree.map(itemgetter(step), battles)
+        paint(axes, env.scenario, battle, before, None if credit is None else float(credit[step]))
+        before = battle
+        found.append(pixels(figure))
+    return found
+
+
+def blank() -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(4, 4))
+    FigureCanvasAgg(figure)
+    return figure, figure.add_axes((0, 0, 1, 1))
+
+
+def paint(axes: Axes, scenario: Scenario, battle: Battle, before: Battle | None, credit: float | None) -> None:
+    axes.set(xlim=(-0.5, FIELD + 0.5), ylim=(-0.5, FIELD + 0.5), aspect="equal")
+    axes.axis("off")
+    axes.add_patch(Rectangle((0, 0), FIELD, FIELD, fill=False, edgecolor="#888888"))
+    lives = np.asarray(battle.health > 0)
+    share = np.asarray(battle.health) / scenario.each("health")
+    names = (*scenario.ours, *scenario.theirs)
+    for unit in np.argsort(lives, kind="stable"):  # the dead below
+        x, y = map(float, battle.position[unit])
+        if not lives[unit]:
+            axes.plot(x, y, marker="x", color=FALLEN, markersize=5)
+            continue
+        colour, radius = THEIRS if scenario.enemy[unit] else OURS, float(scenario.each("radius")[unit])
+        axes.add_patch(Circle((x, y), radius, facecolor="white", edgecolor=colour, linewidth=1.2))
+        axes.add_patch(Wedge((x, y), radius, 90, 90 + 360 * float(share[unit]), facecolor=colour, alpha=0.8))
+        axes.text(x, y, names[unit][0], fontsize=7, ha="center", va="center", color="black")
+    for shooter, hit in shots(scenario, battle, before) if before else ():
+        (x, y), (to_x, to_y) = battle.position[shooter], battle.position[hit]
+        axes.plot([x, to_x], [y, to_y], color=THEIRS if scenario.enemy[shooter] else OURS, linewidth=1, alpha=0.7)
+    said = f"step {int(battle.step)}" + ("" if credit is None else f"   credit {credit:.2g}")
+    axes.text(0.5, FIELD - 0.5, said, fontsize=9, ha="left", va="top")
+
+
+def shots(scenario: Scenario, battle: Battle, before: Battle) -> list[tuple[int, int]]:
+    """Who hit whom in a step: those whose cooldowns rose, for without a hit they fall."""
+    place = np.asarray(battle.action) - ATTACK
+    hit = np.where(scenario.enemy == 1, scenario.allies - 1 - place, scenario.allies + place)
+    fired = np.asarray(battle.cooldown) > np.asarray(before.cooldown)
+    return [(int(unit), int(hit[unit])) for unit in np.flatnonzero(fired)]
+
+
+def pixels(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -1,0 +1,131 @@
+"""The table of families: from what a task calls its environment to the environment.
+
+What stands before the first slash names the family; every other name is one of Gymnasium's. A new family is one module with a
+class that is a `JaxEnv` or a `HostEnv`, and one row here.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from lare.errors import LareError
+from lare.tasks.env import EnvSpec, HostEnv, JaxEnv
+from lare.tasks.spec import TaskSpec
+
+
+def particles(task: TaskSpec, **_: Any) -> JaxEnv:
+    from lare.tasks.particles.env import ParticleJaxEnv
+
+    return ParticleJaxEnv(task.environment_name)
+
+
+def gymnasium(task: TaskSpec, **kwargs: Any) -> HostEnv:
+    from lare.tasks.gymnasium import GymnasiumEnv
+
+    return GymnasiumEnv(task, **kwargs)
+
+
+def smax(task: TaskSpec, **_: Any) -> JaxEnv:
+    from lare.tasks.smax.env import SMAX
+
+    return SMAX(task.environment_name)
+
+
+def smac(task: TaskSpec, **_: Any) -> HostEnv:
+    from lare.tasks.starcraft import StarCraft
+
+    return StarCraft(task.environment_name)
+
+
+def pettingzoo(task: TaskSpec, **kwargs: Any) -> HostEnv:
+    from lare.tasks.pettingzoo import make
+
+    return make(task, **kwargs)
+
+
+FAMILIES: dict[str, Callable[..., JaxEnv | HostEnv]] = {
+    "particles": particles,
+    "smax": smax,
+    "smac": smac,
+    "pettingzoo": pettingzoo,
+}
+
+
+def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
+    """A task's environment; `kwargs` go to the constructor of one on the host.
+
+    Raises:
+        LareError: it cannot be made, or is not what the task says.
+    """
+    env = FAMILIES.get(task.family, gymnasium)(task, **kwargs)
+    try:
+        check(task, env.spec)
+    except LareError:
+        if isinstance(env, HostEnv):
+            env.close()
+        raise
+    return env
+
+
+def env_spec(task: TaskSpec) -> EnvSpec:
+    """Sizes and bounds of a task's environment, which is made for it once. Raises `LareError` as `make_env`."""
+    return known_spec(task.model_dump_json())
+
+
+@functools.lru_cache(maxsize=64)
+def known_spec(task: str) -> EnvSpec:
+    env = make_env(TaskSpec.model_validate_json(task))
+    if isinstance(env, HostEnv):
+        env.close()
+    return env.spec
+
+
+def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
+    """The same on the host, whatever it is."""
+    env = make_env(task, **kwargs)
+    if isinstance(env, HostEnv):
+        return env
+    from lare.tasks.on_host import OnHost
+
+    return OnHost(env)
+
+
+def check(task: TaskSpec, spec: EnvSpec) -> None:
+    """Raise `LareError` at the first thing in which an environment is not what a task says."""
+    names = [team.name for team in spec.teams]
+    if task.teams and [role.team for role in task.teams] != names:
+        raise LareError(f"the teams of {task.environment} must be {', '.join(names)}, in this order")
+    if len(names) > 1 and not task.teams and task.team is None:
+        raise LareError(
+            f"{task.environment} has the teams {', '.join(names)}: name a spec for each of them, in this order"
+        )
+    for key in ("max_episode_steps", "arguments") if spec.in_jax else ():
+        if getattr(task, key):
+            raise LareError(f"task {task.name!r}: {key} makes no difference to {task.environment}: leave it out")
+    if task.max_episode_steps not in (None, spec.max_steps):
+        raise LareError(
+            f"task {task.name!r}: max_episode_steps = {task.max_episode_steps}, but an episode of {task.environment} takes "
+            f"{spec.max_steps} steps: leave it out"
+        )
+    for name in task.measures:
+        if name not in spec.measures:
+            raise LareError(f"task {task.name!r}: {task.environment} does not measure {name!r}")
+    of_state = task.judged_from == "state"
+    if of_state and not spec.state_size:
+        raise LareError(f"task {task.name!r}: judged_from = 'state', but {task.environment} has no global state")
+    for role in task.roles:
+        team = spec.teams[names.index(role.team)] if role.team in names else spec.teams[0]
+        if of_state:
+            sizes = (
+                ("observation_size", "states", spec.state_size),
+                ("action_size", "joint actions", spec.action_size * team.size),
+            )
+        else:
+            sizes = (
+                ("observation_size", "observations", spec.observation_size),
+                ("action_size", "actions", spec.action_size),
+            )
+        for key, what, size in sizes:
+            said = getattr(role, key)
+            if said != size:
+                raise LareError(f"task {role.name!r}: {key} = {said}, but {task.environment} has {what} of size {size}")

@@ -1,0 +1,337 @@
+"""Many copies of a `HostEnv`, stepped in lockstep: in this process (`LocalEnvs`), or in several (`WorkerEnvs`).
+
+Workers are programs of their own, never forks: JAX runs threads in this process. Nor are they started by `multiprocessing`, which
+would run the user's script again in each. What an environment is made by is pickled, so it must be importable.
+
+Gymnasium's AsyncVectorEnv has one process for each environment, steps all of them or none, and does not say which one died.
+"""
+
+import contextlib
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Integer
+
+from lare.errors import LareError
+from lare.tasks.env import EnvSpec, HostEnv, Timestep
+from lare.tasks.environment import EnvironmentFault, fault
+
+Maker = Callable[[], HostEnv]
+
+PROGRAM = "import sys; from lare.tasks.workers import serve; serve(int(sys.argv[1]))"
+
+ARRAYS = tuple(name for name in Timestep._fields if name != "measures")
+
+GRACE = 2.0
+"""Seconds that workers have to close their environments."""
+
+
+class Envs(ABC):
+    """Environments side by side. `where` says which ones are meant; the rows of the others stay what they were.
+
+    The arrays that are returned are written into by the next call.
+    """
+
+    spec: EnvSpec
+
+    def __init__(self, specs: Sequence[EnvSpec]):
+        self.spec = specs[0]
+        for place, spec in enumerate(specs):
+            if sizes(spec) != sizes(self.spec):
+                raise LareError(f"environment {place} is not like environment 0: {sizes(spec)}, not {sizes(self.spec)}")
+        self.batch = stacked([blank(self.spec) for _ in specs])
+
+    def reset(self, where: Bool[np.ndarray, " n"], seeds: Integer[np.ndarray, " n"]) -> Timestep:
+        """Start episodes: the same ones for the same seeds."""
+        return self.all("reset", {place: int(seeds[place]) for place in np.flatnonzero(where).tolist()})
+
+    def step(
+        self, action: Float[np.ndarray, "n agents action"], where: Bool[np.ndarray, " n"] | None = None
+    ) -> Timestep:
+        """One step of each."""
+        places = range(len(self.batch.alive)) if where is None else np.flatnonzero(where).tolist()
+        return self.all("step", {place: action[place] for place in places})
+
+    def all(self, command: str, arguments: Mapping[int, Any]) -> Timestep:
+        for place, row in self.ask(command, arguments).items():
+            for name in ARRAYS:
+                getattr(self.batch, name)[place] = getattr(row, name)
+            for name, value in row.measures.items():
+                self.batch.measures[name][place] = value
+        return self.batch
+
+    @abstractmethod
+    def ask(self, command: str, arguments: Mapping[int, Any]) -> Mapping[int, Timestep]:
+        """What the environments at these places answer."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close all environments."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class LocalEnvs(Envs):
+    """Environments in this process, one after the other."""
+
+    def __init__(self, makers: Sequence[Maker]):
+        self.environments = [made(place, maker) for place, maker in enumerate(makers)]
+        super().__init__([environment.spec for environment in self.environments])
+
+    def ask(self, command: str, arguments: Mapping[int, Any]) -> Mapping[int, Timestep]:
+        return {place: told(place, self.environments[place], command, one) for place, one in arguments.items()}
+
+    def close(self) -> None:
+        for environment in self.environments:
+            environment.close()
+
+
+class WorkerEnvs(Envs):
+    """Environments in processes of their own, several in each where there are more than cores.
+
+    Raises:
+        LareError: one cannot be made, raised, died or did not answer in time. All workers have ended then.
+    """
+
+    def __init__(self, makers: Sequence[Maker], processes: int | None = None, timeout: float = 60.0):
+        self.timeout = timeout
+        self.workers: list[Worker] = []
+        number = min(len(makers), processes or cores())
+        try:
+            for first in range(number):
+                self.workers.append(Worker(range(first, len(makers), number)))
+            self.worker_of = {place: worker for worker in self.workers for place in worker.places}
+            specs = self.ask("make", {place: packed(place, maker) for place, maker in enumerate(makers)})
+            super().__init__([specs[place] for place in range(len(makers))])
+        except BaseException:
+            self.end()
+            raise
+
+    def ask(self, command: str, arguments: Mapping[int, Any]) -> dict[int, Any]:
+        if not self.workers:
+            raise LareError("the worker processes have ended: make the environments again")
+        try:
+            for worker in self.workers:
+                own = {place: arguments[place] for place in worker.places if place in arguments}
+                if own:
+                    worker.send(command, own)
+            return self.answers(command)
+        except BaseException:  # Ctrl-C too: what is still on its way would be taken for the next answer
+            self.end()
+            raise
+
+    def answers(self, command: str) -> dict[int, Any]:
+        """What comes back, as it comes."""
+        found: dict[int, Any] = {}
+        while waiting := [worker for worker in self.workers if worker.expected]:
+            until = min(worker.heard for worker in waiting) + self.timeout
+            ready = wait([worker.connection for worker in waiting], max(0.0, until - time.monotonic()))
+            for worker in waiting:
+                if worker.connection in ready:
+                    place, answer = worker.receive()
+                    if isinstance(answer, Failure):
+                        raise answer.error
+                    found[place] = answer
+                elif time.monotonic() > worker.heard + self.timeout:
+                    raise LareError(f"{worker.name} did not answer for {self.timeout:g} s in {command}")
+        return found
+
+    def close(self) -> None:
+        """Let the environments be closed, as far as they do that soon."""
+        for worker in self.workers:
+            worker.connection.close()  # which they take for the end
+        until = time.monotonic() + GRACE
+        for worker in self.workers:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                worker.process.wait(max(0.0, until - time.monotonic()))
+        self.end()
+
+    def end(self) -> None:
+        """End the processes."""
+        for worker in self.workers:
+            worker.end()
+        self.workers = []
+
+    def __del__(self):
+        self.end()
+
+
+class Failure:
+    """What a worker has to say instead of an answer."""
+
+    def __init__(self, error: LareError):
+        self.text = str(error)
+        self.place = error.place if isinstance(error, EnvironmentFault) else None
+
+    @property
+    def error(self) -> LareError:
+        """What the worker raised."""
+        if self.place is None:
+            return LareError(self.text)
+        error = EnvironmentFault(self.text)
+        error.place = self.place
+        return error
+
+
+class Worker:
+    """A process and its environments, from outside."""
+
+    def __init__(self, places: Sequence[int]):
+        self.places = places
+        self.expected: deque[int] = deque()
+        """Places of the environments that have not answered yet, in their order."""
+        self.heard = time.monotonic()
+        self.connection, theirs = Pipe()
+        # It finds what this process finds, and leaves the other cores to the other workers.
+        variables = (
+            {"OMP_NUM_THREADS": "1"}
+            | os.environ
+            | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+        )
+        with theirs:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-c", PROGRAM, str(theirs.fileno())],
+                stdin=subprocess.PIPE,
+                pass_fds=[theirs.fileno()],
+                env=variables,
+                start_new_session=True,  # Ctrl-C is for the one who waits
+            )
+
+    @property
+    def name(self) -> str:
+        """Which environment is meant where something goes wrong."""
+        return f"environment {self.expected[0]} (in worker process {self.process.pid})"
+
+    def send(self, command: str, arguments: dict[int, Any]) -> None:
+        self.expected.extend(arguments)
+        self.heard = time.monotonic()
+        try:
+            self.connection.send((command, arguments))
+        except OSError:
+            raise self.died() from None
+
+    def receive(self) -> tuple[int, Any]:
+        try:
+            answer = self.connection.recv()
+        except (EOFError, OSError):
+            raise self.died() from None
+        self.heard = time.monotonic()
+        return self.expected.popleft(), answer
+
+    def died(self) -> LareError:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(GRACE)
+        status = self.process.returncode
+        if status is None:
+            return LareError(f"{self.name} hung up")
+        how = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+        return LareError(f"{self.name} died: {how}")
+
+    def end(self) -> None:
+        self.connection.close()
+        self.process.kill()
+        self.process.wait()
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+
+
+def serve(descriptor: int) -> None:
+    """The other end: make, reset and step environments, one answer for each, until nobody asks any more."""
+    threading.Thread(target=end_with_the_parent, daemon=True).start()
+    connection = Connection(descriptor)
+    environments: dict[int, HostEnv] = {}
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        while True:
+            command, arguments = connection.recv()
+            for place, argument in arguments.items():
+                try:
+                    if command == "make":
+                        environments[place] = made(place, lambda argument=argument: pickle.loads(argument)())
+                        answer = environments[place].spec
+                    else:
+                        answer = told(place, environments[place], command, argument)
+                except LareError as error:
+                    answer = Failure(error)
+                connection.send(answer)
+    for environment in environments.values():
+        with contextlib.suppress(Exception):
+            environment.close()
+
+
+def end_with_the_parent() -> None:
+    """Standard input closes when the parent ends, however it ends; a step that hangs would not notice."""
+    while os.read(0, 1):
+        pass
+    os._exit(0)
+
+
+def packed(place: int, maker: Maker) -> bytes:
+    try:
+        return pickle.dumps(maker)
+    except Exception as error:
+        raise fault(f"environment {place} cannot be sent to a worker process", error) from error
+
+
+def made(place: int, maker: Maker) -> HostEnv:
+    try:
+        return maker()
+    except (Exception, SystemExit) as error:
+        raise fault(f"environment {place} cannot be made", error) from error
+
+
+def told(place: int, environment: HostEnv, command: str, argument: Any) -> Timestep:
+    """A reset or a step. Whatever it raises is a `LareError` of one line."""
+    try:
+        return environment.reset(argument) if command == "reset" else environment.step(argument)
+    except EnvironmentFault as error:
+        error.place = place
+        raise
+    except (Exception, SystemExit) as error:
+        raise fault(f"environment {place} failed in {command}", error) from error
+
+
+def cores() -> int:
+    """How many processes can run at the same time."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def sizes(spec: EnvSpec) -> tuple[Any, ...]:
+    return spec.teams, spec.observation_size, spec.action_size, spec.discrete, spec.state_size, spec.measures
+
+
+def blank(spec: EnvSpec) -> Timestep:
+    """Stands where no episode has begun."""
+    return Timestep(
+        observation=np.zeros((spec.agents, spec.observation_size), np.float32),
+        state=np.zeros(spec.state_size, np.float32),
+        available=np.ones((spec.agents, spec.action_size), bool),
+        alive=np.zeros(spec.agents, bool),
+        reward=np.zeros(spec.agents, np.float32),
+        terminated=np.array(False),
+        truncated=np.array(False),
+        measures={name: np.zeros((), np.float32) for name in spec.measures},
+    )
+
+
+def stacked(rows: Sequence[Timestep]) -> Timestep:
+    """Steps of several environments, with an axis for them in front."""
+    *parts, measures = (list(column) for column in zip(*rows, strict=True))
+    by_name = {name: np.stack([one[name] for one in measures]) for name in measures[0]}
+    observation, state, available, alive, reward, terminated, truncated = map(np.stack, parts)
+    return Timestep(observation, state, available, alive, reward, terminated, truncated, by_name)

@@ -1,0 +1,327 @@
+"""Collecting from environments that step on the host: the policy is asked once a step, for all environments of all seeds.
+
+An episode is its seed and its actions. That is how a run comes back into the middle of an episode, in any simulator: reset with
+the seed, play the actions, and compare what is shown bit for bit.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from lare.data.trajectory import Trajectory
+from lare.errors import LareError
+from lare.tasks.env import EnvSpec, Timestep, in_units, team_mean
+from lare.tasks.environment import EnvironmentFault
+from lare.tasks.spec import TaskSpec
+from lare.tasks.table import make_host_env
+from lare.tasks.workers import LocalEnvs, WorkerEnvs
+from lare.training.compiled import Compiled, new_memory
+from lare.training.config import TrainConfig
+from lare.training.evaluation import Evaluation
+from lare.training.streams import Stream, episode_seed, generator, host_noise
+
+Envs = LocalEnvs | WorkerEnvs
+"""Environments in one row: of the first seed, of the second, and so on."""
+
+Acting = Callable[[Timestep, Bool[np.ndarray, "seeds envs"]], Float[np.ndarray, "seeds envs agents action"]]
+"""From what is shown, and which episodes are new, to actions."""
+
+
+class Diverged(LareError):
+    """What is being trained is not finite any more."""
+
+
+class Lanes:
+    """The training environments of a run, and the episode that is under way in each."""
+
+    def __init__(self, envs: Envs, seeds: Sequence[int], environments: int):
+        self.envs, self.seeds, self.environments = envs, list(seeds), environments
+        self.spec = envs.spec
+        count = len(self.seeds) * environments
+        self.episode = np.full(count, -1)
+        """The number of the episode under way in each."""
+        self.actions: list[list[np.ndarray]] = [[] for _ in range(count)]
+        """Of that episode, in the environment's units."""
+        self.shown = shaped(envs.batch, self.shape)
+        """What each environment shows now; written into by the next step."""
+        self.new = np.ones(self.shape, bool)
+        """Which episodes have not had a step yet."""
+        self.dropped = np.zeros(count, bool)
+        """Which episodes could not be had again by `restore`."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self.seeds), self.environments
+
+    def begin(self, where: Bool[np.ndarray, " all"] | None = None) -> None:
+        """Start the next episode in some of the environments, or in all."""
+        where = np.ones(len(self.episode), bool) if where is None else where
+        self.episode[where] += 1
+        for number in np.flatnonzero(where):
+            self.actions[number] = []
+        self.asked(lambda: self.envs.reset(where, self.episode_seeds()))
+        self.new = self.new | where.reshape(self.shape)
+
+    def episode_seeds(self) -> Int[np.ndarray, " all"]:
+        """What each environment's present episode begins with."""
+        return np.array(
+            [
+                episode_seed(self.seed_of(number), Stream.TRAINING_EPISODES, self.number_of(number))
+                for number in range(len(self.episode))
+            ]
+        )
+
+    def seed_of(self, place: int) -> int:
+        """The seed that an environment belongs to."""
+        return self.seeds[place // self.environments]
+
+    def number_of(self, place: int) -> int:
+        """The present episode's number among all episodes of the seed."""
+        return int(self.episode[place]) * self.environments + place % self.environments
+
+    def step(self, taken: Float[np.ndarray, "seeds envs agents action"]) -> None:
+        """One step of all, by actions in the environment's units."""
+        rows = taken.reshape(-1, *taken.shape[2:])
+        for actions, row in zip(self.actions, rows, strict=True):
+            actions.append(row)
+        self.asked(lambda: self.envs.step(rows))
+
+    def collect(self, act: Callable[..., Any], noise: Float[np.ndarray, "time seeds envs agents noise"]) -> Trajectory:
+        """Let the policy act for as many steps as there is noise."""
+        steps = blank_trajectory(self.spec, self.shown, self.shape, len(noise))
+        for time, disturbance in enumerate(noise):
+            action = act(self.shown, disturbance, self.new)
+            check_finite(action, self.seeds)
+            taken = in_units(action, self.spec)
+            write(steps.before, self.shown, time)
+            steps.action[:, time], steps.taken[:, time] = action, taken
+            self.step(taken)
+            write(steps.after, self.shown, time)
+            self.new = np.zeros(self.shape, bool)
+            ended = np.logical_or(self.shown.terminated, self.shown.truncated)
+            if ended.any():
+                self.begin(ended.ravel())
+        return steps
+
+    def asked(self, answer: Callable[[], Timestep]) -> Timestep:
+        """What the environments answer; a fault is said with its place."""
+        try:
+            return answer()
+        except EnvironmentFault as fault:
+            raise fault if fault.place is None else EnvironmentFault(f"{fault}, {self.where(fault.place)}") from None
+
+    def where(self, place: int) -> str:
+        """Where an environment is."""
+        among = f" in environment {place % self.environments}" if self.environments > 1 else ""
+        return (
+            f"at step {len(self.actions[place])} of episode {self.episode[place]} of seed {self.seed_of(place)}{among}"
+        )
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """All that it takes to be here again."""
+        found = {"episode": self.episode.copy(), "new": self.new}
+        observation = self.envs.batch.observation
+        for number, actions in enumerate(self.actions):
+            size = self.spec.agents, self.spec.action_size
+            found[f"actions{number}"] = np.reshape(actions, (-1, *size))
+            found[f"observation{number}"] = observation[number].copy()
+        return found
+
+    def restore(self, saved: dict[str, np.ndarray]) -> list[str]:
+        """Get into the middle of the episodes again, by their seeds and actions.
+
+        Where that does not lead to the same observation, bit for bit, the environment is not deterministic: a new episode
+        begins. Returns what is to be said of each of these, and sets `dropped`.
+        """
+        self.episode = saved["episode"].copy()
+        count = len(self.episode)
+        whole = [saved[f"actions{number}"] for number in range(count)]
+        self.asked(lambda: self.envs.reset(np.ones(count, bool), self.episode_seeds()))
+        lost = np.zeros(count, bool)
+        for step in range(max(map(len, whole))):
+            where = np.array([step < len(actions) for actions in whole]) & ~lost
+            rows = np.stack([actions[min(step, len(actions) - 1)] if len(actions) else self.idle for actions in whole])
+            shown = self.asked(lambda rows=rows, where=where: self.envs.step(rows, where))
+            lost |= where & (shown.terminated | shown.truncated)
+        self.actions, self.new = [list(actions) for actions in whole], saved["new"].copy()
+        now = self.envs.batch.observation
+        same = [np.array_equal(now[number], saved[f"observation{number}"]) for number in range(count)]
+        self.dropped = lost | ~np.array(same)
+        messages = [
+            f"episode {self.episode[number]} of seed {self.seed_of(number)} was dropped after {len(whole[number])} steps: "
+            "the environment did not come back to the same observation by the same actions"
+            for number in np.flatnonzero(self.dropped).tolist()
+        ]
+        if self.dropped.any():
+            self.begin(self.dropped)
+        return messages
+
+    @property
+    def idle(self) -> Float[np.ndarray, "agents action"]:
+        """An action for an environment that is not asked."""
+        return np.zeros((self.spec.agents, self.spec.action_size), np.float32)
+
+
+class HostCollector:
+    """The training environments, the policy that acts in them, and environments to evaluate it in."""
+
+    def __init__(self, envs: Envs, evaluation: Envs, config: TrainConfig, functions: Compiled, seeds: Sequence[int]):
+        self.config, self.functions, self.seeds = config, functions, list(seeds)
+        self.lanes, self.evaluation = Lanes(envs, seeds, config.environments), evaluation
+        self.memory = new_memory(config, *self.lanes.shape)
+        self.lanes.begin()
+
+    def collect(self, actor: Any, step: int) -> Trajectory:
+        """The steps of the iteration that begins at this step: random ones, as long as it is to warm up."""
+        config, random = self.config, [generator(seed, Stream.EXPLORATION, step) for seed in self.seeds]
+        shape = config.rollout_steps, config.environments, config.env.agents
+        if step < config.warmup:
+            uniform = [one.uniform(-1, 1, (*shape, config.env.action_size)) for one in random]
+            return self.lanes.collect(lambda shown, noise, new: noise, np.stack(uniform, 1).astype(np.float32))
+        noise = np.stack([host_noise(one, config.noise, (*shape, config.noise_size)) for one in random], 1)
+
+        def act(shown: Timestep, noise: np.ndarray, new: np.ndarray) -> np.ndarray:
+            given = self.memory, shown.observation, shown.available
+            action, self.memory = self.functions.explore(actor, *given, noise, new)
+            return np.asarray(action)
+
+        return self.lanes.collect(act, noise)
+
+    def evaluate(self, actor: Any, episodes: int) -> Evaluation:
+        """Whole episodes of the policy, from the starts that the run is evaluated from."""
+        act = policy(self.functions, self.config, actor, self.seeds, episodes)
+        return evaluate(self.evaluation, act, self.seeds, episodes)
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """Seeds and actions of the episodes under way, and what the actors remember of them."""
+        memory = {f"memory{place}": np.asarray(leaf) for place, leaf in enumerate(jax.tree.leaves(self.memory))}
+        return self.lanes.saved() | memory
+
+    def restore(self, saved: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
+        """Into the middle of the episodes again; which of them could not be had, and what is to be said of it."""
+        leaves, structure = jax.tree.flatten(self.memory)
+        self.memory = jax.tree.unflatten(structure, [jnp.asarray(saved[f"memory{i}"]) for i in range(len(leaves))])
+        messages = self.lanes.restore(saved)
+        return self.lanes.dropped.reshape(self.lanes.shape), messages
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.lanes.envs.close()
+        self.evaluation.close()
+
+
+def host_collector(
+    task: TaskSpec, config: TrainConfig, functions: Compiled, seeds: Sequence[int], episodes: int
+) -> HostCollector:
+    """A task's environments around its policy: in this process, or in processes of their own where a seed has several."""
+    kind, maker = LocalEnvs if config.environments == 1 else WorkerEnvs, partial(make_host_env, task)
+    envs, evaluation = (kind([maker] * (len(seeds) * count)) for count in (config.environments, episodes))
+    return HostCollector(envs, evaluation, config, functions, seeds)
+
+
+def policy(functions: Compiled, config: TrainConfig, actor: Any, seeds: Sequence[int], episodes: int) -> Acting:
+    """The policy of all seeds as it is evaluated, for so many episodes of each, from their start."""
+    memory = [new_memory(config, len(seeds), episodes)]
+    random = [generator(seed, Stream.EVALUATION_NOISE, 0) for seed in seeds]
+
+    def act(shown: Timestep, new: np.ndarray) -> np.ndarray:
+        given = (actor, memory[0], shown.observation, shown.available)
+        if config.algorithm.greedy:
+            action, memory[0] = functions.act(*given, None, new)
+        else:
+            shape = (episodes, config.env.agents, config.noise_size)
+            noise = np.stack([host_noise(one, config.noise, shape) for one in random])
+            action, memory[0] = functions.explore(*given, noise, new)
+        return np.asarray(action)
+
+    return act
+
+
+def shaped(rows: Timestep, shape: tuple[int, ...]) -> Timestep:
+    """Views of the same arrays, by seeds and environments."""
+
+    def view(leaf: np.ndarray) -> np.ndarray:
+        return leaf.reshape(*shape, *leaf.shape[1:])
+
+    *parts, measures = rows
+    return Timestep(*map(view, parts), measures={name: view(values) for name, values in measures.items()})  # pyright: ignore
+
+
+def blank_trajectory(spec: EnvSpec, shown: Timestep, shape: tuple[int, int], time: int) -> Trajectory:
+    """Room for so many steps."""
+    seeds, environments = shape
+
+    def rows(like: np.ndarray) -> np.ndarray:
+        return np.zeros((seeds, time, environments, *like.shape[2:]), like.dtype)
+
+    def timestep() -> Timestep:
+        return jax.tree.map(rows, shown)
+
+    action = np.zeros((seeds, time, environments, spec.agents, spec.action_size), np.float32)
+    taken = action.astype(np.float32 if spec.discrete else spec.low.dtype)
+    return Trajectory(timestep(), action, taken, timestep())
+
+
+def write(rows: Timestep, shown: Timestep, time: int) -> None:
+    """Copy what is shown to its place."""
+    *columns, measures = rows
+    for column, value in zip(columns, shown, strict=False):
+        column[:, time] = value
+    for name, column in measures.items():
+        column[:, time] = shown.measures[name]
+
+
+def check_finite(action: Float[np.ndarray, "seeds *rest"], seeds: Sequence[int]) -> None:
+    """Raise `Diverged` where the actions of a seed's policy are not finite."""
+    for seed, chosen in zip(seeds, action, strict=True):
+        if not np.isfinite(chosen).all():
+            raise Diverged(
+                f"training diverged: the policy of seed {seed} is not finite any more; the last checkpoint is whole"
+            )
+
+
+def evaluate(envs: Envs, act: Acting, seeds: Sequence[int], episodes: int, first: int = 0) -> Evaluation:
+    """One episode in each environment, all in lockstep, each from a start of its own.
+
+    The starts depend on seed and place only, which are counted from `first`: every evaluation of a run begins from the same
+    ones, and none of them is a start of a training episode.
+    """
+    spec, shape = envs.spec, (len(seeds), episodes)
+
+    starts = [
+        episode_seed(seed, Stream.EVALUATION_EPISODES, place)
+        for seed in seeds
+        for place in range(first, first + episodes)
+    ]
+    running, new = np.ones(len(starts), bool), np.ones(shape, bool)
+    teams = len(spec.teams)
+    returns, sums = np.zeros((*shape, teams)), np.zeros((*shape, teams))
+    lengths = np.zeros(shape, int)
+    measures = {name: np.full(shape, np.nan) for name in spec.measures}
+    try:
+        envs.reset(running, np.array(starts))
+        shown = shaped(envs.batch, shape)
+        while running.any():
+            actions = act(shown, new)
+            alive = shown.alive.copy()
+            check_finite(actions, seeds)
+            rows = in_units(actions, spec)
+            envs.step(rows.reshape(-1, *rows.shape[2:]), running)
+            now = running.reshape(shape)
+            earned = shown.reward.astype(np.float64) * now[..., None]
+            returns += np.stack([team_mean(earned, alive, team) for team in spec.teams], axis=-1)
+            sums += np.stack([earned[..., team.agents].sum(axis=-1) for team in spec.teams], axis=-1)
+            lengths += now
+            ended = now & (shown.terminated | shown.truncated)
+            for name, values in measures.items():
+                values[ended] = shown.measures[name][ended]
+            running, new = running & ~ended.ravel(), np.zeros_like(new)
+    except EnvironmentFault as fault:
+        where = "" if fault.place is None else f", in an evaluation of seed {seeds[fault.place // episodes]}"
+        raise EnvironmentFault(f"{fault}{where}") from None
+    return Evaluation(returns, sums, lengths, measures)

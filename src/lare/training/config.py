@@ -1,0 +1,122 @@
+"""What the compiled functions of a run hold fixed."""
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from lare.algorithms.table import Algorithm, AlgorithmSettings, Consumes, Noise
+from lare.credit.decomposition import CreditSettings
+from lare.credit.methods import Encoder, Method
+from lare.tasks.env import EnvSpec
+from lare.tasks.spec import JudgedFrom
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """What is to be trained and how."""
+
+    env: EnvSpec
+    judged_from: JudgedFrom
+    method: Method
+    algorithm: Algorithm
+    hyperparameters: AlgorithmSettings
+    credit: CreditSettings
+    scale_rewards: bool
+    """Divide the rewards that the algorithm sees by the running root mean square of R/T."""
+    factors: tuple[int, ...]
+    """Of each team's latent function; empty for a method that needs none."""
+    environments: int
+    """That each seed collects from."""
+    rollout_steps: int
+    """Steps of each environment in an iteration."""
+    capacity: int
+    """Rows of the replay, of each environment."""
+    steps: int
+    """Environment steps of the whole run."""
+    fit_updates: int
+    """Updates of the decoder in an iteration that fits it; one that goes with each update of the algorithm has no need of it."""
+
+    @property
+    def noise(self) -> Noise:
+        """What the policy that collects is disturbed by."""
+        return self.algorithm.noise(self.env.discrete)
+
+    @property
+    def noise_size(self) -> int:
+        """Numbers of noise for an agent's action."""
+        return self.env.action_size + (self.noise is Noise.UNIFORM)
+
+    @property
+    def of_state(self) -> bool:
+        """Whether credit is judged from the global state: one row a step for each team."""
+        return self.judged_from == "state"
+
+    @property
+    def judged_rows(self) -> int:
+        """Rows of a step that are judged: one for each agent, or one for each team."""
+        return len(self.env.teams) if self.of_state else self.env.agents
+
+    def judged(self, place: int) -> slice:
+        """The rows of a team."""
+        return slice(place, place + 1) if self.of_state else self.env.teams[place].agents
+
+    @property
+    def warmup(self) -> int:
+        """Environment steps with random actions before the first update."""
+        return getattr(self.hyperparameters, "warmup", 0)
+
+    @property
+    def interleaved(self) -> bool:
+        """Whether each update of the algorithm goes with one of the decoder."""
+        return (
+            self.algorithm.consumes is not Consumes.ROLLOUTS
+            and self.method.descends
+            and self.method.fit is not None
+            and not self.method.fit.apart
+        )
+
+    @property
+    def features(self) -> tuple[int, ...]:
+        """Size of what each team's decoder sees of a judged row."""
+        if self.method.encoder is Encoder.LATENT:
+            return self.factors
+        shown = self.env.state_size if self.of_state else self.env.observation_size
+        size = {None: 0, Encoder.RAW: shown, Encoder.STATE_ACTION: shown}[self.method.encoder]
+        if self.method.encoder is Encoder.STATE_ACTION or self.raw_differences:
+            size += self.env.action_size * (self.env.agents if self.of_state else 1)
+        return (size + (shown if self.raw_differences else 0),) * len(self.env.teams)
+
+    @property
+    def raw_differences(self) -> bool:
+        """Whether raw features are [s, a, s - s'], as published for a single agent."""
+        return self.method.encoder is Encoder.RAW and self.env.agents == 1 and not self.of_state
+
+    @property
+    def columns(self) -> dict[str, jax.ShapeDtypeStruct]:
+        """What a row of the replay holds: what the algorithm and the decoder read, and no more."""
+        env, consumes = self.env, self.algorithm.consumes
+        stored = consumes is not Consumes.ROLLOUTS
+        encoder = self.method.encoder
+        raw = encoder in (Encoder.RAW, Encoder.STATE_ACTION)
+        wanted = {
+            "observation": stored or (raw and not self.of_state),
+            "action": stored or encoder is Encoder.STATE_ACTION or self.raw_differences,
+            "factors": self.method.latent,
+            "reward": True,
+            "state": env.state_size > 0 and ((raw and self.of_state) or consumes is Consumes.SEQUENCES),
+            "available": env.masks_actions and consumes is Consumes.SEQUENCES,
+            "alive": env.agents_leave,
+            "terminated": consumes is Consumes.TRANSITIONS,
+        }
+        shapes: dict[str, tuple[tuple[int, ...], type]] = {
+            "observation": ((env.agents, env.observation_size), np.float32),
+            "action": ((env.agents, env.action_size), np.float32),
+            "factors": ((self.judged_rows, max(self.factors, default=0)), np.float32),
+            "reward": ((env.agents,), np.float32),
+            "state": ((env.state_size,), np.float32),
+            "available": ((env.agents, env.action_size), np.bool_),
+            "alive": ((env.agents,), np.bool_),
+            "terminated": ((), np.bool_),
+        }
+        return {name: jax.ShapeDtypeStruct(*shapes[name]) for name, there in wanted.items() if there}

@@ -1,0 +1,92 @@
+"""Which settings, method, algorithm and task go together."""
+
+from lare.algorithms.table import ALGORITHMS, Consumes
+from lare.credit.methods import Decoder, Method, Reward, find_method
+from lare.data.replay import room
+from lare.errors import LareError
+from lare.tasks.env import EnvSpec
+from lare.tasks.spec import TaskSpec
+from lare.tasks.table import env_spec
+from lare.training.settings import ResolvedSettings, Settings, resolve
+
+
+def decide(settings: Settings, task: TaskSpec) -> ResolvedSettings:
+    """Fill in what was left open, by the task, and check the whole.
+
+    Raises:
+        LareError: method, algorithm and task do not go together, or the steps are no whole number of iterations.
+    """
+    if task.team is not None:
+        raise LareError(f"{task.name} is one team of {task.environment}: train the task that has both")
+    env = env_spec(task)
+    resolved = resolve(settings, env)
+    if resolved.judges == task.judges:  # what the task says anyway makes no other run
+        resolved = resolved.model_copy(update={"judges": None})
+    check_algorithm(resolved, task, env)
+    check_method(resolved, task, env)
+    check_room(resolved, task, env)
+    return resolved
+
+
+def check_algorithm(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> None:
+    """Raise `LareError` where an algorithm cannot train on a task."""
+    row = ALGORITHMS[resolved.algorithm]
+    many = env.agents > 1
+    if not (row.many_agents if many else row.one_agent):
+        raise LareError(
+            f"{row.name} is for {'a single agent' if many else 'many agents'}, and {task.name} is a task "
+            f"of {'many' if many else 'one'}"
+        )
+    if len(env.teams) > 1 and not row.many_teams:
+        raise LareError(f"{row.name} trains one team, and {task.name} has {len(env.teams)}: ippo trains several")
+    if env.discrete and not row.discrete:
+        raise LareError(f"{row.name} acts by numbers within bounds, and {task.name} offers a choice: ppo can choose")
+    if not env.discrete and not row.continuous:
+        raise LareError(f"{row.name} chooses among actions, and those of {task.name} are numbers within bounds")
+
+
+def check_method(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> None:
+    """Raise `LareError` where a method cannot assign credit in a task."""
+    method, many = find_method(resolved.method), env.agents > 1
+    if method.reward is Reward.DESIGNED and resolved.judged_by(task) == "both":
+        raise LareError(f"{method.name} is one reward a step: it judges the observation before or after, not both")
+    if resolved.scale_rewards and method.has_proxy and not method.in_units:
+        raise LareError(
+            f"scale_rewards divides by the size of returns, and the rewards of {method.name} are not in their unit"
+        )
+    if method.for_one_only and many:
+        raise LareError(f"{method.name} assigns credit to a single agent, and {task.name} is a task of many")
+    if method.for_many_only and not many:
+        raise LareError(f"{method.name} assigns credit among agents, and {task.name} is a task of one")
+    if method.for_many_only and task.judged_from == "state":
+        raise LareError(f"{method.name} assigns credit among agents, and {task.name} is judged from the global state")
+    if method.whole_episodes and not (env.fixed_length and resolved.rollout_steps % env.max_steps == 0):
+        raise LareError(
+            f"{method.name} looks at whole episodes of one length: those of {task.name} must have a fixed one, and rollout_steps "
+            "be a multiple of it"
+        )
+    check_credit(resolved, method, env)
+
+
+def check_credit(resolved: ResolvedSettings, method: Method, env: EnvSpec) -> None:
+    """Raise `LareError` where a decoder cannot be what is asked for."""
+    credit = resolved.credit
+    if "drawn_steps" in method.settings and not env.fixed_length and credit.steps < credit.drawn_steps:
+        raise LareError(
+            f"credit.steps = {credit.steps} is less than credit.drawn_steps = {credit.drawn_steps}, of one episode"
+        )
+    if method.decoder is Decoder.DIASTER and not credit.hidden:
+        raise LareError(f"credit.hidden is empty, and {method.name} needs a hidden layer")
+
+
+def check_room(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> None:
+    """Raise `LareError` where the replay could not hold what an iteration stores, or a run is too short."""
+    longest = env.max_steps
+    if 2 * resolved.steps < longest:
+        raise LareError(
+            f"steps = {resolved.steps} are too few: an episode of {task.name} takes up to {longest}, and a run at least half of one"
+        )
+    needed = room(resolved.rollout_steps, longest) * resolved.environments
+    if resolved.rereads and resolved.capacity < needed:
+        what = "a rollout" if ALGORITHMS[resolved.algorithm].consumes is Consumes.ROLLOUTS else "an iteration"
+        raise LareError(f"capacity = {resolved.capacity} is too small: {what} of {task.name} takes up to {needed}")

@@ -1,0 +1,35 @@
+"""What episodes of a policy gave."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lare.tasks.env import EnvSpec
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Of whole episodes of each seed's policy."""
+
+    returns: Float[np.ndarray, "seeds episodes teams"]
+    """R of each team: the sum over time of the mean over its agents that are alive."""
+    sums: Float[np.ndarray, "seeds episodes teams"]
+    """The sum over time and over all agents of a team: what particle tasks are reported by."""
+    lengths: Int[np.ndarray, "seeds episodes"]
+    """In steps."""
+    measures: dict[str, Float[np.ndarray, "seeds episodes"]]
+    """What the task asks to be taken from the last step."""
+
+    def metrics(self, spec: EnvSpec) -> dict[str, Float[np.ndarray, " seeds"]]:
+        """Means over the episodes, by the keys of metrics.jsonl; several teams have each its own."""
+        found = {"evaluation/length": self.lengths.mean(axis=1)}
+        found |= {f"evaluation/{name}": values.mean(axis=1) for name, values in self.measures.items()}
+        for place, team in enumerate(spec.teams):
+            for suffix in ("", f"_{team.name}") if place == 0 else (f"_{team.name}",):
+                if suffix and len(spec.teams) == 1:
+                    continue
+                found[f"evaluation/return{suffix}"] = self.returns[..., place].mean(axis=1)
+                if spec.agents > 1:
+                    found[f"evaluation/summed_return{suffix}"] = self.sums[..., place].mean(axis=1)
+        return found

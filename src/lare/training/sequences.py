@@ -1,0 +1,218 @@
+"""Algorithms that consume whole episodes: draw them, relabel them by the newest decoder, update; as often as episodes have ended.
+
+QMIX and VDN. The team has one reward a step: the mean over its agents that are alive. The mixer is given the global state by its
+running mean and deviation (PyMARL2: as it comes, where its environments scale it); where there is none, all observations side
+by side.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
+
+from lare.algorithms import qmix
+from lare.algorithms.recurrent import Recurrent
+from lare.data import replay
+from lare.data.replay import Index, Replay
+from lare.data.sampling import EpisodeDraw, draw_distinct_episodes
+from lare.data.trajectory import Trajectory
+from lare.normalise import RunningMeanStd, new_mean_std, observe, standardise_if_known
+from lare.tasks.env import team_mean
+from lare.training import learner as common
+from lare.training.config import TrainConfig
+from lare.training.learner import Learner, Paid, draw_credit
+
+Measured = dict[str, Float[Array, "*seeds"]]
+
+
+class SequenceState(NamedTuple):
+    """What QMIX learns, and what stands around it."""
+
+    qmix: qmix.QMIX
+    states: RunningMeanStd
+    """Of what the mixer is given."""
+    done: Int[Array, ""]
+    """Updates that the episodes so far have been worth: one for `update_every`, made or not."""
+
+
+class Actor(NamedTuple):
+    """What is needed to act."""
+
+    agent: Recurrent
+    epsilon: Float[Array, ""]
+
+
+def settings_of(config: TrainConfig) -> qmix.QMIXSettings:
+    """The algorithm's hyperparameters."""
+    assert isinstance(config.hyperparameters, qmix.QMIXSettings)
+    return config.hyperparameters
+
+
+def mixer_input_size(config: TrainConfig) -> int:
+    """Size of what the mixer is given."""
+    return config.env.state_size or config.env.agents * config.env.observation_size
+
+
+def mixer_input(shown: Any, config: TrainConfig) -> Float[Array, "*batch state"]:
+    """The global state, or all observations side by side."""
+    if config.env.state_size:
+        return shown["state"]
+    observation = shown["observation"]
+    return observation.reshape(*observation.shape[:-2], -1)
+
+
+def init(key: PRNGKeyArray, config: TrainConfig) -> SequenceState:
+    """The untrained algorithm."""
+    env, size = config.env, mixer_input_size(config)
+    made = qmix.init(key, env.agents, env.observation_size, env.action_size, size, settings_of(config))
+    return SequenceState(made, new_mean_std(size), jnp.zeros((), jnp.int32))
+
+
+def actor(learner: Learner, done: int, config: TrainConfig) -> Actor:
+    """What is needed to act, of all seeds."""
+    state = learner.algorithm
+    return Actor(state.qmix.online.agent, jnp.full(state.done.shape, qmix.epsilon(done, settings_of(config))))
+
+
+def memory(config: TrainConfig) -> qmix.Memory:
+    """What the agents remember before the first step of an episode."""
+    return qmix.no_memory((config.env.agents,), config.env.action_size, settings_of(config))
+
+
+def act(
+    actor: Actor,
+    memory: qmix.Memory,
+    observation: Float[Array, "*batch agents observation"],
+    available: Bool[Array, "*batch agents action"],
+    noise: Float[Array, "*batch agents 1+action"] | None,
+    config: TrainConfig,
+) -> tuple[Float[Array, "*batch agents action"], qmix.Memory]:
+    """The available actions of largest value or, with noise, sometimes any."""
+    return qmix.act(actor.agent, memory, observation, available, noise, actor.epsilon)
+
+
+def sequences(
+    held: Replay, episodes: EpisodeDraw, steps: int, paid: Paid, states: RunningMeanStd, config: TrainConfig
+) -> qmix.Sequences:
+    """Drawn episodes, each padded with its last step to so many, with what the method pays for them."""
+    number = jnp.minimum(jnp.arange(steps), episodes.length[:, None] - 1)
+    env = jnp.broadcast_to(episodes.first.env[:, None], number.shape)
+    drawn = replay.read(held, Index(env, episodes.first.number[:, None] + number))
+    here = (jnp.arange(steps) < episodes.length[:, None]) * episodes.mask[:, None]
+    reward = common.rewards(drawn, paid, config)
+
+    def at_all_times(name: str) -> Array:
+        return jnp.concatenate([drawn.before[name][:, :1], drawn.after[name]], axis=1)
+
+    observation = at_all_times("observation")
+    shown = {"observation": observation, "state": at_all_times("state") if config.env.state_size else None}
+    shape = (*observation.shape[:-1], config.env.action_size)
+    return qmix.Sequences(
+        observation=observation,
+        state=standardise_if_known(states, mixer_input(shown, config)),
+        available=at_all_times("available") if config.env.masks_actions else jnp.ones(shape, bool),
+        action=drawn.before["action"],
+        reward=here * team_mean(reward, common.alive(drawn, config), config.env.teams[0]),
+        terminated=here * (jnp.arange(steps) == episodes.length[:, None] - 1),
+        mask=here,
+    )
+
+
+def lengths(config: TrainConfig) -> list[int]:
+    """To which a batch may be cut: the shortest that holds its longest episode is taken."""
+    longest = config.env.max_steps
+    if config.env.fixed_length:
+        return [longest]
+    return sorted({-(-longest // 4), -(-longest // 2), longest})
+
+
+def one_update(
+    learner: Learner, episodes: EpisodeDraw, key: PRNGKeyArray, number: Int[Scalar, ""], config: TrainConfig, steps: int
+) -> tuple[Learner, Measured]:
+    """The decoder's update, and then the algorithm's, of one seed."""
+    draw_key, fit_key = jax.random.split(key)
+    credit, measured = learner.credit, {}
+    draw = draw_credit(learner.replay, draw_key, 1, config)
+    if draw is not None:
+        credit, measured = common.fit(credit, learner.replay, jax.tree.map(lambda leaf: leaf[0], draw), fit_key, config)
+    state, settings = learner.algorithm, settings_of(config)
+    paid = Paid(credit, learner.scale)
+    batch = sequences(learner.replay, episodes, steps, paid, state.states, config)
+    played = number * settings.update_every
+    moves = played // settings.target_every > (played - settings.update_every) // settings.target_every
+    made, learned = qmix.update(state.qmix, batch, moves, settings)
+    return learner._replace(credit=credit, algorithm=state._replace(qmix=made)), measured | learned
+
+
+def improve(
+    learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], done: Int[Scalar, ""], config: TrainConfig
+) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
+    """One update for every `update_every` episodes that have ended, once there are enough for a batch; the mean of each metric.
+
+    All seeds together, so that the length of a batch is one number and no more is computed than is needed.
+    """
+    settings, before = settings_of(config), learner.algorithm.done
+    worth = jnp.sum(learner.replay.episodes, axis=1) // settings.update_every
+    ready = jnp.sum(jax.vmap(replay.finished)(learner.replay), axis=1) >= settings.batch_size
+    owed = jnp.where(ready, worth - before, 0)
+    states = jax.vmap(partial(with_states, config=config))(learner.algorithm.states, steps)
+    learner = learner._replace(algorithm=learner.algorithm._replace(states=states, done=worth))
+    cuts = lengths(config)
+    changing = learner.algorithm.qmix, learner.credit
+
+    def update(turn: Int[Scalar, ""], carry: tuple[Any, Measured]) -> tuple[Any, Measured]:
+        (made, credit), total = carry
+        now = learner._replace(algorithm=learner.algorithm._replace(qmix=made), credit=credit)
+        draw_keys, update_keys = jnp.unstack(
+            jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, turn)))(keys), axis=1
+        )
+        draw = partial(draw_distinct_episodes, count=settings.batch_size)
+        episodes = jax.vmap(draw)(now.replay, draw_keys)
+        longest = jnp.max(episodes.length * (episodes.mask > 0))
+        branches = [jax.vmap(partial(one_update, config=config, steps=cut)) for cut in cuts]
+        place = jnp.searchsorted(jnp.asarray(cuts), longest)
+        made_and_credit, measured = jax.lax.switch(
+            place,
+            [partial(changed, branch) for branch in branches],
+            now,
+            episodes,
+            update_keys,
+            before + turn + 1,
+        )
+        counts = turn < owed
+
+        def choose(new: Array, old: Array) -> Array:
+            return jnp.where(counts.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        return jax.tree.map(choose, made_and_credit, (made, credit)), {
+            name: total[name] + jnp.where(counts, values, 0) for name, values in measured.items()
+        }
+
+    names = ["critic/loss", "critic/value"]
+    if config.interleaved:
+        names += loss_names(config)
+    nothing = {name: jnp.zeros(len(owed)) for name in names}
+    (made, credit), total = jax.lax.fori_loop(0, jnp.max(owed), update, (changing, nothing))
+    learner = learner._replace(algorithm=learner.algorithm._replace(qmix=made), credit=credit)
+    measured = {name: values / owed for name, values in total.items()}  # NaN where there was no update
+    return learner, measured | {"algorithm/updates": owed.astype(jnp.float32)}
+
+
+def changed(branch: Any, *given: Any) -> tuple[tuple[Any, Any], Measured]:
+    """What an update changes of the learner, which holds more than a branch should pass on."""
+    learner, measured = branch(*given)
+    return (learner.algorithm.qmix, learner.credit), measured
+
+
+def loss_names(config: TrainConfig) -> list[str]:
+    """The metrics of the decoders' updates."""
+    some = [{"credit/loss": jnp.zeros(())} for _ in config.env.teams]
+    return list(common.by_team(some, config))
+
+
+def with_states(states: RunningMeanStd, steps: Trajectory, config: TrainConfig) -> RunningMeanStd:
+    """With what the mixer will be given of new steps."""
+    rows = mixer_input({"state": steps.after.state, "observation": steps.after.observation}, config)
+    return observe(states, jnp.asarray(rows).reshape(-1, rows.shape[-1]))

@@ -1,0 +1,223 @@
+"""A run under way: the training state, the environments around it, one iteration of the work at a time."""
+
+import contextlib
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lare.algorithms.table import ALGORITHMS
+from lare.credit.methods import find_method
+from lare.data.trajectory import Trajectory
+from lare.tasks.env import JaxEnv, Timestep
+from lare.tasks.table import env_spec, make_env
+from lare.training import checkpoint
+from lare.training.annotate import annotate
+from lare.training.collect_device import DeviceCollector
+from lare.training.collect_host import HostCollector, host_collector
+from lare.training.compiled import Compiled, compiled, new_learners
+from lare.training.config import TrainConfig
+from lare.training.learner import Learner, forget_episodes
+from lare.training.run import Run
+from lare.training.seeds import lines
+from lare.training.settings import ResolvedSettings
+from lare.training.streams import Stream, seed_keys, stream_keys
+
+
+def config_for(run: Run) -> TrainConfig:
+    """What the run's compiled functions hold fixed."""
+    task, settings, env = run.config.task, run.config.settings, env_spec(run.config.task)
+    return TrainConfig(
+        env=env,
+        judged_from=task.judged_from,
+        method=find_method(settings.method),
+        algorithm=ALGORITHMS[settings.algorithm],
+        hyperparameters=settings.hyperparameters,
+        credit=settings.credit,
+        scale_rewards=settings.scale_rewards,
+        factors=tuple(function.size_by(run.judges) for function in run.functions),
+        environments=settings.environments,
+        rollout_steps=settings.rollout_steps,
+        capacity=settings.rows(env.max_steps),
+        steps=settings.steps,
+        fit_updates=settings.fit_updates,
+    )
+
+
+@dataclass
+class Session:
+    """The training state, and what is around it on the host."""
+
+    run: Run
+    config: TrainConfig
+    functions: Compiled
+    learner: Learner
+    collector: DeviceCollector | HostCollector
+    step: int = 0
+    """Environment steps done, of each seed."""
+    metrics_length: int = 0
+    """Bytes of metrics.jsonl that belong to the state."""
+    latest: dict[str, Float[Array, " seeds"]] = field(default_factory=dict)
+    """What the last updates measured."""
+
+    @property
+    def settings(self) -> ResolvedSettings:
+        return self.run.config.settings
+
+    @property
+    def actor(self) -> Any:
+        """What is needed to act now."""
+        return self.functions.actor(self.learner, self.step)
+
+    def advance(self) -> None:
+        """One iteration: steps, factors, replay, sometimes the decoder, the algorithm."""
+        steps = self.collector.collect(self.actor, self.step)
+        self.learner = self.functions.store(self.learner, steps, annotate(self.run, self.config, steps))
+        if self.step >= self.config.warmup:
+            self.update(steps)
+        self.step += self.settings.iteration_steps
+
+    def update(self, steps: Trajectory) -> None:
+        """The decoder's own updates, where it has any and their turn has come, and the algorithm's."""
+        number = self.step // self.settings.iteration_steps
+        fits = self.config.method.descends and not self.config.interleaved
+        if fits and number % self.settings.fit_every == 0:
+            self.learner, fitted = self.functions.fit(self.learner, stream_keys(self.run.seeds, Stream.FIT, self.step))
+            self.latest |= fitted
+        keys = seed_keys(jnp.asarray(self.run.seeds), self.step + 1)
+        self.learner, learned = self.functions.improve(self.learner, steps, keys, self.step)
+        if np.any(np.asarray(learned.get("algorithm/updates", 1)) > 0):
+            self.latest |= learned
+
+    def report(self, rate: float) -> list[dict[str, Any]]:
+        """Evaluate, always from the same starts; one line of metrics.jsonl for each seed."""
+        evaluation = self.collector.evaluate(self.actor, self.settings.evaluation_episodes)
+        measured = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest
+        return lines(self.run.seeds, self.step, measured, rate)
+
+    def save(self) -> None:
+        """Write a checkpoint."""
+        host = {"step": self.step, "metrics_length": self.metrics_length}
+        arrays = {f"latest/{name}": np.asarray(values) for name, values in self.latest.items()}
+        arrays |= {f"collector/{name}": values for name, values in self.collector.saved().items()}
+        checkpoint.save(self.run.checkpoint, self.learner, host, arrays)
+
+    def return_to(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[str]:
+        """Put everything around the learner back to a checkpoint; returns what is to be said about it."""
+        self.step, self.metrics_length = host["step"], host["metrics_length"]
+        self.latest = {name: jnp.asarray(values) for name, values in part(arrays, "latest/").items()}
+        dropped, messages = self.collector.restore(part(arrays, "collector/"))
+        if dropped.any():
+            self.learner = drop(self.learner, jnp.asarray(dropped))
+            self.save()  # before a new episode is in the rows of the dropped one, which the checkpoint has as written
+        return messages
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.collector.close()
+
+
+def part(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays whose names begin so, by the rest of their names."""
+    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
+drop = jax.jit(jax.vmap(forget_episodes))
+
+
+def load_learner(run: Run) -> tuple[TrainConfig, Learner, dict[str, Any], dict[str, np.ndarray]]:
+    """The training state of a run's last checkpoint, and what stood with it."""
+    config = config_for(run)
+    return config, *checkpoint.load(run.checkpoint, learner_shape(run, config))
+
+
+def learner_shape(run: Run, config: TrainConfig) -> Learner:
+    """A learner with the shapes of its arrays in their place."""
+    return jax.eval_shape(partial(new_learners, config=config), seed_keys(jnp.asarray(run.seeds), 0))
+
+
+def new_learner(run: Run, config: TrainConfig) -> Learner:
+    """An untrained learner."""
+    keys = seed_keys(jnp.asarray(run.seeds), 0)
+    made = ahead(jax.jit(partial(new_learners, config=config)), keys)
+    give_memory_back()
+    return made(keys)
+
+
+def start(run: Run) -> Session:
+    """A session before its first step."""
+    config = config_for(run)
+    return begin(run, config, partial(new_learner, run, config))
+
+
+def restore(run: Run) -> tuple[Session, list[str]]:
+    """A session as of the last checkpoint, and what is to be said about it."""
+    config, learner, host, arrays = load_learner(run)
+    session = begin(run, config, lambda: learner)
+    return session, session.return_to(host, arrays)
+
+
+def begin(run: Run, config: TrainConfig, make_learner: Callable[[], Learner]) -> Session:
+    """Environments and compiled functions around a learner, which is made when they are there.
+
+    The compiler needs hundreds of megabytes for a while; what it gives back in time holds the replay.
+    """
+    functions = compile_ahead(run, config, compiled(config))
+    give_memory_back()
+    learner = make_learner()
+    if config.env.in_jax:
+        env = make_env(run.config.task)
+        assert isinstance(env, JaxEnv)
+        return Session(run, config, functions, learner, DeviceCollector(env, config, run.seeds))
+    episodes = run.config.settings.evaluation_episodes
+    return Session(
+        run, config, functions, learner, host_collector(run.config.task, config, functions, run.seeds, episodes)
+    )
+
+
+def compile_ahead(run: Run, config: TrainConfig, functions: Compiled) -> Compiled:
+    """The functions of a run, compiled for the shapes that they will see."""
+    lead = len(run.seeds), config.rollout_steps, config.environments
+    env = config.env
+
+    def shape(*sizes: int, dtype: Any = np.float32) -> Any:
+        return jax.ShapeDtypeStruct((*lead, *sizes), dtype)
+
+    action = shape(env.agents, env.action_size)
+    flag = shape(dtype=np.bool_)
+    shown = Timestep(
+        observation=shape(env.agents, env.observation_size),
+        state=shape(env.state_size),
+        available=shape(env.agents, env.action_size, dtype=np.bool_),
+        alive=shape(env.agents, dtype=np.bool_),
+        reward=shape(env.agents),
+        terminated=flag,
+        truncated=flag,
+        measures={name: shape() for name in env.measures},
+    )
+    taken = shape(env.agents, env.action_size, dtype=np.float32 if env.discrete else env.low.dtype)
+    steps = Trajectory(shown, action, taken, shown)
+    factors = shape(config.judged_rows, max(config.factors, default=0))
+    learner, keys = learner_shape(run, config), jax.eval_shape(seed_keys, jnp.asarray(run.seeds), 0)
+    return functions._replace(
+        store=ahead(functions.store, learner, steps, factors),
+        improve=ahead(functions.improve, learner, steps, keys, 0),
+        assess=ahead(functions.assess, learner),
+    )
+
+
+def ahead(function: Any, *shapes: Any) -> Any:
+    """A jitted function, compiled before it is called."""
+    return function.lower(*shapes).compile()
+
+
+def give_memory_back() -> None:
+    """What the compiler has freed, glibc keeps for the process unless it is asked not to."""
+    with contextlib.suppress(OSError, AttributeError):  # there is another C library, or none that can be asked
+        ctypes.CDLL(None).malloc_trim(0)
