@@ -58,7 +58,7 @@ class Replay(NamedTuple):
 
 
 class Index(NamedTuple):
-    """Which transitions: of which environment, and their numbers."""
+    """Transitions, each by its environment and its number there."""
 
     env: Int[Array, "*batch"]
     number: Int[Array, "*batch"]

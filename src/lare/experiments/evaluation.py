@@ -11,6 +11,8 @@ from jaxtyping import Float
 
 from lare.errors import LareError
 from lare.tasks.env import HostEnv, in_units
+from lare.tasks.gymnasium import GymnasiumEnv
+from lare.tasks.spaces import OneHot
 from lare.tasks.spec import check_against_environment
 from lare.tasks.table import env_spec, make_env, make_host_env
 from lare.tasks.workers import LocalEnvs
@@ -37,18 +39,15 @@ def policy_of(run: Run, seed: int | None = None) -> Callable[[np.ndarray], Any]:
     act = acting(run, 0 if seed is None else run.seeds.index(seed))
     if not env_spec(run.config.task).discrete:
         return act
-    first = first_action(run)
-    return lambda observation: first + int(np.argmax(act(observation)))
+    space = choices(run)
+    return lambda observation: space.number(act(observation))
 
 
-def first_action(run: Run) -> int:
-    """The number of the first action, as the environment counts them."""
-    from lare.tasks.gymnasium import GymnasiumEnv
-
-    env = make_env(run.config.task)
-    assert isinstance(env, GymnasiumEnv)
-    with closing(env):
-        return env.environment.action_space.start  # type: ignore[attr-defined]
+def choices(run: Run) -> OneHot:
+    """The actions of a run's environment, which are a choice."""
+    with closing(GymnasiumEnv(run.config.task)) as env:
+        assert isinstance(env.environment.action_space, OneHot)
+        return env.environment.action_space
 
 
 def acting(run: Run, place: int = 0) -> Callable[[np.ndarray], np.ndarray]:

@@ -4,10 +4,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from lare.tasks.canvas import blank, pixels
 from lare.tasks.particles.task import ParticleTask
 
 TEAM, OTHERS, LANDMARK = "#0072b2", "#d55e00", "#9a9a9a"
@@ -45,12 +45,6 @@ def frames(
     return found
 
 
-def blank() -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(4, 4))
-    FigureCanvasAgg(figure)
-    return figure, figure.add_axes((0, 0, 1, 1))
-
-
 def reach(task: ParticleTask, position: Float[np.ndarray, "*steps entities 2"]) -> float:
     """Half the side of a picture in which nothing is cut off."""
     outermost = np.abs(position) + task.world.size[:, None]
@@ -84,9 +78,3 @@ def paint(
     if credit is not None:
         for (x, y), size, value in zip(position, task.world.size, credit, strict=False):
             axes.text(x, y + size + 0.01 * side, f"{value:.2g}", fontsize=8, ha="center", va="bottom")
-
-
-def pixels(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

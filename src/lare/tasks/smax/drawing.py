@@ -6,10 +6,10 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle, Wedge
 
+from lare.tasks.canvas import blank, pixels
 from lare.tasks.smax.battle import ATTACK, FIELD, Battle
 from lare.tasks.smax.env import SMAX, State
 from lare.tasks.smax.scenarios import Scenario
@@ -47,12 +47,6 @@ def frames(
     return found
 
 
-def blank() -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(4, 4))
-    FigureCanvasAgg(figure)
-    return figure, figure.add_axes((0, 0, 1, 1))
-
-
 def paint(axes: Axes, scenario: Scenario, battle: Battle, before: Battle | None, credit: float | None) -> None:
     axes.set(xlim=(-0.5, FIELD + 0.5), ylim=(-0.5, FIELD + 0.5), aspect="equal")
     axes.axis("off")
@@ -82,9 +76,3 @@ def shots(scenario: Scenario, battle: Battle, before: Battle) -> list[tuple[int,
     hit = np.where(scenario.enemy == 1, scenario.allies - 1 - place, scenario.allies + place)
     fired = np.asarray(battle.cooldown) > np.asarray(before.cooldown)
     return [(int(unit), int(hit[unit])) for unit in np.flatnonzero(fired)]
-
-
-def pixels(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
