@@ -58,12 +58,12 @@ SHORT: Mapping[str, Mapping[str, Any]] = {
 }
 LAPTOP: Mapping[str, Mapping[str, Any]] = {
     "qmix": {
-        "steps": 600_000,
+        "steps": 200_000,
         "evaluate_every": 20_000,
         "qmix": QMIXSettings(batch_size=32, update_every=4, epsilon_steps=50_000),
     },
 }
-"""Twice as many updates as PyMARL2 makes, each on a quarter of the episodes: within 600,000 steps updates are what is scarce."""
+"""Twice as many updates as PyMARL2 makes, each on a quarter of the episodes: within 200,000 steps updates are what is scarce."""
 PAPER: Mapping[str, Mapping[str, Any]] = {"qmix": {"steps": 10_050_000}}
 
 BUDGETS: Mapping[str, Budget] = {
