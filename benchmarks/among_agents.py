@@ -16,11 +16,11 @@ from jaxtyping import Float
 from measure import apart, correlation, write
 
 from lare.experiments.watch import on_device, proxy_of
+from lare.run.directory import Run, open_run
 from lare.tasks.env import JaxEnv
 from lare.tasks.table import make_env
 from lare.training.annotate import annotate
 from lare.training.compiled import module_of
-from lare.training.run import Run, open_run
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
 

@@ -13,7 +13,7 @@ from measure import write
 
 from lare.experiments.agents import sample
 from lare.experiments.credit import correlations
-from lare.training.run import open_run
+from lare.run.directory import open_run
 
 
 def main(directories: list[str]) -> None:

@@ -21,10 +21,10 @@ from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import METHODS
 from lare.data import replay
+from lare.run.directory import open_run
 from lare.training import learner as common
 from lare.training.config import TrainConfig
 from lare.training.learner import Learner, Paid
-from lare.training.run import open_run
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
 

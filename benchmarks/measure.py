@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 import lare
+from lare.run.decide import decide
+from lare.run.directory import create
 from lare.source import source
-from lare.training.decide import decide
-from lare.training.run import create
 from lare.training.session import Session, start
 from lare.training.train import chosen_functions
 

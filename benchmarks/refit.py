@@ -22,10 +22,10 @@ from lare.credit.methods import Fit
 from lare.data import replay
 from lare.data.sampling import CreditDraw, draw_parts
 from lare.normalise import Scale
+from lare.run.directory import open_run
 from lare.training import learner as common
 from lare.training.config import TrainConfig
 from lare.training.learner import Learner
-from lare.training.run import open_run
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
 

@@ -14,9 +14,9 @@ from lare import cli
 from lare.algorithms.ppo import PPOSettings
 from lare.algorithms.table import ALGORITHMS
 from lare.latent.function import LatentFunction, verified
+from lare.run.settings import Settings
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import FAMILIES
-from lare.training.settings import Settings
 from toys import PHI, REWARD, Chase, toy_spec
 
 # Most of a small run's time is compilation, and many tests compile the same. JAX may have been imported already, and

@@ -17,19 +17,20 @@ MODULES = {
 }
 
 MUST_NOT_KNOW = {
-    "errors": "tasks llm latent credit networks algorithms training experiments cli",
-    "files": "tasks llm latent credit networks algorithms training experiments cli",
-    "source": "tasks llm latent credit networks algorithms training experiments cli",
-    "networks": "tasks llm latent credit algorithms training experiments cli",
-    "normalise": "tasks llm latent credit networks algorithms training experiments cli",
-    "tasks": "llm latent data credit networks algorithms training experiments cli",
-    "data": "llm latent credit networks algorithms training experiments cli",
-    "llm": "latent data credit networks algorithms training experiments cli",
-    "latent": "data credit networks algorithms training experiments cli",
-    "credit": "tasks llm latent data algorithms training experiments cli",
-    "algorithms": "tasks llm latent data credit training experiments cli",
-    "theory": "tasks llm latent credit networks algorithms training experiments cli",
-    "training": "experiments cli",
+    "errors": "tasks llm latent credit networks algorithms run training experiments cli",
+    "files": "tasks llm latent credit networks algorithms run training experiments cli",
+    "source": "tasks llm latent credit networks algorithms run training experiments cli",
+    "networks": "tasks llm latent credit algorithms run training experiments cli",
+    "normalise": "tasks llm latent credit networks algorithms run training experiments cli",
+    "tasks": "llm latent data credit networks algorithms run training experiments cli",
+    "data": "llm latent credit networks algorithms run training experiments cli",
+    "llm": "latent data credit networks algorithms run training experiments cli",
+    "latent": "data credit networks algorithms run training experiments cli",
+    "credit": "tasks llm latent data algorithms run training experiments cli",
+    "algorithms": "tasks llm latent data credit run training experiments cli",
+    "theory": "tasks llm latent credit networks algorithms run training experiments cli",
+    "run": "llm training experiments cli",
+    "training": "llm experiments cli",
     "experiments": "cli",
 }
 

@@ -9,8 +9,8 @@ from rich.progress import Progress
 
 from lare.cli import watch
 from lare.experiments.jobs import Job
-from lare.training.decide import decide
-from lare.training.settings import Settings
+from lare.run.decide import decide
+from lare.run.settings import Settings
 from toys import toy_spec
 
 

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from lare.latent.design import design as design
     from lare.latent.function import LatentFunction as LatentFunction
     from lare.latent.function import load as load_function  # noqa: F401
+    from lare.run.directory import Run as Run
+    from lare.run.directory import open_run as open_run
+    from lare.run.settings import Settings as Settings
     from lare.tasks.episodic import EpisodicReward as EpisodicReward
     from lare.tasks.spec import TaskSpec as TaskSpec
     from lare.tasks.spec import load_task as load_task
-    from lare.training.run import Run as Run
-    from lare.training.run import open_run as open_run
-    from lare.training.settings import Settings as Settings
     from lare.training.train import resume as resume
     from lare.training.train import train as train
 
@@ -38,9 +38,9 @@ HOMES = {
     "EpisodicReward": "lare.tasks.episodic",
     "TaskSpec": "lare.tasks.spec",
     "load_task": "lare.tasks.spec",
-    "Run": "lare.training.run",
-    "open_run": "lare.training.run",
-    "Settings": "lare.training.settings",
+    "Run": "lare.run.directory",
+    "open_run": "lare.run.directory",
+    "Settings": "lare.run.settings",
     "resume": "lare.training.train",
     "train": "lare.training.train",
 }

@@ -3,7 +3,7 @@
 from typing import get_args
 
 from lare.algorithms.table import ALGORITHMS, TABLE, Name
-from lare.training.settings import Settings
+from lare.run.settings import Settings
 
 
 def test_names_are_those_of_the_types():

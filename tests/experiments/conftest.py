@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from lare.training.decide import decide
-from lare.training.run import Run, describe
-from lare.training.settings import Settings
+from lare.run.decide import decide
+from lare.run.directory import Run, describe
+from lare.run.settings import Settings
 from toys import toy_spec
 
 

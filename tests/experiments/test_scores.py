@@ -7,7 +7,7 @@ import pytest
 from lare.errors import LareError
 from lare.experiments.compare import find_runs
 from lare.experiments.scores import RETURN, by_label, grouped
-from lare.training.run import Run
+from lare.run.directory import Run
 from toys import toy_spec
 
 

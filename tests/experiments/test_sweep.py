@@ -19,7 +19,7 @@ from lare.experiments.jobs import as_json, train_one
 from lare.experiments.processes import shares
 from lare.experiments.sweep import read_sweep, run_sweep
 from lare.experiments.tables import rows_of, write_table
-from lare.training.run import open_run
+from lare.run.directory import open_run
 from lare.training.train import Interrupted
 from toys import At
 

@@ -8,10 +8,10 @@ import pytest
 import lare
 from lare.errors import LareError
 from lare.latent.function import verified
+from lare.run.directory import open_run
 from lare.tasks.particles.table import TASKS
 from lare.tasks.particles.task import STEPS
 from lare.training import session as sessions
-from lare.training.run import open_run
 from lare.training.train import Interrupted
 from toys import At, figures
 

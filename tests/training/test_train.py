@@ -22,12 +22,12 @@ from lare.credit.methods import METHODS
 from lare.data import replay
 from lare.errors import LareError
 from lare.latent.function import verified
+from lare.run import checkpoint
+from lare.run.checkpoint import saved_step
+from lare.run.directory import FORMAT, open_run
 from lare.source import source
 from lare.tasks.environment import EnvironmentFault
-from lare.training import checkpoint
 from lare.training import session as sessions
-from lare.training.checkpoint import saved_step
-from lare.training.run import FORMAT, open_run
 from lare.training.train import Interrupted
 from toys import PHI, At, figures, pick_spec, toy_spec
 

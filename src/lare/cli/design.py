@@ -142,7 +142,7 @@ def policy_that_plays(run: Path | None, spec: TaskSpec) -> Callable[[np.ndarray]
     if run is None:
         return None
     from lare.experiments.evaluation import acting
-    from lare.training.run import open_run
+    from lare.run.directory import open_run
 
     opened = open_run(run)
     if opened.config.task.environment != spec.environment:

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from lare.cli.terminal import RunDirectories, RunDirectory, progress, say, show
 from lare.errors import LareError
-from lare.training.settings import Settings, set_in_vain
+from lare.run.settings import Settings, set_in_vain
 
 DEFAULTS = Settings()
 
@@ -35,7 +35,7 @@ def train(
     """
     import lare
     from lare.latent.function import CHANGED, load, per_role
-    from lare.training.decide import decide
+    from lare.run.decide import decide
     from lare.training.train import check_given
 
     if resume is not None:
@@ -72,8 +72,8 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
     from lare.experiments.evaluation import evaluate_run
     from lare.experiments.statistics import mean_and_deviation, plus_minus
     from lare.experiments.video import check_video, record_video
+    from lare.run.directory import open_run
     from lare.tasks.table import env_spec
-    from lare.training.run import open_run
 
     opened = open_run(run)
     if video is not None:
@@ -120,7 +120,7 @@ def cross_play(
     from lare.experiments.agents import Match
     from lare.experiments.agents import cross_play as play
     from lare.experiments.statistics import mean_and_deviation, plus_minus
-    from lare.training.run import open_run
+    from lare.run.directory import open_run
 
     runs = open_run(first), open_run(second)
     matches = play(runs, episodes)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 from lare.errors import LareError
 from lare.experiments.credit import correlations
 from lare.experiments.watch import Watched, watch
+from lare.run.directory import Run
 from lare.tasks.env import JaxEnv, Team
 from lare.tasks.play import rows_of
 from lare.tasks.table import make_env
@@ -19,7 +20,6 @@ from lare.training.annotate import host
 from lare.training.collect_device import play
 from lare.training.compiled import acting, module_of
 from lare.training.config import TrainConfig
-from lare.training.run import Run
 from lare.training.session import load_learner
 
 SAMPLED = 40

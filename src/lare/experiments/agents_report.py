@@ -14,7 +14,7 @@ from lare.experiments.credit import correlations, factor_labels
 from lare.experiments.html import factor_table, function_text, note
 from lare.experiments.video import gif
 from lare.experiments.watch import Watched, watch
-from lare.training.run import Run
+from lare.run.directory import Run
 
 PICTURED = 1000
 """Points of a t-SNE picture."""

@@ -9,7 +9,7 @@ from lare.experiments import figures
 from lare.experiments.html import note, table, write_page
 from lare.experiments.scores import REFERENCES, by_label
 from lare.experiments.statistics import REPETITIONS, Band, Comparison, compare, plus_minus, too_few
-from lare.training.run import CONFIG, Run, read_measured
+from lare.run.directory import CONFIG, Run, read_measured
 
 HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "better than first [95%]")
 

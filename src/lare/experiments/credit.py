@@ -12,9 +12,9 @@ from lare.credit.accuracy import RECENT
 from lare.credit.methods import Fit
 from lare.data import replay
 from lare.experiments.watch import newest_episode
+from lare.run.directory import Run
 from lare.training.config import TrainConfig
 from lare.training.learner import Learner, Paid, features, rewards
-from lare.training.run import Run
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
+from lare.run.directory import Run
 from lare.tasks.env import HostEnv, in_units
 from lare.tasks.gymnasium import GymnasiumEnv
 from lare.tasks.spaces import OneHot
@@ -19,7 +20,6 @@ from lare.tasks.workers import LocalEnvs
 from lare.training.collect_device import DeviceCollector
 from lare.training.collect_host import evaluate, policy
 from lare.training.compiled import compiled, new_memory
-from lare.training.run import Run
 from lare.training.session import load_learner
 
 AT_A_TIME = 20

@@ -9,11 +9,11 @@ import lare
 from lare.credit.methods import find_method
 from lare.errors import LareError
 from lare.latent.design import CANDIDATES, check_recorded
+from lare.run.checkpoint import saved_step
+from lare.run.decide import decide
+from lare.run.directory import CHECKPOINT, CONFIG, read_config, read_metrics
+from lare.run.settings import ResolvedSettings, Settings
 from lare.tasks.spec import TaskSpec
-from lare.training.checkpoint import saved_step
-from lare.training.decide import decide
-from lare.training.run import CHECKPOINT, CONFIG, read_config, read_metrics
-from lare.training.settings import ResolvedSettings, Settings
 from lare.training.train import chosen_functions
 
 

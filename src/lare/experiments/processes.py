@@ -15,7 +15,7 @@ from typing import Any
 
 from lare.errors import LareError
 from lare.experiments.jobs import Job, as_json, train_one
-from lare.training.run import Busy
+from lare.run.directory import Busy
 
 PATIENCE = 60.0
 """Seconds that a run is waited for, which another process has just been told to end."""

@@ -16,11 +16,12 @@ from lare.experiments.credit import DELTA, credit_of, factor_labels
 from lare.experiments.html import factor_table, function_text, note, table, write_page
 from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN
 from lare.experiments.statistics import mean_and_deviation, plus_minus
+from lare.run.directory import Run, open_run
+from lare.run.settings import Settings
+from lare.run.usual import resolve
 from lare.source import source
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import env_spec
-from lare.training.run import Run, open_run
-from lare.training.settings import Settings, resolve
 
 TOP = "True rewards, for a million steps of the best public TD3,"
 """What the upper ends of `REFERENCES` are."""

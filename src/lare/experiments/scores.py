@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
-from lare.training.run import Run
+from lare.run.directory import Run
 
 REFERENCES = {
     "Reacher-v4": (-44.0, -2.7),

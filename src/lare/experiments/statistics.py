@@ -19,7 +19,7 @@ from scipy.stats import trim_mean
 
 from lare.errors import LareError
 from lare.experiments.scores import RETURN, Group, grouped
-from lare.training.run import Run
+from lare.run.directory import Run
 
 REPETITIONS = 2000
 """Of the bootstrap."""

@@ -19,8 +19,8 @@ from lare.errors import Checked, LareError
 from lare.experiments.cluster import on_ray
 from lare.experiments.jobs import Job, check, job_of
 from lare.experiments.processes import in_processes
+from lare.run.settings import Settings, set_in_vain
 from lare.tasks.spec import load_task
-from lare.training.settings import Settings, set_in_vain
 from lare.training.train import Interrupted
 
 Texts = Annotated[tuple[str, ...], Field(min_length=1)]

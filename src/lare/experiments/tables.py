@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lare.files import write_atomically
-from lare.training.run import CONFIG, read_config, read_metrics
+from lare.run.directory import CONFIG, read_config, read_metrics
 
 KEYS = ("task", "run", "method", "algorithm", "judges", "draw", "seed", "step")
 

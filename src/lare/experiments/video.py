@@ -14,10 +14,10 @@ from lare.errors import LareError
 from lare.experiments import agents
 from lare.experiments.evaluation import acting
 from lare.experiments.watch import watch
+from lare.run.directory import Run
 from lare.tasks.env import HostEnv
 from lare.tasks.gymnasium import GymnasiumEnv
 from lare.tasks.table import env_spec, make_host_env
-from lare.training.run import Run
 from lare.training.streams import Stream, episode_seed
 
 FRAMES_PER_SECOND = 8

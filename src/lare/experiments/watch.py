@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from lare.data import replay
 from lare.data.replay import Index
 from lare.data.trajectory import Trajectory
+from lare.run.directory import Run
 from lare.tasks.env import HostEnv, JaxEnv
 from lare.tasks.table import make_env, make_host_env
 from lare.tasks.workers import LocalEnvs
@@ -23,7 +24,6 @@ from lare.training.collect_host import Lanes
 from lare.training.compiled import compiled, module_of, new_memory
 from lare.training.config import TrainConfig
 from lare.training.learner import Learner, Paid
-from lare.training.run import Run
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
 from lare.training.streams import device_noise

@@ -1,1 +1,1 @@
-"""A run: replay, the fused training step, checkpoints."""
+"""How a run trains: steps are collected, credited and learned from."""

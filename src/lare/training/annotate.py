@@ -4,9 +4,9 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.data.trajectory import Trajectory
+from lare.run.directory import Run
 from lare.tasks.play import rows_of
 from lare.training.config import TrainConfig
-from lare.training.run import Run
 
 
 def annotate(run: Run, config: TrainConfig, steps: Trajectory) -> Float[np.ndarray, "*lead time envs rows factors"]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import jax
 
 from lare.errors import LareError
-from lare.training.run import Run
+from lare.run.directory import Run
 
 
 @contextlib.contextmanager

@@ -15,18 +15,18 @@ from jaxtyping import Array, Float
 from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import find_method
 from lare.data.trajectory import Trajectory
+from lare.run import checkpoint
+from lare.run.directory import Run
+from lare.run.settings import ResolvedSettings
 from lare.tasks.env import JaxEnv, Timestep
 from lare.tasks.table import env_spec, make_env
-from lare.training import checkpoint
 from lare.training.annotate import annotate
 from lare.training.collect_device import DeviceCollector
 from lare.training.collect_host import HostCollector, host_collector
 from lare.training.compiled import Compiled, compiled, new_learners
 from lare.training.config import TrainConfig
 from lare.training.learner import Learner, forget_episodes
-from lare.training.run import Run
 from lare.training.seeds import lines
-from lare.training.settings import ResolvedSettings
 from lare.training.streams import Stream, seed_keys, stream_keys
 
 

@@ -11,15 +11,15 @@ from lare.credit.methods import Fit, Method, Reward, find_method
 from lare.errors import LareError
 from lare.latent.design import CANDIDATES, design
 from lare.latent.function import LatentFunction, load, per_role
+from lare.run.decide import decide
+from lare.run.directory import Run, create, default_directory, isolation, locked, open_run
+from lare.run.settings import ResolvedSettings, Settings, set_in_vain
 from lare.tasks.spec import TaskSpec, load_task
 from lare.training import session as sessions
 from lare.training.collect_host import Diverged
-from lare.training.decide import decide
 from lare.training.process import enough_memory, stop_requests
 from lare.training.progress import Clock, Listener, TensorBoard, Terminal, summary_writer
-from lare.training.run import Run, create, default_directory, isolation, locked, open_run
 from lare.training.session import Session
-from lare.training.settings import ResolvedSettings, Settings, set_in_vain
 
 Given = LatentFunction | str | Path
 """A latent function, or the path of its file."""

@@ -17,8 +17,8 @@ from lare.experiments.paper.trained import jobs_of, verdict
 from lare.experiments.scores import ERROR, RETURN, SUMMED_RETURN
 from lare.experiments.sweep import Share
 from lare.llm.recording import shipped_recordings
+from lare.run.directory import describe
 from lare.training import train as training
-from lare.training.run import describe
 from toys import At
 
 SMOKE = BUDGETS["smoke"]

@@ -25,10 +25,11 @@ from lare.experiments.statistics import (
     plus_minus,
     too_few,
 )
+from lare.run.directory import Run, read_measured
+from lare.run.settings import Settings
+from lare.run.usual import usual_algorithm
 from lare.tasks.spec import load_task
 from lare.tasks.table import env_spec
-from lare.training.run import Run, read_measured
-from lare.training.settings import Settings, usual_algorithm
 
 LEVEL = 0.025
 """A claim counts as decided where luck alone would give as many pairs at most so often."""

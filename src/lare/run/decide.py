@@ -4,10 +4,11 @@ from lare.algorithms.table import ALGORITHMS, Consumes
 from lare.credit.methods import Decoder, Method, Reward, find_method
 from lare.data.replay import room
 from lare.errors import LareError
+from lare.run.settings import ResolvedSettings, Settings
+from lare.run.usual import resolve
 from lare.tasks.env import EnvSpec
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import env_spec
-from lare.training.settings import ResolvedSettings, Settings, resolve
 
 
 def decide(settings: Settings, task: TaskSpec) -> ResolvedSettings:

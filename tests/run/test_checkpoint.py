@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lare.errors import LareError
-from lare.training import checkpoint
+from lare.run import checkpoint
 
 ROWS = 16
 

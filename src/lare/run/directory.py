@@ -27,11 +27,11 @@ from lare.errors import Checked, LareError
 from lare.files import write_atomically
 from lare.latent.evaluator import LatentRewardError
 from lare.latent.function import LatentFunction, load, per_role
+from lare.run.checkpoint import STATE
+from lare.run.settings import ResolvedSettings
 from lare.source import source
 from lare.tasks.spec import Judges, TaskSpec
 from lare.tasks.table import env_spec
-from lare.training.checkpoint import STATE
-from lare.training.settings import ResolvedSettings
 
 CONFIG, METRICS, FUNCTION, CHECKPOINT = "config.json", "metrics.jsonl", "latent_function.py", "checkpoint"
 FAILED_BATCH = "failed_batch.npz"

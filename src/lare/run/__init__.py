@@ -1,0 +1,1 @@
+"""A run: its settings, and what it leaves on the disk."""

@@ -1,0 +1,117 @@
+"""What a run is like where nothing is said: by task, method and algorithm."""
+
+from collections.abc import Callable
+from typing import Any
+
+from lare.algorithms.table import ALGORITHMS, Name
+from lare.credit.decomposition import CreditSettings
+from lare.credit.methods import find_method
+from lare.run.settings import ResolvedSettings, Settings
+from lare.tasks.env import EnvSpec
+
+MANY_AGENTS = CreditSettings(
+    hidden=(64, 64, 64, 64),
+    learning_rate=5e-4,
+    weight_decay=1e-5,
+    drawn_steps=10,
+    steps=6400,
+    encoder=(256,),
+    bottleneck=4,
+    divergence=1e-3,
+)
+"""Of many agents. The numbers are the published code's, but for VIB's divergence."""
+
+
+Usual = Callable[[EnvSpec, int], dict[str, Any]]
+"""From an environment and the number of its copies that was asked for (0: none was) to what is usual."""
+
+
+def transitions(env: EnvSpec, copies: int) -> dict[str, Any]:
+    """td3, ddpg, sac."""
+    return {"environments": copies or 1, "rollout_steps": 50, "evaluate_every": 5000, "capacity": 1_000_000}
+
+
+def ppo(env: EnvSpec, copies: int) -> dict[str, Any]:
+    copies = copies or 1
+    return {
+        "environments": copies,
+        "rollout_steps": max(1, 2000 // copies),
+        "fit_updates": 500,
+        "evaluate_iterations": 5,
+        "capacity": 1_000_000,
+    }
+
+
+def ippo(env: EnvSpec, copies: int) -> dict[str, Any]:
+    """In JAX as published for particle tasks: 82 episodes of 25 steps between two updates."""
+    copies = copies or (82 if env.in_jax else 1)
+    return {
+        "environments": copies,
+        "rollout_steps": env.max_steps if env.fixed_length else max(1, (2050 if env.in_jax else 2000) // copies),
+        "fit_every": 10,
+        "fit_updates": 50,
+        "steps_iterations": 1000,
+        "evaluate_iterations": 10,
+        "evaluation_episodes": 50 if env.in_jax else 10,
+        "capacity": 15_000 * (env.max_steps + 1),
+        "credit": MANY_AGENTS,
+    }
+
+
+def sequences(env: EnvSpec, copies: int) -> dict[str, Any]:
+    """qmix, vdn."""
+    return {
+        "environments": copies or (8 if env.in_jax else 1),
+        "rollout_steps": 50,
+        "steps": 2_000_000,
+        "evaluate_every": 10_000,
+        "evaluation_episodes": 32 if env.in_jax else 10,
+        "capacity": 5000 * (env.max_steps + 1),
+        "credit": MANY_AGENTS.model_copy(update={"drawn_steps": 24, "steps": 3200}),
+    }
+
+
+USUAL: dict[Name, Usual] = {
+    "td3": transitions,
+    "ddpg": transitions,
+    "sac": transitions,
+    "ppo": ppo,
+    "ippo": ippo,
+    "qmix": sequences,
+    "vdn": sequences,
+}
+"""What a run is like where nothing is said, by algorithm."""
+
+
+def usual_algorithm(env: EnvSpec) -> Name:
+    """What trains on a task where nothing is said."""
+    if env.agents == 1:
+        return "ppo" if env.discrete else "td3"
+    return "qmix" if env.state_size and env.masks_actions and len(env.teams) == 1 else "ippo"
+
+
+def resolve(settings: Settings, env: EnvSpec) -> ResolvedSettings:
+    """Fill in what was left open. Raises `LareError` where the steps are no whole number of iterations."""
+    algorithm = settings.algorithm or usual_algorithm(env)
+    method = settings.method or ("lare-rrdu" if env.agents == 1 else "lare-rd")
+    given = {name: value for name, value in settings if value is not None and name not in (*ALGORITHMS, "credit")}
+    values = {
+        "steps": 1_000_000,
+        "fit_every": 1,
+        "fit_updates": 1,
+        "evaluation_episodes": 10,
+        "credit": CreditSettings(),
+        "judges": None,
+        **USUAL[algorithm](env, settings.environments or 0),
+    }
+    iteration = (settings.rollout_steps or values["rollout_steps"]) * values["environments"]
+    for name in ("steps", "evaluate"):
+        key = "steps" if name == "steps" else "evaluate_every"
+        iterations = values.pop(f"{name}_iterations", None) or max(1, round(values[key] / iteration))
+        values[key] = iterations * iteration
+    fit = find_method(method).fit
+    if fit is not None and fit.apart:
+        values["fit_updates"] = max(1, iteration // 50)
+    credit = values["credit"].model_copy(update=settings.credit.model_dump(exclude_none=True))
+    decided = {"method": method, "algorithm": algorithm, "hyperparameters": getattr(settings, algorithm)}
+    return ResolvedSettings(**{**values, **given, **decided, "credit": credit})
