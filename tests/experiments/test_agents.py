@@ -86,7 +86,7 @@ def test_a_pair_is_the_first_team_of_one_seed_and_the_others_of_another(runs):
         one = jax.tree.map(lambda leaf, seed=seed: leaf[seed : seed + 1], learner)
         actor = module_of(config).actor(one, 200, config)
         played = jax.jit(partial(play, env, count=40, config=config, greedy=False))(actor, jax.random.key(0)[None])
-        alone = played.steps.after.reward[..., team.agents].sum(axis=(0, -1)).mean()
+        alone = played.steps.after.reward[..., team.agents].mean(axis=-1).sum(axis=0).mean()
         np.testing.assert_allclose(matches[0].returns[seed, seed], alone, rtol=1e-4)
     assert len({match.returns[0, 1] for match in matches}) == 4
 

@@ -93,8 +93,7 @@ def test_targets_move_when_enough_episodes_have_been_played():
     update = jax.jit(partial(sequences.one_update, config=config, steps=12))
     moved = []
     for number in (1, 2, 3, 4):
-        after, _ = update(learner, drawn, jax.random.key(0), jnp.array(number))
-        made = after.algorithm.qmix
+        (made, _), _ = update(learner, drawn, jax.random.key(0), jnp.array(number))
         moved.append(jax.tree.all(jax.tree.map(jnp.array_equal, made.target, made.online)))
     assert moved == [False, True, False, True]
 

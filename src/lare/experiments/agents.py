@@ -13,7 +13,7 @@ from lare.errors import LareError
 from lare.experiments.credit import correlations
 from lare.experiments.watch import Watched, watch
 from lare.run.directory import Run
-from lare.tasks.env import JaxEnv, Team
+from lare.tasks.env import JaxEnv, Team, team_mean
 from lare.tasks.play import rows_of
 from lare.tasks.table import make_env
 from lare.training.annotate import host
@@ -121,12 +121,12 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
 def first_teams_return(
     env: JaxEnv, ours: Any, theirs: Any, key: PRNGKeyArray, episodes: int, config: TrainConfig
 ) -> Float[Array, ""]:
-    """The mean over episodes of the sum over the first team's agents, where one policy leads it and another one all others."""
+    """The first team's return R, mean over episodes, where one policy leads it and another one all others."""
     team = config.env.teams[0]
     act = partial(led_by_two, act=acting(config, greedy=False), team=team)
     played = play(env, (ours, theirs), key[None], episodes, config, greedy=False, act=act)
-    reward = played.steps.after.reward * played.mask[..., None]
-    return jnp.mean(jnp.sum(reward[..., team.agents], axis=(0, -1)))
+    reward = team_mean(played.steps.after.reward, played.steps.before.alive, team)
+    return jnp.mean(jnp.sum(reward * played.mask, axis=0))
 
 
 def led_by_two(

@@ -94,7 +94,13 @@ def team_mean(
 
     This is the one place that says what a team earns by a step. Its return R is the sum of that over the episode.
     """
-    values, alive = values[..., team.agents], alive[..., team.agents]
+    return alive_mean(values[..., team.agents], alive[..., team.agents])
+
+
+def alive_mean(
+    values: Float[Numbers, "*batch agents"], alive: Bool[Numbers, "*batch agents"]
+) -> Float[Numbers, "*batch"]:
+    """The mean over the agents that are alive; 0 where none is."""
     return (values * alive).sum(axis=-1) / array_module(values).maximum(alive.sum(axis=-1), 1)
 
 

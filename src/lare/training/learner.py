@@ -23,7 +23,7 @@ from lare.data.replay import Draw, Replay
 from lare.data.sampling import CreditDraw, draw_packed, draw_padded, draw_parts
 from lare.data.trajectory import Trajectory
 from lare.normalise import Scale, magnitude, new_scale, observe_scale, within_range
-from lare.tasks.env import team_mean
+from lare.tasks.env import alive_mean, team_mean
 from lare.training.config import TrainConfig
 
 PART = 2400
@@ -279,16 +279,11 @@ def rewards(steps: Draw, paid: Paid, config: TrainConfig) -> Float[Array, "*batc
                 part = proxy_rewards(steps, paid, config, place)
         part = jnp.broadcast_to(part, shape)
         if config.method.shared:
-            part = jnp.broadcast_to(team_share(part, acting[..., team.agents]), shape)
+            part = jnp.broadcast_to(alive_mean(part, acting[..., team.agents])[..., None], shape)
         if "alive" in steps.before:
             part = jnp.where(acting[..., team.agents], part, 0)
         parts.append(part / magnitude(paid.scale[place]) if config.scale_rewards else part)
     return jnp.concatenate(parts, axis=-1)
-
-
-def team_share(part: Float[Array, "*batch team"], acting: Bool[Array, "*batch team"]) -> Float[Array, "*batch 1"]:
-    """The mean over those of a team that act."""
-    return jnp.sum(part * shares(acting), axis=-1, keepdims=True)
 
 
 def proxy_rewards(steps: Draw, paid: Paid, config: TrainConfig, place: int) -> Float[Array, "*batch rows"]:

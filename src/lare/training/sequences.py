@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare.algorithms import qmix
 from lare.algorithms.recurrent import Recurrent
+from lare.credit.decomposition import Decomposition
 from lare.data import replay
 from lare.data.replay import Index, Replay
 from lare.data.sampling import EpisodeDraw, draw_distinct_episodes
@@ -25,6 +26,7 @@ from lare.training.config import TrainConfig
 from lare.training.learner import Learner, Paid, draw_credit
 
 Measured = dict[str, Float[Array, "*seeds"]]
+Updated = tuple[qmix.QMIX, tuple[Decomposition, ...]]
 
 
 class SequenceState(NamedTuple):
@@ -130,8 +132,8 @@ def lengths(config: TrainConfig) -> list[int]:
 
 def one_update(
     learner: Learner, episodes: EpisodeDraw, key: PRNGKeyArray, number: Int[Scalar, ""], config: TrainConfig, steps: int
-) -> tuple[Learner, Measured]:
-    """The decoder's update, and then the algorithm's, of one seed."""
+) -> tuple[Updated, Measured]:
+    """The decoder's update, and then the algorithm's, of one seed; only what they change, for the learner holds much more."""
     draw_key, fit_key = jax.random.split(key)
     credit, measured = learner.credit, {}
     draw = draw_credit(learner.replay, draw_key, 1, config)
@@ -143,7 +145,7 @@ def one_update(
     played = number * settings.update_every
     moves = played // settings.target_every > (played - settings.update_every) // settings.target_every
     made, learned = qmix.update(state.qmix, batch, moves, settings)
-    return learner._replace(credit=credit, algorithm=state._replace(qmix=made)), measured | learned
+    return (made, credit), measured | learned
 
 
 def improve(
@@ -160,9 +162,8 @@ def improve(
     states = jax.vmap(partial(with_states, config=config))(learner.algorithm.states, steps)
     learner = learner._replace(algorithm=learner.algorithm._replace(states=states, done=worth))
     cuts = lengths(config)
-    changing = learner.algorithm.qmix, learner.credit
 
-    def update(turn: Int[Scalar, ""], carry: tuple[Any, Measured]) -> tuple[Any, Measured]:
+    def update(turn: Int[Scalar, ""], carry: tuple[Updated, Measured]) -> tuple[Updated, Measured]:
         (made, credit), total = carry
         now = learner._replace(algorithm=learner.algorithm._replace(qmix=made), credit=credit)
         draw_keys, update_keys = jnp.unstack(
@@ -173,37 +174,25 @@ def improve(
         longest = jnp.max(episodes.length * (episodes.mask > 0))
         branches = [jax.vmap(partial(one_update, config=config, steps=cut)) for cut in cuts]
         place = jnp.searchsorted(jnp.asarray(cuts), longest)
-        made_and_credit, measured = jax.lax.switch(
-            place,
-            [partial(changed, branch) for branch in branches],
-            now,
-            episodes,
-            update_keys,
-            before + turn + 1,
-        )
+        updated, measured = jax.lax.switch(place, branches, now, episodes, update_keys, before + turn + 1)
         counts = turn < owed
 
         def choose(new: Array, old: Array) -> Array:
             return jnp.where(counts.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-        return jax.tree.map(choose, made_and_credit, (made, credit)), {
-            name: total[name] + jnp.where(counts, values, 0) for name, values in measured.items()
-        }
+        sums = {name: total[name] + jnp.where(counts, values, 0) for name, values in measured.items()}
+        return jax.tree.map(choose, updated, (made, credit)), sums
 
     names = ["critic/loss", "critic/value"]
     if config.interleaved:
         names += loss_names(config)
     nothing = {name: jnp.zeros(len(owed)) for name in names}
-    (made, credit), total = jax.lax.fori_loop(0, jnp.max(owed), update, (changing, nothing))
+    (made, credit), total = jax.lax.fori_loop(
+        0, jnp.max(owed), update, ((learner.algorithm.qmix, learner.credit), nothing)
+    )
     learner = learner._replace(algorithm=learner.algorithm._replace(qmix=made), credit=credit)
     measured = {name: values / owed for name, values in total.items()}  # NaN where there was no update
     return learner, measured | {"algorithm/updates": owed.astype(jnp.float32)}
-
-
-def changed(branch: Any, *given: Any) -> tuple[tuple[Any, Any], Measured]:
-    """What an update changes of the learner, which holds more than a branch should pass on."""
-    learner, measured = branch(*given)
-    return (learner.algorithm.qmix, learner.credit), measured
 
 
 def loss_names(config: TrainConfig) -> list[str]:
