@@ -20,7 +20,7 @@ from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Fit
 from lare.data import replay
-from lare.data.sampling import CreditDraw, draw_parts
+from lare.data.sampling import CreditSample, sample_parts
 from lare.normalise import Scale
 from lare.run.directory import open_run
 from lare.training import learner as common
@@ -34,14 +34,14 @@ UPDATES, STRETCH = 20_000, 5_000
 
 @partial(jax.jit, static_argnames=("fit", "config"))
 def updates(credit: Decomposition, held: replay.Replay, key: jax.Array, fit: Fit, config: TrainConfig) -> Decomposition:
-    def one(credit: Decomposition, drawn: CreditDraw) -> tuple[Decomposition, None]:
+    def one(credit: Decomposition, drawn: CreditSample) -> tuple[Decomposition, None]:
         features = common.features(replay.read(held, drawn.steps), config, 0)
         chosen = drawn.episodes
         episodes = Episodes(features, drawn.episode, chosen.length, chosen.mean_reward[..., 0], chosen.mask)
         return decomposition.update(credit, episodes, key, fit, config.credit)[0], None
 
     drawn_steps = min(config.credit.drawn_steps, config.env.max_steps)
-    return jax.lax.scan(one, credit, draw_parts(held, key, STRETCH, common.parts_count(config), drawn_steps))[0]
+    return jax.lax.scan(one, credit, sample_parts(held, key, STRETCH, common.parts_count(config), drawn_steps))[0]
 
 
 def newest(learner: Learner, config: TrainConfig) -> tuple[jax.Array, jax.Array]:

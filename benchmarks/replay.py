@@ -81,9 +81,9 @@ def filled(transitions: int) -> Replay:
 
 def reads(held: Replay, key: jax.Array) -> Any:
     """Everything that 50 updates read, one after the other; what the last one read is returned."""
-    draws = off_policy.draw(held, key, UPDATES, CONFIG)
+    draws = off_policy.sample(held, key, UPDATES, CONFIG)
 
-    def one(draw: off_policy.Draws) -> Any:
+    def one(draw: off_policy.UpdateSample) -> Any:
         assert draw.credit is not None
         drawn, batch = replay.read(held, draw.credit.steps), replay.read(held, draw.batch)
         credit = features(drawn, CONFIG, 0), draw.credit.episodes

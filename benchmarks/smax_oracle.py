@@ -27,7 +27,7 @@ from measure import write
 
 from lare.tasks.smax import NAMES, battle, enemy, observation
 from lare.tasks.smax.env import MOST, reward
-from lare.tasks.smax.scenarios import KINDS, Scenario, find_scenario
+from lare.tasks.smax.scenarios import UNIT_TYPES, Scenario, find_scenario
 
 streams = sys.stdout, sys.stderr
 from jaxmarl.environments.smax.heuristic_enemy import create_heuristic_policy  # noqa: E402
@@ -56,7 +56,7 @@ PINNED = {"2s3z": "won", "3s_vs_5z": "lost", "1c3s5z": "lost"}
 
 def theirs(scenario: Scenario) -> HeuristicEnemySMAX:
     """JaxMARL's, with the colossus appended to its kinds where the battle has one."""
-    table = list(KINDS.values())[: scenario.kinds]
+    table = list(UNIT_TYPES.values())[: scenario.unit_types]
     figures = {
         "unit_type_velocities": [kind.speed for kind in table],
         "unit_type_attacks": [kind.damage for kind in table],
@@ -68,15 +68,15 @@ def theirs(scenario: Scenario) -> HeuristicEnemySMAX:
     }
     # Its own kinds keep its own figures, so that ours are compared too.
     arguments: dict[str, Any] = {}
-    if scenario.kinds > 6:
+    if scenario.unit_types > 6:
         defaults = HeuristicEnemySMAX()._env
         arguments = {
             name: jnp.concatenate([getattr(defaults, name), jnp.array(values[6:], jnp.float32)])
             for name, values in figures.items()
         }
-        arguments["unit_type_names"] = [*defaults.unit_type_names, *list(KINDS)[6 : scenario.kinds]]
+        arguments["unit_type_names"] = [*defaults.unit_type_names, *list(UNIT_TYPES)[6 : scenario.unit_types]]
         arguments["unit_type_shorthands"] = [*defaults.unit_type_shorthands, "c"]
-    kinds = jnp.asarray(scenario.kind, jnp.uint8)
+    kinds = jnp.asarray(scenario.unit_type, jnp.uint8)
     their = Theirs(kinds, scenario.allies, scenario.enemies, False, False)
     return HeuristicEnemySMAX(scenario=their, attack_mode="closest", max_steps=scenario.limit - 1, **arguments)
 

@@ -34,7 +34,7 @@ def test_the_estimate_against_least_squares():
     counts, totals = rng.integers(0, 4, size=(20, 6)).astype(np.float32), rng.normal(size=20).astype(np.float32)
     state = theory.nothing_seen(6, 2.0)
     for row, total in zip(counts, totals, strict=True):
-        state = theory.take_in(state, jnp.asarray(row), jnp.asarray(total))
+        state = theory.update(state, jnp.asarray(row), jnp.asarray(total))
     # Ridge regression is least squares on rows that ask for 0, sqrt(lambda) strong.
     rows, asked = np.vstack([counts, np.sqrt(2.0) * np.eye(6)]), np.append(totals, np.zeros(6))
     np.testing.assert_allclose(theory.estimate(state), np.linalg.lstsq(rows, asked)[0], rtol=1e-3, atol=1e-4)
@@ -56,7 +56,7 @@ def test_optimism_against_trying_every_policy(mdp):
     counts = rng.integers(0, 3, size=(4, table.size)).astype(np.float32)
     state = theory.nothing_seen(table.size, 5.0)
     for row in counts:
-        state = theory.take_in(state, jnp.asarray(row), jnp.asarray(row.sum() / 2))
+        state = theory.update(state, jnp.asarray(row), jnp.asarray(row.sum() / 2))
     choices = theory.policies(CORES, ACTIONS)
     expected = jnp.stack([theory.shared_out(theory.visits(mdp, policy, HORIZON), table) for policy in choices])
     inverse = np.linalg.inv(np.asarray(state.design, np.float64))

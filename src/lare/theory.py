@@ -96,7 +96,7 @@ def nothing_seen(size: int, ridge: float) -> Estimator:
     return Estimator(ridge * jnp.eye(size), jnp.zeros(size))
 
 
-def take_in(state: Estimator, counts: Float[Array, " size"], total: Float[Array, ""]) -> Estimator:
+def update(state: Estimator, counts: Float[Array, " size"], total: Float[Array, ""]) -> Estimator:
     """One more episode: how often it met each entry, and what it returned."""
     return Estimator(state.design + jnp.outer(counts, counts), state.products + counts * total)
 
@@ -154,7 +154,7 @@ def oful(key: PRNGKeyArray, mdp: MDP, redundant: int, horizon: int, episodes: in
     def one(carry: tuple[Estimator, Float[Array, ""]], turn: tuple[PRNGKeyArray, Float[Array, ""]]):
         (state, regret), (key, number) = carry, turn
         chosen = optimistic(state, expected, radius(number, horizon, table.size, ridge, delta))
-        state = take_in(state, *play(key, mdp, choices[chosen], table, horizon))
+        state = update(state, *play(key, mdp, choices[chosen], table, horizon))
         regret = regret + jnp.max(value) - value[chosen]
         away = true - estimate(state)
         error = jnp.sqrt(away @ state.design @ away)

@@ -18,7 +18,7 @@ from lare.tasks.gymnasium import GymnasiumEnv
 from lare.tasks.on_host import OnHost
 from lare.tasks.table import FAMILIES, make_host_env
 from lare.tasks.workers import LocalEnvs, WorkerEnvs
-from lare.training.collect_host import Diverged, Lanes, evaluate
+from lare.training.collect_host import Diverged, HostEpisodes, evaluate
 from lare.training.streams import Stream, episode_seed
 from lare.training.train import Interrupted
 from toys import At, figures, toy_spec
@@ -48,7 +48,7 @@ def local(count, task=None):
 
 
 def lanes(seeds=(0, 1), environments=1, task=None):
-    made = Lanes(local(len(seeds) * environments, task), seeds, environments)
+    made = HostEpisodes(local(len(seeds) * environments, task), seeds, environments)
     made.begin()
     return made
 
@@ -278,7 +278,7 @@ def test_many_agents_on_the_host_resume_bit_for_bit(algorithm, small_many, tmp_p
 def test_environments_in_processes_of_their_own_give_the_same():
     maker = partial(make_host_env, toy_spec(environment="toys:toys/Chase-v0"))
     with WorkerEnvs([maker] * 4) as workers:
-        there, here = Lanes(workers, (0, 1), 2), lanes((0, 1), 2)
+        there, here = HostEpisodes(workers, (0, 1), 2), lanes((0, 1), 2)
         there.begin()
         one, other = (each.collect(follow, quiet(each, 25)) for each in (there, here))
     for a, b in zip((*one.before[:-1], *one.after[:-1]), (*other.before[:-1], *other.after[:-1]), strict=True):

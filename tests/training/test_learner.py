@@ -12,7 +12,7 @@ from lare.credit.closed_form import LinearDecoder
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import TABLE, Fit, Reward
 from lare.data import replay
-from lare.data.sampling import draw_parts
+from lare.data.sampling import sample_parts
 from lare.normalise import magnitude
 from lare.tasks.env import EnvSpec, Team
 from lare.training import learner as common
@@ -42,7 +42,7 @@ def close(one, other, rtol=1e-4, atol=1e-5):
 
 def fitted(learner, config, key=0):
     """One update of the decoders on what is drawn by a key, and what it measured."""
-    draw = common.draw_credit(learner.replay, jax.random.key(key), 1, config)
+    draw = common.sample_credit(learner.replay, jax.random.key(key), 1, config)
     draw = jax.tree.map(lambda leaf: leaf[0], draw)
     return jax.jit(partial(common.fit, config=config))(learner.credit, learner.replay, draw, jax.random.key(1))
 
@@ -89,7 +89,7 @@ def test_the_unbiased_loss_has_the_expectation_of_the_full_one_for_episodes_of_a
         learner = stored(config)
         steep = jax.tree.map(lambda weight: 6 * weight, learner.credit[0].decoder)  # steps that differ
         learner = learner._replace(credit=(learner.credit[0]._replace(decoder=steep),))
-        draws = draw_parts(learner.replay, jax.random.key(3), 1, 40_000, drawn)
+        draws = sample_parts(learner.replay, jax.random.key(3), 1, 40_000, drawn)
         first = jax.tree.map(lambda leaf: leaf[0], draws)
         _, measured = common.fit(learner.credit, learner.replay, first, jax.random.key(0), config)
         losses[name] = float(measured["credit/loss"])
@@ -107,7 +107,7 @@ def test_the_unbiased_loss_has_the_expectation_of_the_full_one_for_episodes_of_a
 def test_padding_counts_for_nothing(method):
     config = config_of(method)
     learner = stored(config)
-    draws = jax.tree.map(lambda one: one[0], common.draw_credit(learner.replay, jax.random.key(2), 1, config))
+    draws = jax.tree.map(lambda one: one[0], common.sample_credit(learner.replay, jax.random.key(2), 1, config))
     padding = np.asarray(draws.episode) >= len(draws.episodes.length)
     assert padding.any()
     elsewhere = draws._replace(steps=draws.steps._replace(number=jnp.where(padding, 40, draws.steps.number)))

@@ -23,7 +23,7 @@ def test_relabelling_is_by_the_newest_decoder():
     learner = stored(config)
     after, metrics = off_policy.improve_one(learner, steps_of(), jax.random.key(0), jnp.array(0), config)
     draw_key, _, noise_key = jax.random.split(jax.random.key(0), 3)
-    index = jax.tree.map(lambda leaf: leaf[0], off_policy.draw(learner.replay, draw_key, 1, config).batch)
+    index = jax.tree.map(lambda leaf: leaf[0], off_policy.sample(learner.replay, draw_key, 1, config).batch)
     batch, losses = replay.read(learner.replay, index), []
     for decoder in (learner.credit, after.credit):
         reward = common.rewards(batch, common.Paid(decoder, learner.scale), config)
@@ -66,7 +66,7 @@ def test_an_update_for_each_step_and_nothing_is_expected_after_a_termination(env
 def test_scaled_rewards_are_those_in_units_of_the_mean_return():
     plain, scaled = config_of("dense"), config_of("dense", scale_rewards=True)
     learner = stored(plain)
-    draw = replay.read(learner.replay, off_policy.draw(learner.replay, jax.random.key(0), 1, plain).batch)
+    draw = replay.read(learner.replay, off_policy.sample(learner.replay, jax.random.key(0), 1, plain).batch)
     one, other = (common.rewards(draw, paid_by(learner), config) for config in (plain, scaled))
     np.testing.assert_allclose(other, one / jnp.sqrt(learner.scale[0].mean_square), rtol=1e-5)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lare.data import replay
-from lare.data.sampling import draw_distinct_episodes, episodes_at
+from lare.data.sampling import episodes_at, sample_distinct_episodes
 from lare.normalise import standardise
 from lare.training import learner as common
 from lare.training import sequences
@@ -37,7 +37,7 @@ def episodes_of(steps):
 def test_episodes_against_the_steps_that_were_stored(method):
     config, steps = qmix(method), steps_of(TOGETHER, 2)
     learner = stored(config)
-    drawn = draw_distinct_episodes(learner.replay, jax.random.key(0), 12)
+    drawn = sample_distinct_episodes(learner.replay, jax.random.key(0), 12)
     batch = sequences.sequences(learner.replay, drawn, 12, paid_by(learner), learner.algorithm.states, config)
     assert np.asarray(drawn.mask).tolist() == [1] * 10 + [0, 0]
     whole = episodes_of(steps)
@@ -89,7 +89,7 @@ def test_targets_move_when_enough_episodes_have_been_played():
     """One update for 2 episodes, targets every 4: at every second update."""
     config = qmix("dense")
     learner = stored(config)
-    drawn = draw_distinct_episodes(learner.replay, jax.random.key(0), 4)
+    drawn = sample_distinct_episodes(learner.replay, jax.random.key(0), 4)
     update = jax.jit(partial(sequences.one_update, config=config, steps=12))
     moved = []
     for number in (1, 2, 3, 4):

@@ -64,7 +64,7 @@ class Index(NamedTuple):
     number: Int[Array, "*batch"]
 
 
-class Draw(NamedTuple):
+class StoredSteps(NamedTuple):
     """Transitions read back."""
 
     before: dict[str, Array]
@@ -212,7 +212,7 @@ def flat(values: Array) -> Array:
     return values.reshape(-1, *values.shape[2:])
 
 
-def read(replay: Replay, index: Index) -> Draw:
+def read(replay: Replay, index: Index) -> StoredSteps:
     """The transitions of this index."""
     rows = capacity(replay)
     slots = replay.first.shape[-1]
@@ -226,7 +226,7 @@ def read(replay: Replay, index: Index) -> Draw:
     total, length = flat(replay.episode_return)[slot], end - flat(replay.first)[slot]
     last = (index.number + 1 == end) & done
     columns = {name: flat(values) for name, values in replay.columns.items()}
-    return Draw(
+    return StoredSteps(
         before={name: values[here] for name, values in columns.items()},
         after={name: values[next_one] for name, values in columns.items() if name in SHOWN},
         episodic_reward=jnp.where(last[..., None], total, 0),

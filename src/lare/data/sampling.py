@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 from lare.data.replay import Index, Replay, end_of, finished, flat, oldest_transition, size
 
 
-class EpisodeDraw(NamedTuple):
+class EpisodeSample(NamedTuple):
     """Some finished episodes."""
 
     first: Index
@@ -22,14 +22,14 @@ class EpisodeDraw(NamedTuple):
     """1, or 0 for a place that holds no episode."""
 
 
-class CreditDraw(NamedTuple):
+class CreditSample(NamedTuple):
     """Which steps one update of a decoder reads, and of which episodes."""
 
     steps: Index
     """[*updates rows]."""
     episode: Int[Array, "*updates rows"]
     """Which of the episodes a row belongs to; as many as there are episodes, where it is padding."""
-    episodes: EpisodeDraw
+    episodes: EpisodeSample
 
 
 def one_of(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
@@ -40,32 +40,32 @@ def one_of(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[int, ...
     return Index(env, number - (ends - counts)[env])
 
 
-def draw_transitions(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
+def sample_transitions(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
     """Transitions, uniform over all that are stored, finished episode or not."""
     chosen = one_of(size(replay), key, shape)
     return Index(chosen.env, oldest_transition(replay)[chosen.env] + chosen.number)
 
 
-def draw_episodes(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> EpisodeDraw:
+def sample_episodes(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> EpisodeSample:
     """Finished episodes, uniform, with replacement."""
     return episodes_at(replay, one_of(finished(replay), key, shape))
 
 
-def draw_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> EpisodeDraw:
+def sample_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> EpisodeSample:
     """Finished episodes, uniform, without replacement: the first of a random order of all slots that hold one.
 
     Where there are fewer, `mask` is 0 for the places that are left.
     """
-    held, slots = finished(replay), replay.first.shape[-1]
-    stored = jnp.arange(slots) < held[:, None]
+    there, slots = finished(replay), replay.first.shape[-1]
+    stored = jnp.arange(slots) < there[:, None]
     order = jnp.where(stored, jax.random.uniform(key, stored.shape), jnp.inf).ravel()
     _, chosen = jax.lax.top_k(-order, min(count, order.size))
     chosen = jnp.pad(chosen, (0, count - len(chosen)))
     drawn = episodes_at(replay, Index(chosen // slots, chosen % slots))
-    return drawn._replace(mask=drawn.mask * (jnp.arange(count) < jnp.sum(held)))
+    return drawn._replace(mask=drawn.mask * (jnp.arange(count) < jnp.sum(there)))
 
 
-def episodes_at(replay: Replay, place: Index) -> EpisodeDraw:
+def episodes_at(replay: Replay, place: Index) -> EpisodeSample:
     """The finished episodes of these places, counted from each environment's oldest."""
     slots = replay.first.shape[-1]
     episode = replay.oldest[place.env] + place.number
@@ -73,7 +73,7 @@ def episodes_at(replay: Replay, place: Index) -> EpisodeDraw:
     first = flat(replay.first)[slot]
     length = jnp.maximum(end_of(replay, place.env, episode) - first, 1)
     some = jnp.sum(finished(replay)) > 0
-    return EpisodeDraw(
+    return EpisodeSample(
         Index(place.env, first),
         length,
         flat(replay.episode_return)[slot] / length[..., None],
@@ -82,33 +82,33 @@ def episodes_at(replay: Replay, place: Index) -> EpisodeDraw:
 
 
 def steps_of(
-    episodes: EpisodeDraw, number: Int[Array, "*episodes steps"], episode: Int[Array, "*episodes steps"]
-) -> CreditDraw:
+    episodes: EpisodeSample, number: Int[Array, "*episodes steps"], episode: Int[Array, "*episodes steps"]
+) -> CreditSample:
     """Steps of drawn episodes (their last axis) by their number within each, in a row."""
     index = Index(
         jnp.broadcast_to(episodes.first.env[..., None], number.shape), episodes.first.number[..., None] + number
     )
     lead = episodes.length.shape[:-1]
-    return CreditDraw(jax.tree.map(lambda x: x.reshape(*lead, -1), index), episode.reshape(*lead, -1), episodes)
+    return CreditSample(jax.tree.map(lambda x: x.reshape(*lead, -1), index), episode.reshape(*lead, -1), episodes)
 
 
-def draw_parts(replay: Replay, key: PRNGKeyArray, updates: int, count: int, drawn: int) -> CreditDraw:
+def sample_parts(replay: Replay, key: PRNGKeyArray, updates: int, count: int, drawn: int) -> CreditSample:
     """`drawn` steps of each of `count` episodes, for RRD; of a shorter episode all, and padding."""
     episodes_key, steps_key = jax.random.split(key)
-    episodes = draw_episodes(replay, episodes_key, (updates, count))
-    number = draw_steps(steps_key, episodes.length, drawn)
+    episodes = sample_episodes(replay, episodes_key, (updates, count))
+    number = sample_steps(steps_key, episodes.length, drawn)
     belongs = jnp.arange(drawn) < episodes.length[..., None]
     return steps_of(episodes, number, jnp.where(belongs, jnp.arange(count)[:, None], count))
 
 
-def draw_padded(replay: Replay, key: PRNGKeyArray, updates: int, count: int, longest: int) -> CreditDraw:
+def sample_padded(replay: Replay, key: PRNGKeyArray, updates: int, count: int, longest: int) -> CreditSample:
     """All steps of some episodes, and the last one again until each is as long as the longest can be."""
-    episodes = draw_episodes(replay, key, (updates, count))
+    episodes = sample_episodes(replay, key, (updates, count))
     number = jnp.minimum(jnp.arange(longest), episodes.length[..., None] - 1)
     return steps_of(episodes, number, jnp.broadcast_to(jnp.arange(count)[:, None], number.shape))
 
 
-def draw_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, longest: int) -> CreditDraw:
+def sample_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, longest: int) -> CreditSample:
     """All steps of max(1, steps // mean length) episodes, one behind the other, for RD.
 
     The rows are as many as the longest episode has, or `steps` if that is more; an episode that would run over the end
@@ -117,10 +117,10 @@ def draw_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, lon
     return jax.vmap(partial(pack, replay, steps=steps, longest=longest))(jax.random.split(key, updates))
 
 
-def pack(replay: Replay, key: PRNGKeyArray, steps: int, longest: int) -> CreditDraw:
-    """One update's share of `draw_packed`."""
+def pack(replay: Replay, key: PRNGKeyArray, steps: int, longest: int) -> CreditSample:
+    """One update's share of `sample_packed`."""
     budget, places = max(steps, longest), steps
-    drawn = draw_episodes(replay, key, (places,))
+    drawn = sample_episodes(replay, key, (places,))
     wanted = steps * jnp.sum(finished(replay)) // jnp.maximum(stored_steps(replay), 1)
     end = jnp.cumsum(drawn.length)
     mask = drawn.mask * (jnp.arange(places) < jnp.maximum(wanted, 1)) * (end <= budget)
@@ -132,7 +132,7 @@ def pack(replay: Replay, key: PRNGKeyArray, steps: int, longest: int) -> CreditD
         jnp.where(belongs, drawn.first.env[place], drawn.first.env[0]),
         jnp.where(belongs, number, drawn.first.number[0]),
     )
-    return CreditDraw(index, jnp.where(belongs, place, places), drawn._replace(mask=mask))
+    return CreditSample(index, jnp.where(belongs, place, places), drawn._replace(mask=mask))
 
 
 def stored_steps(replay: Replay) -> Int[Scalar, ""]:
@@ -141,7 +141,7 @@ def stored_steps(replay: Replay) -> Int[Scalar, ""]:
     return jnp.sum(last - oldest_transition(replay))
 
 
-def draw_steps(key: PRNGKeyArray, length: Int[Array, "*episodes"], drawn: int) -> Int[Array, "*episodes {drawn}"]:
+def sample_steps(key: PRNGKeyArray, length: Int[Array, "*episodes"], drawn: int) -> Int[Array, "*episodes {drawn}"]:
     """K of the steps 0..T-1 of each episode, without replacement; where T < K all of them, and then the last one again.
 
     Floyd's algorithm (Bentley and Floyd, 1987): for j = T-K .. T-1 take a uniform t of 0..j, or j where t was taken

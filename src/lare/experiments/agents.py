@@ -61,15 +61,15 @@ def sample(run: Run, random: bool = False) -> list[Sample]:
     after, taken = host(steps.after), np.asarray(steps.taken)
     for place, team in enumerate(config.env.teams):
         rows, _ = rows_of(run.config.task, team, after, taken)
-        counts = np.broadcast_to(watched.mask[..., None], rows.shape[:-1])
+        mask = np.broadcast_to(watched.mask[..., None], rows.shape[:-1])
         reward = watched.reward[..., team.agents]
         if config.of_state:
             reward = reward.mean(axis=-1, keepdims=True)
         else:
-            counts = counts & np.asarray(steps.before.alive)[..., team.agents]
+            mask = mask & np.asarray(steps.before.alive)[..., team.agents]
         size = config.factors[place] if config.factors else 0
         factors = watched.factors[..., config.judged(place), :size]
-        found.append(Sample(team, rows[counts], factors[counts], reward[counts]))
+        found.append(Sample(team, rows[mask], factors[mask], reward[mask]))
     return found
 
 

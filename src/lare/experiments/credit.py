@@ -78,10 +78,10 @@ def factor_correlations(learner: Learner, config: TrainConfig) -> Float[np.ndarr
     """Of a single agent's factors with its true reward, over the newest steps; nothing for many agents."""
     if not config.method.latent or config.judged_rows > 1 or config.env.agents > 1:
         return np.zeros(0)
-    held = learner.replay
-    known = int(jnp.min(held.transitions - jax.vmap(replay.oldest_transition)(held)))
+    buffer = learner.replay
+    known = int(jnp.min(buffer.transitions - jax.vmap(replay.oldest_transition)(buffer)))
     count = min(RECENT, known)
-    steps = jax.vmap(lambda one: replay.read(one, replay.newest(one, count)))(held)
+    steps = jax.vmap(lambda one: replay.read(one, replay.newest(one, count)))(buffer)
     reward = np.asarray(steps.before["reward"]).ravel()
     factors = np.asarray(steps.before["factors"]).reshape(len(reward), -1)
     return correlations(factors, reward)

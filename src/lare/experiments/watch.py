@@ -20,7 +20,7 @@ from lare.tasks.workers import LocalEnvs
 from lare.training import learner as learning
 from lare.training.annotate import annotate
 from lare.training.collect_device import play
-from lare.training.collect_host import Lanes
+from lare.training.collect_host import HostEpisodes
 from lare.training.compiled import compiled, module_of, new_memory
 from lare.training.config import TrainConfig
 from lare.training.learner import Learner, Paid
@@ -91,7 +91,7 @@ def on_host(run: Run, config: TrainConfig, actor: Any, episodes: int) -> tuple[T
     memory = [new_memory(config, 1, episodes)]
     steps, random = [], jax.random.key(0)
     with contextlib.closing(LocalEnvs([partial(make_host_env, run.config.task)] * episodes)) as envs:
-        collector = Lanes(envs, run.seeds[:1], episodes)
+        collector = HostEpisodes(envs, run.seeds[:1], episodes)
         collector.begin()
         ended = np.zeros((1, episodes), bool)
         while not ended.all():
@@ -120,12 +120,12 @@ def proxy_of(
 ) -> Float[np.ndarray, "time episodes agents"]:
     """What a single seed's decoders say of episodes: these alone are put into a replay, and read."""
     time, episodes = np.shape(steps.after.terminated)
-    held = replay.empty(config.columns, episodes, 2 * time + 2, len(config.env.teams))
+    buffer = replay.empty(config.columns, episodes, 2 * time + 2, len(config.env.teams))
 
     @jax.jit
     def decoded(steps: Trajectory, factors: Any) -> Any:
         rows = learning.rows_of(steps, factors, config)
-        whole = replay.extend(held, *rows, learning.team_rewards(steps, config), steps.ended)
+        whole = replay.extend(buffer, *rows, learning.team_rewards(steps, config), steps.ended)
         drawn = replay.read(whole, replay.newest(whole, time))
         return jnp.swapaxes(learning.rewards(drawn, Paid(learner.credit, learner.scale), config), 0, 1)
 
@@ -134,10 +134,10 @@ def proxy_of(
 
 def newest_episode(learner: Learner) -> Index | None:
     """The steps of the last episode of a seed's first environment that has ended; None as long as there is none."""
-    held = learner.replay
-    if not int(replay.finished(held)[0]):
+    buffer = learner.replay
+    if not int(replay.finished(buffer)[0]):
         return None
-    env, episode = jnp.zeros((), int), held.episodes[0] - 1
-    begin = int(held.first[0, episode % held.first.shape[-1]])
-    number = jnp.arange(begin, int(replay.end_of(held, env, episode)))
+    env, episode = jnp.zeros((), int), buffer.episodes[0] - 1
+    begin = int(buffer.first[0, episode % buffer.first.shape[-1]])
+    number = jnp.arange(begin, int(replay.end_of(buffer, env, episode)))
     return Index(jnp.zeros_like(number), number)

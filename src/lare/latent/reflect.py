@@ -20,7 +20,7 @@ RIDGE = 1.0
 """Strength of the penalty, in units of one episode: factors are standardised."""
 
 
-def factors_of(
+def episode_factors(
     function: LatentFunction, task: TaskSpec, episode: Episode
 ) -> Float[np.ndarray, "steps_and_rows factors"]:
     """The factors of an episode's steps (of all agents that acted), by the observations that the task says are judged."""
@@ -58,7 +58,7 @@ def gather(function: LatentFunction, task: TaskSpec, episodes: list[Episode]) ->
     Raises:
         LatentRewardError: it failed on one of them.
     """
-    factors = [factors_of(function, task, episode) for episode in episodes]
+    factors = [episode_factors(function, task, episode) for episode in episodes]
     means = np.stack([rows.mean(axis=0) for rows in factors]).astype(np.float64)
     targets = np.asarray([episode.total / len(episode.action) for episode in episodes])
     return Evidence(held_out_fit(means, targets), described(function, np.concatenate(factors), means, targets))

@@ -83,8 +83,8 @@ def save(
     directory.mkdir(exist_ok=True)
     for left in directory.glob("*.new"):  # by a process that was killed while it wrote
         left.unlink(missing_ok=True)
-    held, rows = learner.replay, capacity(learner)
-    end = np.asarray(held.next_row)
+    buffer, rows = learner.replay, capacity(learner)
+    end = np.asarray(buffer.next_row)
     start, segments = np.zeros_like(end), []
     if (directory / STATE).exists():
         with opened(directory / STATE) as saved:
@@ -95,7 +95,7 @@ def save(
     count = end - start + 1
     width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations
     index = jnp.asarray((start[..., None] + np.arange(width)) % rows)
-    segment = {name: np.asarray(take(column, index))[:, :, : count.max()] for name, column in held.columns.items()}
+    segment = {name: np.asarray(take(column, index))[:, :, : count.max()] for name, column in buffer.columns.items()}
     number = segments[-1]["number"] + 1 if segments else 0
     write_atomically(directory / f"rows-{number}.npz", lambda file: np.savez(file, allow_pickle=False, **segment))
     segments.append({"number": number, "start": start.tolist(), "count": count.tolist()})

@@ -36,7 +36,7 @@ class Diverged(LareError):
     """What is being trained is not finite any more."""
 
 
-class Lanes:
+class HostEpisodes:
     """The training environments of a run, and the episode that is under way in each."""
 
     def __init__(self, envs: Envs, seeds: Sequence[int], environments: int):
@@ -172,9 +172,9 @@ class HostCollector:
 
     def __init__(self, envs: Envs, evaluation: Envs, config: TrainConfig, functions: Compiled, seeds: Sequence[int]):
         self.config, self.functions, self.seeds = config, functions, list(seeds)
-        self.lanes, self.evaluation = Lanes(envs, seeds, config.environments), evaluation
-        self.memory = new_memory(config, *self.lanes.shape)
-        self.lanes.begin()
+        self.episodes, self.evaluation = HostEpisodes(envs, seeds, config.environments), evaluation
+        self.memory = new_memory(config, *self.episodes.shape)
+        self.episodes.begin()
 
     def collect(self, actor: Any, step: int) -> Trajectory:
         """The steps of the iteration that begins at this step: random ones, as long as it is to warm up."""
@@ -182,7 +182,7 @@ class HostCollector:
         shape = config.rollout_steps, config.environments, config.env.agents
         if step < config.warmup:
             uniform = [one.uniform(-1, 1, (*shape, config.env.action_size)) for one in random]
-            return self.lanes.collect(lambda shown, noise, new: noise, np.stack(uniform, 1).astype(np.float32))
+            return self.episodes.collect(lambda shown, noise, new: noise, np.stack(uniform, 1).astype(np.float32))
         noise = np.stack([host_noise(one, config.noise, (*shape, config.noise_size)) for one in random], 1)
 
         def act(shown: Timestep, noise: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -190,7 +190,7 @@ class HostCollector:
             action, self.memory = self.functions.explore(actor, *given, noise, new)
             return np.asarray(action)
 
-        return self.lanes.collect(act, noise)
+        return self.episodes.collect(act, noise)
 
     def evaluate(self, actor: Any, episodes: int) -> Evaluation:
         """Whole episodes of the policy, from the starts that the run is evaluated from."""
@@ -200,18 +200,18 @@ class HostCollector:
     def saved(self) -> dict[str, np.ndarray]:
         """Seeds and actions of the episodes under way, and what the actors remember of them."""
         memory = {f"memory{place}": np.asarray(leaf) for place, leaf in enumerate(jax.tree.leaves(self.memory))}
-        return self.lanes.saved() | memory
+        return self.episodes.saved() | memory
 
     def restore(self, saved: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
         """Into the middle of the episodes again; which of them could not be had, and what is to be said of it."""
         leaves, structure = jax.tree.flatten(self.memory)
         self.memory = jax.tree.unflatten(structure, [jnp.asarray(saved[f"memory{i}"]) for i in range(len(leaves))])
-        messages = self.lanes.restore(saved)
-        return self.lanes.dropped.reshape(self.lanes.shape), messages
+        messages = self.episodes.restore(saved)
+        return self.episodes.dropped.reshape(self.episodes.shape), messages
 
     def close(self) -> None:
         """Close the environments."""
-        self.lanes.envs.close()
+        self.episodes.envs.close()
         self.evaluation.close()
 
 

@@ -19,8 +19,8 @@ from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Encoder, Fit, Reward
 from lare.data import replay
-from lare.data.replay import Draw, Replay
-from lare.data.sampling import CreditDraw, draw_packed, draw_padded, draw_parts
+from lare.data.replay import Replay, StoredSteps
+from lare.data.sampling import CreditSample, sample_packed, sample_padded, sample_parts
 from lare.data.trajectory import Trajectory
 from lare.normalise import Scale, magnitude, new_scale, observe_scale, within_range
 from lare.tasks.env import alive_mean, team_mean
@@ -81,7 +81,7 @@ def init(key: PRNGKeyArray, config: TrainConfig, algorithm: Any) -> Learner:
     )
 
 
-def features(steps: Draw, config: TrainConfig, place: int) -> Float[Array, "*batch rows features"]:
+def features(steps: StoredSteps, config: TrainConfig, place: int) -> Float[Array, "*batch rows features"]:
     """What a team's decoder sees of some steps."""
     before, after, rows = steps.before, steps.after, config.judged(place)
     if config.method.latent:
@@ -100,14 +100,14 @@ def features(steps: Draw, config: TrainConfig, place: int) -> Float[Array, "*bat
     return jnp.concatenate([*found, shown - led_to] if config.raw_differences else found, axis=-1)
 
 
-def alive(steps: Draw, config: TrainConfig) -> Bool[Array, "*batch agents"]:
+def alive(steps: StoredSteps, config: TrainConfig) -> Bool[Array, "*batch agents"]:
     """Which agents acted."""
     if "alive" in steps.before:
         return steps.before["alive"]
     return jnp.ones((*steps.finished.shape, config.env.agents), bool)
 
 
-def alive_rows(steps: Draw, config: TrainConfig, place: int) -> Bool[Array, "*batch rows"] | None:
+def alive_rows(steps: StoredSteps, config: TrainConfig, place: int) -> Bool[Array, "*batch rows"] | None:
     """Which of a team's judged rows count; None where all always do."""
     if "alive" not in steps.before or config.of_state:
         return None
@@ -118,16 +118,16 @@ def store(
     learner: Learner, steps: Trajectory, factors: Float[Array, "time envs rows factors"], config: TrainConfig
 ) -> Learner:
     """Put new steps into the replay and into the running statistics."""
-    held = replay.extend(learner.replay, *rows_of(steps, factors, config), team_rewards(steps, config), steps.ended)
+    buffer = replay.extend(learner.replay, *rows_of(steps, factors, config), team_rewards(steps, config), steps.ended)
     ended = jnp.asarray(steps.ended)
-    new = replay.read(held, replay.newest(held, len(ended)))
+    new = replay.read(buffer, replay.newest(buffer, len(ended)))
     new = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), new)
     scale = tuple(
         observe_scale(one, new.mean_reward[..., place].ravel(), ended.ravel())
         for place, one in enumerate(learner.scale)
     )
     credit = tuple(with_steps(one, new, ended, config, place) for place, one in enumerate(learner.credit))
-    return learner._replace(credit=credit, scale=scale, replay=held)
+    return learner._replace(credit=credit, scale=scale, replay=buffer)
 
 
 def rows_of(steps: Trajectory, factors: Array, config: TrainConfig) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -151,7 +151,7 @@ def team_rewards(steps: Trajectory, config: TrainConfig) -> Float[Array, "time e
 
 
 def with_steps(
-    credit: Decomposition, steps: Draw, ended: Bool[Array, "time envs"], config: TrainConfig, place: int
+    credit: Decomposition, steps: StoredSteps, ended: Bool[Array, "time envs"], config: TrainConfig, place: int
 ) -> Decomposition:
     """A team's decoder with new steps in its statistics; one in closed form is fitted to the episodes that have ended."""
     rows, mask, mean_reward = (
@@ -186,19 +186,19 @@ def forget_episodes(learner: Learner, dropped: Bool[Array, " envs"]) -> Learner:
     return learner._replace(credit=credit, replay=replay.drop_running(learner.replay, dropped))
 
 
-def draw_credit(held: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditDraw | None:
+def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditSample | None:
     """Decide for some updates of the decoders which steps each of them reads; None for a method without such updates."""
     fit, credit, longest = config.method.fit, config.credit, config.env.max_steps
     if fit is None or not config.method.descends:
         return None
     if fit is Fit.SUBTRAJECTORIES:
-        return draw_padded(held, key, updates, credit.episodes, longest)
+        return sample_padded(buffer, key, updates, credit.episodes, longest)
     if fit is not Fit.ALL_STEPS:
         drawn = min(credit.drawn_steps, longest)
-        return draw_parts(held, key, updates, parts_count(config), drawn)
+        return sample_parts(buffer, key, updates, parts_count(config), drawn)
     if config.env.fixed_length:
-        return draw_padded(held, key, updates, parts_count(config), longest)
-    return draw_packed(held, key, updates, credit.steps, longest)
+        return sample_padded(buffer, key, updates, parts_count(config), longest)
+    return sample_packed(buffer, key, updates, credit.steps, longest)
 
 
 def parts_count(config: TrainConfig) -> int:
@@ -208,18 +208,18 @@ def parts_count(config: TrainConfig) -> int:
 
 
 def fit(
-    credit: tuple[Decomposition, ...], held: Replay, draw: CreditDraw, key: PRNGKeyArray, config: TrainConfig
+    credit: tuple[Decomposition, ...], buffer: Replay, sample: CreditSample, key: PRNGKeyArray, config: TrainConfig
 ) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
     """One update of every team's decoder."""
     assert config.method.fit is not None
-    steps, chosen = replay.read(held, draw.steps), draw.episodes
+    steps, chosen = replay.read(buffer, sample.steps), sample.episodes
     fitted, measured = [], []
     for place, (one, own) in enumerate(zip(credit, jax.random.split(key, len(credit)), strict=True)):
         mask = alive_rows(steps, config, place)
         rows = features(steps, config, place)
         batch = Episodes(
             rows,
-            draw.episode,
+            sample.episode,
             chosen.length,
             chosen.mean_reward[..., place],
             chosen.mask,
@@ -253,19 +253,19 @@ def fit_often(
     learner: Learner, key: PRNGKeyArray, config: TrainConfig
 ) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
     """`fit_updates` updates of the decoders, one behind the other; the mean of each metric over them."""
-    draw_key, key = jax.random.split(key)
-    draws = draw_credit(learner.replay, draw_key, config.fit_updates, config)
-    if draws is None:
+    sample_key, key = jax.random.split(key)
+    samples = sample_credit(learner.replay, sample_key, config.fit_updates, config)
+    if samples is None:
         return learner.credit, {}
 
-    def one(credit: tuple[Decomposition, ...], update: tuple[CreditDraw, PRNGKeyArray]):
+    def one(credit: tuple[Decomposition, ...], update: tuple[CreditSample, PRNGKeyArray]):
         return fit(credit, learner.replay, *update, config)
 
-    credit, measured = jax.lax.scan(one, learner.credit, (draws, jax.random.split(key, config.fit_updates)))
+    credit, measured = jax.lax.scan(one, learner.credit, (samples, jax.random.split(key, config.fit_updates)))
     return credit, jax.tree.map(jnp.mean, measured)
 
 
-def rewards(steps: Draw, paid: Paid, config: TrainConfig) -> Float[Array, "*batch agents"]:
+def rewards(steps: StoredSteps, paid: Paid, config: TrainConfig) -> Float[Array, "*batch agents"]:
     """What the algorithm is trained on: of each agent, proxy rewards always by the decoders as they stand."""
     acting, parts = alive(steps, config), []
     for place, team in enumerate(config.env.teams):
@@ -286,7 +286,7 @@ def rewards(steps: Draw, paid: Paid, config: TrainConfig) -> Float[Array, "*batc
     return jnp.concatenate(parts, axis=-1)
 
 
-def proxy_rewards(steps: Draw, paid: Paid, config: TrainConfig, place: int) -> Float[Array, "*batch rows"]:
+def proxy_rewards(steps: StoredSteps, paid: Paid, config: TrainConfig, place: int) -> Float[Array, "*batch rows"]:
     """r_hat of a team, for a method that has one: of each of its agents, or one for all."""
     if config.method.reward is Reward.DESIGNED:
         return steps.before["factors"][..., config.judged(place), 0]
@@ -303,13 +303,13 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
     """How near the newest proxy rewards come to the true ones, over the last steps of every environment."""
     if not config.method.has_proxy:
         return {}
-    held, found = learner.replay, []
+    buffer, found = learner.replay, []
     # What looks at whole episodes is given no others: those of the newest iteration.
     count = config.rollout_steps if config.env.fixed_length else max(1, RECENT // config.environments)
-    index = replay.newest(held, min(replay.capacity(held) - 1, count))
-    oldest = replay.oldest_transition(held)[:, None]
+    index = replay.newest(buffer, min(replay.capacity(buffer) - 1, count))
+    oldest = replay.oldest_transition(buffer)[:, None]
     there = index.number >= oldest
-    recent = replay.read(held, index._replace(number=jnp.maximum(index.number, oldest)))
+    recent = replay.read(buffer, index._replace(number=jnp.maximum(index.number, oldest)))
     paid = Paid(learner.credit, learner.scale)
     for place, team in enumerate(config.env.teams):
         true, acting = recent.before["reward"], alive(recent, config)

@@ -1,4 +1,4 @@
-"""Algorithms that consume transitions: draw, fit the decoder, relabel by it, update; many times in one compiled call.
+"""Algorithms that consume transitions: sample, fit the decoder, relabel by it, update; many times in one compiled call.
 
 Algorithm 1 of the LaRe paper, lines 6 to 8, for TD3, DDPG and SAC. Each is a module with the same functions: `init`, `act`,
 `explore` and `update`. They train a single agent.
@@ -15,20 +15,20 @@ from lare.algorithms import sac, td3
 from lare.algorithms.critics import OffPolicySettings, Transitions
 from lare.credit.decomposition import Decomposition
 from lare.data import replay
-from lare.data.replay import Draw, Index, Replay
-from lare.data.sampling import CreditDraw, draw_transitions
+from lare.data.replay import Index, Replay, StoredSteps
+from lare.data.sampling import CreditSample, sample_transitions
 from lare.data.trajectory import Trajectory
 from lare.networks import MLP
 from lare.training import learner as common
 from lare.training.config import TrainConfig
-from lare.training.learner import Learner, Paid, draw_credit
+from lare.training.learner import Learner, Paid, sample_credit
 
 
-class Draws(NamedTuple):
+class UpdateSample(NamedTuple):
     """Which transitions one update reads. Only numbers; the rows are read when the update runs."""
 
     batch: Index
-    credit: CreditDraw | None
+    credit: CreditSample | None
 
 
 def settings_of(config: TrainConfig) -> OffPolicySettings:
@@ -72,42 +72,42 @@ def act(
     return module.explore(actor, observation, noise, settings_of(config)), memory
 
 
-def draw(held: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> Draws:
+def sample(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> UpdateSample:
     """Decide for many updates at once what each of them reads."""
     batch_key, credit_key = jax.random.split(key)
-    batch = draw_transitions(held, batch_key, (updates, settings_of(config).batch_size))
-    return Draws(batch, draw_credit(held, credit_key, updates, config) if config.interleaved else None)
+    batch = sample_transitions(buffer, batch_key, (updates, settings_of(config).batch_size))
+    return UpdateSample(batch, sample_credit(buffer, credit_key, updates, config) if config.interleaved else None)
 
 
 def improve_one(
     learner: Learner, steps: Trajectory, key: PRNGKeyArray, done: Int[Scalar, ""], config: TrainConfig
 ) -> tuple[Learner, dict[str, Float[Array, ""]]]:
     """One update for each new step of an environment; the mean of each metric over them."""
-    draw_key, _, noise_key = jax.random.split(key, 3)
-    held, settings = learner.replay, settings_of(config)
+    sample_key, _, noise_key = jax.random.split(key, 3)
+    buffer, settings = learner.replay, settings_of(config)
     updates = config.rollout_steps * config.environments
 
     def one(
-        carry: tuple[Any, tuple[Decomposition, ...]], update: tuple[Int[Scalar, ""], Draws, PRNGKeyArray]
+        carry: tuple[Any, tuple[Decomposition, ...]], update: tuple[Int[Scalar, ""], UpdateSample, PRNGKeyArray]
     ) -> tuple[Any, dict[str, Array]]:
         algorithm, credit = carry
-        number, draws, key = update
+        number, chosen, key = update
         fit_key, key = jax.random.split(key)
         measured = {}
-        if draws.credit is not None:
-            credit, measured = common.fit(credit, held, draws.credit, fit_key, config)
-        steps = replay.read(held, draws.batch)
+        if chosen.credit is not None:
+            credit, measured = common.fit(credit, buffer, chosen.credit, fit_key, config)
+        steps = replay.read(buffer, chosen.batch)
         reward = common.rewards(steps, Paid(credit, learner.scale), config)
         algorithm, learned = module_of(config).update(algorithm, transitions(steps, reward), key, number, settings)
         return (algorithm, credit), measured | learned
 
     numbers = done - settings.warmup + jnp.arange(updates)
-    each = (numbers, draw(held, draw_key, updates, config), jax.random.split(noise_key, updates))
+    each = (numbers, sample(buffer, sample_key, updates, config), jax.random.split(noise_key, updates))
     (algorithm, credit), measured = jax.lax.scan(one, (learner.algorithm, learner.credit), each)
     return learner._replace(algorithm=algorithm, credit=credit), jax.tree.map(jnp.mean, measured)
 
 
-def transitions(steps: Draw, reward: Float[Array, "batch 1"]) -> Transitions:
+def transitions(steps: StoredSteps, reward: Float[Array, "batch 1"]) -> Transitions:
     """Steps of the only agent, as the algorithm sees them."""
     before, after = steps.before, steps.after
     continues = 1.0 - before["terminated"]

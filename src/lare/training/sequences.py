@@ -1,4 +1,4 @@
-"""Algorithms that consume whole episodes: draw them, relabel them by the newest decoder, update; as often as episodes have ended.
+"""Algorithms that consume whole episodes: sample them, relabel them by the newest decoder, update; as often as episodes have ended.
 
 QMIX and VDN. The team has one reward a step: the mean over its agents that are alive. The mixer is given the global state by its
 running mean and deviation (PyMARL2: as it comes, where its environments scale it); where there is none, all observations side
@@ -17,13 +17,13 @@ from lare.algorithms.recurrent import Recurrent
 from lare.credit.decomposition import Decomposition
 from lare.data import replay
 from lare.data.replay import Index, Replay
-from lare.data.sampling import EpisodeDraw, draw_distinct_episodes
+from lare.data.sampling import EpisodeSample, sample_distinct_episodes
 from lare.data.trajectory import Trajectory
 from lare.normalise import RunningMeanStd, new_mean_std, observe, standardise_if_known
 from lare.tasks.env import team_mean
 from lare.training import learner as common
 from lare.training.config import TrainConfig
-from lare.training.learner import Learner, Paid, draw_credit
+from lare.training.learner import Learner, Paid, sample_credit
 
 Measured = dict[str, Float[Array, "*seeds"]]
 Updated = tuple[qmix.QMIX, tuple[Decomposition, ...]]
@@ -96,12 +96,12 @@ def act(
 
 
 def sequences(
-    held: Replay, episodes: EpisodeDraw, steps: int, paid: Paid, states: RunningMeanStd, config: TrainConfig
+    buffer: Replay, episodes: EpisodeSample, steps: int, paid: Paid, states: RunningMeanStd, config: TrainConfig
 ) -> qmix.Sequences:
     """Drawn episodes, each padded with its last step to so many, with what the method pays for them."""
     number = jnp.minimum(jnp.arange(steps), episodes.length[:, None] - 1)
     env = jnp.broadcast_to(episodes.first.env[:, None], number.shape)
-    drawn = replay.read(held, Index(env, episodes.first.number[:, None] + number))
+    drawn = replay.read(buffer, Index(env, episodes.first.number[:, None] + number))
     here = (jnp.arange(steps) < episodes.length[:, None]) * episodes.mask[:, None]
     reward = common.rewards(drawn, paid, config)
 
@@ -131,14 +131,21 @@ def lengths(config: TrainConfig) -> list[int]:
 
 
 def one_update(
-    learner: Learner, episodes: EpisodeDraw, key: PRNGKeyArray, number: Int[Scalar, ""], config: TrainConfig, steps: int
+    learner: Learner,
+    episodes: EpisodeSample,
+    key: PRNGKeyArray,
+    number: Int[Scalar, ""],
+    config: TrainConfig,
+    steps: int,
 ) -> tuple[Updated, Measured]:
     """The decoder's update, and then the algorithm's, of one seed; only what they change, for the learner holds much more."""
-    draw_key, fit_key = jax.random.split(key)
+    sample_key, fit_key = jax.random.split(key)
     credit, measured = learner.credit, {}
-    draw = draw_credit(learner.replay, draw_key, 1, config)
-    if draw is not None:
-        credit, measured = common.fit(credit, learner.replay, jax.tree.map(lambda leaf: leaf[0], draw), fit_key, config)
+    chosen = sample_credit(learner.replay, sample_key, 1, config)
+    if chosen is not None:
+        credit, measured = common.fit(
+            credit, learner.replay, jax.tree.map(lambda leaf: leaf[0], chosen), fit_key, config
+        )
     state, settings = learner.algorithm, settings_of(config)
     paid = Paid(credit, learner.scale)
     batch = sequences(learner.replay, episodes, steps, paid, state.states, config)
@@ -166,21 +173,21 @@ def improve(
     def update(turn: Int[Scalar, ""], carry: tuple[Updated, Measured]) -> tuple[Updated, Measured]:
         (made, credit), total = carry
         now = learner._replace(algorithm=learner.algorithm._replace(qmix=made), credit=credit)
-        draw_keys, update_keys = jnp.unstack(
+        sample_keys, update_keys = jnp.unstack(
             jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, turn)))(keys), axis=1
         )
-        draw = partial(draw_distinct_episodes, count=settings.batch_size)
-        episodes = jax.vmap(draw)(now.replay, draw_keys)
+        sample = partial(sample_distinct_episodes, count=settings.batch_size)
+        episodes = jax.vmap(sample)(now.replay, sample_keys)
         longest = jnp.max(episodes.length * (episodes.mask > 0))
         branches = [jax.vmap(partial(one_update, config=config, steps=cut)) for cut in cuts]
         place = jnp.searchsorted(jnp.asarray(cuts), longest)
         updated, measured = jax.lax.switch(place, branches, now, episodes, update_keys, before + turn + 1)
-        counts = turn < owed
+        mask = turn < owed
 
         def choose(new: Array, old: Array) -> Array:
-            return jnp.where(counts.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+            return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-        sums = {name: total[name] + jnp.where(counts, values, 0) for name, values in measured.items()}
+        sums = {name: total[name] + jnp.where(mask, values, 0) for name, values in measured.items()}
         return jax.tree.map(choose, updated, (made, credit)), sums
 
     names = ["critic/loss", "critic/value"]

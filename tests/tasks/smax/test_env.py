@@ -9,7 +9,7 @@ from lare.tasks.env import JaxEnv, Timestep
 from lare.tasks.smax import NAMES
 from lare.tasks.smax.battle import ATTACK, STOP
 from lare.tasks.smax.env import SMAX, State
-from lare.tasks.smax.scenarios import KINDS
+from lare.tasks.smax.scenarios import UNIT_TYPES
 
 BATTLES = 8
 
@@ -223,13 +223,13 @@ def test_a_batch_is_its_battles_one_by_one(name):
 def test_the_state_is_laid_out_as_the_texts_say(name):
     env, (state, seen) = made(name), played(name)
     scenario, battle = env.scenario, state.battle
-    width = 4 + scenario.kinds
-    kinds = list(KINDS)
+    width = 4 + scenario.unit_types
+    kinds = list(UNIT_TYPES)
     assert width == (11 if name == "1c3s5z" else 10)
     for unit, kind in enumerate((*scenario.ours, *scenario.theirs)):
         entries = seen.state[..., unit * width : (unit + 1) * width]
         lives = battle.health[..., unit] > 0
-        np.testing.assert_allclose(entries[..., 0], battle.health[..., unit] / KINDS[kind].health, rtol=1e-6)
+        np.testing.assert_allclose(entries[..., 0], battle.health[..., unit] / UNIT_TYPES[kind].health, rtol=1e-6)
         np.testing.assert_array_equal(entries[lives][:, 1:3], battle.position[lives][:, unit])
         np.testing.assert_array_equal(entries[lives][:, 3], battle.cooldown[lives][:, unit])
         place = {"stalker": 6, "zealot": 7, "colossus": 10}[kind]
@@ -256,6 +256,6 @@ def test_the_weapon_falls_by_half_a_second_in_each_step_without_an_attack():
 def test_observations_are_bounded_and_hold_ones_own_place(name):
     env, (state, seen) = made(name), played(name)
     assert (np.abs(seen.observation) <= 1).all()
-    own = seen.observation[..., -(4 + env.scenario.kinds) :]
+    own = seen.observation[..., -(4 + env.scenario.unit_types) :]
     position = state.battle.position[:, :, : env.spec.agents]
     np.testing.assert_allclose(own[seen.alive][:, 1:3], position[seen.alive] / 32, rtol=1e-6)

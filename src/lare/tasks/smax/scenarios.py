@@ -1,4 +1,4 @@
-"""Who fights: the kinds of units, and the armies of each battle.
+"""Who fights: the types of units, and the armies of each battle.
 
 All figures but the colossus's are the defaults of SMAX in JaxMARL 0.2.0 (Rutherford et al., 2024; `smax_env.py`,
 Apache-2.0); shields count as health there. JaxMARL has no colossus. Ours has StarCraft II's health (200, and a shield of
@@ -16,8 +16,8 @@ from lare.errors import LareError, did_you_mean
 from lare.tasks.smax import NAMES
 
 
-class Kind(NamedTuple):
-    """What all units of a kind have in common. Lengths are those of the field, times are seconds."""
+class UnitType(NamedTuple):
+    """What all units of a type have in common. Lengths are those of the field, times are seconds."""
 
     speed: float
     damage: float
@@ -30,14 +30,14 @@ class Kind(NamedTuple):
     """From one attack to the next, on average a little more."""
 
 
-KINDS = {
-    "marine": Kind(3.15, 9, 5, 9, 0.375, 45, 0.61),
-    "marauder": Kind(2.25, 10, 6, 10, 0.5625, 125, 1.07),
-    "stalker": Kind(4.13, 13, 6, 10, 0.625, 160, 1.87),
-    "zealot": Kind(3.15, 8, 2, 9, 0.5, 150, 0.86),
-    "zergling": Kind(4.13, 5, 2, 8, 0.375, 35, 0.5),
-    "hydralisk": Kind(3.15, 12, 5, 9, 0.625, 80, 0.59),
-    "colossus": Kind(3.15, 20, 7, 10, 1.0, 350, 1.07),
+UNIT_TYPES = {
+    "marine": UnitType(3.15, 9, 5, 9, 0.375, 45, 0.61),
+    "marauder": UnitType(2.25, 10, 6, 10, 0.5625, 125, 1.07),
+    "stalker": UnitType(4.13, 13, 6, 10, 0.625, 160, 1.87),
+    "zealot": UnitType(3.15, 8, 2, 9, 0.5, 150, 0.86),
+    "zergling": UnitType(4.13, 5, 2, 8, 0.375, 35, 0.5),
+    "hydralisk": UnitType(3.15, 12, 5, 9, 0.625, 80, 0.59),
+    "colossus": UnitType(3.15, 20, 7, 10, 1.0, 350, 1.07),
 }
 """In the order of their numbers in observations and states."""
 
@@ -51,8 +51,8 @@ class Scenario:
     theirs: tuple[str, ...]
     limit: int
     """The most steps."""
-    kinds: int = 6
-    """How many kinds observations and states tell apart."""
+    unit_types: int = 6
+    """How many types observations and states tell apart."""
 
     @property
     def allies(self) -> int:
@@ -67,9 +67,9 @@ class Scenario:
         return self.allies + self.enemies
 
     @cached_property
-    def kind(self) -> Int[np.ndarray, " units"]:
-        """Each unit's number in KINDS."""
-        numbers = list(KINDS)
+    def unit_type(self) -> Int[np.ndarray, " units"]:
+        """Each unit's number in UNIT_TYPES."""
+        numbers = list(UNIT_TYPES)
         return np.array([numbers.index(name) for name in (*self.ours, *self.theirs)])
 
     @cached_property
@@ -78,8 +78,8 @@ class Scenario:
         return np.repeat(np.array([0, 1], np.float32), [self.allies, self.enemies])
 
     def each(self, figure: str) -> Float[np.ndarray, " units"]:
-        """A figure of each unit's kind."""
-        return np.array([getattr(KINDS[name], figure) for name in (*self.ours, *self.theirs)], np.float32)
+        """A figure of each unit's type."""
+        return np.array([getattr(UNIT_TYPES[name], figure) for name in (*self.ours, *self.theirs)], np.float32)
 
 
 def army(colossi: int = 0, stalkers: int = 0, zealots: int = 0) -> tuple[str, ...]:
@@ -91,7 +91,7 @@ SCENARIOS = {
     for scenario in (
         Scenario("2s3z", army(0, 2, 3), army(0, 2, 3), 120),
         Scenario("3s_vs_5z", army(0, 3, 0), army(0, 0, 5), 250),
-        Scenario("1c3s5z", army(1, 3, 5), army(1, 3, 5), 180, kinds=7),
+        Scenario("1c3s5z", army(1, 3, 5), army(1, 3, 5), 180, unit_types=7),
     )
 }
 """With the time limits that these battles have in SMAC."""

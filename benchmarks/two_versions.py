@@ -1,0 +1,123 @@
+"""What a training step costs in two versions of LaRe: each in a process of its own, by turns, in seconds of the processor.
+
+    git worktree add ../before COMMIT
+    python benchmarks/two_versions.py ../before .
+
+A turn is 500 environment steps of HalfCheetah-v4 with as many updates (td3, ddpg, sac), one rollout of 2000 steps with its updates
+(ppo), or ten iterations of CN-6 with one fit of the decoder (ippo), by each version's own `step_costs.py` and `agents_speed.py`.
+Both processes are bound to the same core, and one waits while the other works.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import tyro
+from measure import write
+
+TURN = {"ppo": 2000, "td3": 500, "ddpg": 500, "sac": 500}
+"""Environment steps."""
+CASES = ("td3 lare-rrdu", "ppo lare-rrdu", "ippo lare-rd")
+
+PROGRAM = """
+import sys, tempfile, time
+from functools import partial
+from pathlib import Path
+
+import agents_speed, measure, step_costs
+
+algorithm, method, steps = sys.argv[1], sys.argv[2], int(sys.argv[3])
+with tempfile.TemporaryDirectory() as place:
+    if algorithm == "ippo":
+        turn = partial(agents_speed.turn, agents_speed.session(Path(place) / "run", "CN-6", method))
+    else:
+        turn = partial(measure.advance, step_costs.session(Path(place), algorithm, method), steps)
+    turn()
+    print("ready", flush=True)
+    for _ in sys.stdin:
+        before = time.process_time()
+        turn()
+        print(time.process_time() - before, flush=True)
+"""
+
+
+class Version:
+    """A checkout whose training steps are timed."""
+
+    def __init__(self, checkout: Path, case: str, core: int):
+        algorithm, method = case.split()
+        path = os.pathsep.join(str(checkout.resolve() / name) for name in ("src", "benchmarks"))
+        self.process = subprocess.Popen(
+            [sys.executable, "-P", "-c", PROGRAM, algorithm, method, str(TURN.get(algorithm, 0))],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu"},
+            preexec_fn=lambda: os.sched_setaffinity(0, {core}),
+        )
+
+    def answer(self) -> str:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise SystemExit("the process ended: see above")
+        return line.strip()
+
+    def turn(self) -> float:
+        """Seconds of the processor."""
+        assert self.process.stdin is not None
+        self.process.stdin.write("go\n")
+        self.process.stdin.flush()
+        return float(self.answer())
+
+    def close(self) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        self.process.wait()
+
+
+def measured(before: Path, after: Path, case: str, rounds: int, core: int) -> dict[str, Any]:
+    """Seconds of each turn, and the median over the rounds of the ratio within a round."""
+    versions = [Version(checkout, case, core) for checkout in (before, after)]
+    assert all(version.answer() == "ready" for version in versions)
+    turns: list[list[float]] = [[], []]
+    for number in range(rounds):
+        for place in (0, 1) if number % 2 else (1, 0):  # who is first changes
+            turns[place].append(versions[place].turn())
+    for version in versions:
+        version.close()
+    ratios = sorted(new / old for old, new in zip(*turns, strict=True))
+    return {"before": turns[0], "after": turns[1], "ratio": median(ratios), "least": ratios[0], "most": ratios[-1]}
+
+
+def commit(checkout: Path) -> str:
+    return subprocess.run(
+        ["git", "-C", str(checkout), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+def main(before: tyro.conf.Positional[Path], after: tyro.conf.Positional[Path], rounds: int = 9, core: int = 0) -> None:
+    """Measure.
+
+    Args:
+        before: a checkout.
+        after: another one.
+        rounds: how often each has its turn.
+        core: which both run on.
+    """
+    found = {}
+    for case in CASES:
+        found[case] = measured(before, after, case, rounds, core)
+        print(f"{case}: {json.dumps({name: round(found[case][name], 3) for name in ('ratio', 'least', 'most')})}")
+    write(
+        "two_versions",
+        {"before": commit(before), "after": commit(after), "rounds": rounds, "processor seconds of a turn": found},
+    )
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
