@@ -13,7 +13,9 @@ from lare.tasks.spec import read_task
 from lare.training import session as sessions
 from toys import pick_spec, toy_spec
 
-KINDS = ("td3", "ppo", "ippo", "qmix")
+GRID = [(kind, method) for kind in ("td3", "ippo", "qmix") for method in METHODS]
+GRID += [("ppo", method) for method in ("dense", "rrdu", "diaster", "arel", "lare-rd", "lare-linear", "llm-reward")]
+"""ppo is ippo of one agent: one method of each kind, and diaster, which many agents do not have."""
 
 
 def task_of(kind):
@@ -48,8 +50,7 @@ def fits(kind, row):
     return not (row.for_one_only if many else row.for_many_only)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("kind", "method"), GRID)
 def test_every_method_trains_and_reports_or_is_refused(method, kind, small, small_many, tmp_path):
     row = METHODS[method]
     if not fits(kind, row):

@@ -29,6 +29,10 @@ Measured = dict[str, Float[Array, "*seeds"]]
 Updated = tuple[qmix.QMIX, tuple[Decomposition, ...]]
 
 
+WORTH_CUTTING = 32
+"""Steps of the longest episode. Each length is compiled by itself, and shorter episodes have little to save."""
+
+
 class SequenceState(NamedTuple):
     """What QMIX learns, and what stands around it."""
 
@@ -125,7 +129,7 @@ def sequences(
 def lengths(config: TrainConfig) -> list[int]:
     """To which a batch may be cut: the shortest that holds its longest episode is taken."""
     longest = config.env.max_steps
-    if config.env.fixed_length:
+    if config.env.fixed_length or longest < WORTH_CUTTING:
         return [longest]
     return sorted({-(-longest // 4), -(-longest // 2), longest})
 
