@@ -235,3 +235,24 @@ def test_random_steps_are_everybodys_and_nobody_writes_into_them(chase):
 def test_another_task_has_other_steps(chase):
     longer = toy_spec(max_episode_steps=50)
     assert not np.array_equal(random_steps(chase, steps=50)[0], random_steps(longer, steps=50)[0])
+
+
+def test_agents_that_have_left_have_no_random_steps():
+    """Of two agents one acts twice in an episode of five steps, the other at each."""
+    task = toy_spec(
+        name="toy",
+        environment="pettingzoo/parallel_toys:Toy",
+        observation_size=2,
+        action_size=3,
+        arguments={"leaves": {"a_1": 2}},
+    )
+    observation, action = random_steps(task, steps=70)
+    assert np.bincount(observation[:, 1].astype(int)).tolist() == [20, 20, 10, 10, 10]
+    np.testing.assert_array_equal(action.sum(axis=1), 1)
+
+
+def test_an_agent_that_never_acts_cannot_be_judged():
+    late = {"name": "toy", "environment": "pettingzoo/parallel_toys:Toy", "observation_size": 2, "action_size": 3}
+    team = toy_spec(**late, arguments={"joins": {"a_1": 9}}, agents=("a_1",), team="late")
+    with pytest.raises(LareError, match=r"^no agent of toy acted in 200 steps of random actions$"):
+        random_steps(team, steps=10)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from lare.errors import LareError
 from lare.latent.checks import Check, Failed, Trial, advice, examine, failed
 from lare.latent.jailed import JailedProgram, WorkerFailed
 from lare.latent.names import names_of
@@ -19,6 +20,8 @@ from lare.tasks.table import make_host_env
 
 STEPS = 256
 """Random steps that a function is tried on."""
+PATIENCE = 20
+"""Environment steps, at most, for each of them: agents that have left have none."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +93,16 @@ def known_steps(
     with contextlib.closing(make_host_env(role)) as env:
         team, random = team_of(role, env.spec), np.random.default_rng(seed)
         played = (step for number in itertools.count() for step in steps_of(env, None, random, seed + number))
-        per_step = 1 if role.judged_from == "state" else team.size
-        found = [rows_of(role, team, *step[:2]) for step in itertools.islice(played, -(-steps // per_step))]
+        found, count = [], 0
+        for before, action, _ in itertools.islice(played, PATIENCE * steps):
+            acted = slice(None) if role.judged_from == "state" else before.alive[team.agents]
+            found.append([rows[acted] for rows in rows_of(role, team, before, action)])
+            count += len(found[-1][0])
+            if count >= steps:
+                break
     observation, action = (np.concatenate(part)[:steps].astype(np.float32) for part in zip(*found, strict=True))
+    if not len(observation):
+        raise LareError(f"no agent of {role.name} acted in {PATIENCE * steps} steps of random actions")
     for array in (observation, action):
         array.setflags(write=False)
     return observation, action
