@@ -16,7 +16,7 @@ from lare.algorithms.table import ALGORITHMS
 from lare.latent.function import LatentFunction, verified
 from lare.run.settings import Settings
 from lare.tasks.spec import TaskSpec
-from lare.tasks.table import FAMILIES
+from lare.tasks.table import FAMILIES, Family
 from toys import PHI, REWARD, Chase, toy_spec
 
 # Most of a small run's time is compilation, and many tests compile the same. JAX may have been imported already, and
@@ -89,7 +89,7 @@ def command(monkeypatch, capsys, tmp_path):
 @pytest.fixture
 def echo(monkeypatch) -> TaskSpec:
     """The toy of many agents in JAX, of a family of its own."""
-    monkeypatch.setitem(FAMILIES, "echo", lambda task, **_: Echo())
+    monkeypatch.setitem(FAMILIES, "echo", Family(lambda task, **_: Echo()))
     return echo_spec()
 
 

@@ -267,6 +267,18 @@ def test_an_id_that_names_its_module(spec_file):
     assert load_task(spec_file(environment="toys:toys/Chase-v0")).environment == "toys:toys/Chase-v0"
 
 
+@pytest.mark.parametrize("value", ["inf", "-inf", "nan", "2001-02-03", "[1, nan]", "{ n = inf }"])
+def test_arguments_that_a_run_cannot_keep(tmp_path, value):
+    """TOML has them and JSON has not: they would come back as null, or as text, and make another environment."""
+    path = tmp_path / "task.toml"
+    path.write_text(f'like = "CN-6"\narguments = {{ n = {value} }}\n')
+    with pytest.raises(LareError) as error:
+        read_task(path)
+    said = "a run cannot keep dates, inf or nan: numbers, strings, lists and tables only"
+    assert str(error.value).startswith(f"task '{path}': arguments = {{'n': ")
+    assert str(error.value).endswith(f": {said}")
+
+
 def test_a_name_too_long_for_a_file():
     with pytest.raises(LareError, match="no task 'xxx"):
         load_task("x" * 300)

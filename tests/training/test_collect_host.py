@@ -16,7 +16,7 @@ from lare.tasks.env import EnvSpec, Team, in_units
 from lare.tasks.environment import EnvironmentFault
 from lare.tasks.gymnasium import GymnasiumEnv
 from lare.tasks.on_host import OnHost
-from lare.tasks.table import FAMILIES, make_host_env
+from lare.tasks.table import FAMILIES, Family, make_host_env
 from lare.tasks.workers import LocalEnvs, WorkerEnvs
 from lare.training.collect_host import Diverged, HostEpisodes, evaluate
 from lare.training.streams import Stream, episode_seed
@@ -262,7 +262,7 @@ def test_many_agents_on_the_host_resume_bit_for_bit(algorithm, small_many, tmp_p
         env.spec = replace(env.spec, in_jax=False)
         return env
 
-    monkeypatch.setitem(FAMILIES, "hosted", hosted)
+    monkeypatch.setitem(FAMILIES, "hosted", Family(hosted))
     monkeypatch.setattr("lare.training.collect_host.WorkerEnvs", LocalEnvs)
     task = echo_spec(environment="hosted/three")
     changes = {"environments": 2, "rollout_steps": 10, "steps": 160, "evaluate_every": 40, "evaluation_episodes": 2}

@@ -140,7 +140,7 @@ def finite(value: Any, shape: tuple[int, ...] | None) -> Float[np.ndarray, "..."
     try:
         with np.errstate(over="ignore"):
             array = np.array(value, np.float32)  # a copy: the environment may write the next ones into the same memory
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"is {shortened(value)}, which are no numbers") from None
     if shape is not None and array.shape != shape:
         raise ValueError(f"has the shape {array.shape}, not {shape}")
@@ -175,14 +175,15 @@ def by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tuple[Team
     if task.team is not None:  # it speaks of one team, whose function is verified
         own = [name for name in names if speaks_of(task, name)]
         others = [name for name in names if name not in own]
-        found = {task.team: own} | ({"others": others} if others else {})
+        if not own:
+            raise LareError(nobody(task, task.team, names, f"{task.team}: {', '.join(task.agents)}"))
+        found = {task.team: own} | ({f"not {task.team}": others} if others else {})
         return [*own, *others], in_order(found)
     found = {role.team or role.name: [name for name in names if speaks_of(role, name)] for role in task.roles}
     said = "; ".join(f"{role.team or role.name}: {', '.join(role.agents) or 'all'}" for role in task.roles)
     for role, members in found.items():
         if not members:
-            listed = ", ".join(map(str, names))
-            raise LareError(f"task {task.name!r}: no agent is in {role}, of the agents {listed} ({said})")
+            raise LareError(nobody(task, role, names, said))
     for name in names:
         teams = [role for role, members in found.items() if name in members]
         if len(teams) != 1:
@@ -192,6 +193,10 @@ def by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tuple[Team
         kinds = {kind(name) for name in names}
         return list(names), (Team(kinds.pop() if len(kinds) == 1 else "agent", 0, len(names)),)
     return [name for members in found.values() for name in members], in_order(found)
+
+
+def nobody(task: TaskSpec, team: str, names: Sequence[Any], said: str) -> str:
+    return f"task {task.name!r}: no agent is in {team}, of the agents {', '.join(map(str, names))} ({said})"
 
 
 def in_order(members: Mapping[str, Sequence[Any]]) -> tuple[Team, ...]:

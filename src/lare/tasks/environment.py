@@ -38,23 +38,31 @@ class Guarded(gymnasium.Wrapper, RecordConstructorArgs):
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         try:
-            return self.env.reset(**options)
+            observation, info = self.env.reset(**options)
         except (Exception, SystemExit) as error:
             raise fault(f"environment {self.name!r} failed in reset", error) from error
+        return observation, self.told(info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
+            terminated, truncated = bool(terminated), bool(truncated)  # an array of several is neither
         except (Exception, SystemExit) as error:
             raise fault(f"environment {self.name!r} failed in step", error) from error
-        return observation, number(reward, f"environment {self.name!r} gave the reward"), terminated, truncated, info
+        paid = number(reward, f"environment {self.name!r} gave the reward")
+        return observation, paid, terminated, truncated, self.told(info)
+
+    def told(self, info: Any) -> dict[str, Any]:
+        if not isinstance(info, dict):
+            raise LareError(f"environment {self.name!r} gave {shortened(info)} for its info, which is no dictionary")
+        return info
 
 
 def number(value: Any, what: str) -> float:
     """A number that came out of foreign code. Raises `LareError` where it is none."""
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise LareError(f"{what} {shortened(value)}, which is no number") from None
 
 
@@ -77,7 +85,8 @@ def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) 
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
         try:
             made = gymnasium.make(environment, max_episode_steps=max_episode_steps, **kwargs)
-            return as_rows(Guarded(made, environment))
+            # Outermost: rows are made of what the environment gave, which may not be what its spaces say.
+            return Guarded(as_rows(made), environment)
         except (Exception, SystemExit) as error:  # anything may come out of its constructor
             hint, library = "", os.environ.get("MUJOCO_GL")
             if library and isinstance(error, AttributeError):
@@ -97,5 +106,6 @@ def limit_of(environment: str) -> int | None:
 def measured(info: dict, name: str) -> float:
     """What the last step's `info` says of a measure of the task. Raises `LareError` where it says nothing."""
     if name not in info:
-        raise LareError(f"the task measures {name!r}, but the last step's info has only {', '.join(sorted(info))}")
+        keys = ", ".join(sorted(map(str, info)))
+        raise LareError(f"the task measures {name!r}, but the last step's info has only {keys or 'nothing'}")
     return number(info[name], f"the task measures {name!r}, and the last step's info has")

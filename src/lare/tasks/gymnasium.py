@@ -95,8 +95,9 @@ def spec_of(task: TaskSpec, observations: Any, actions: Any) -> EnvSpec:
 def checked(value: object, what: str, shape: tuple[int, ...] | None) -> np.ndarray:
     """What an environment gave, as an array of its own. Raises `EnvironmentFault` where nothing can be learned from it."""
     try:
-        array = np.array(value, np.float32)  # a copy: the environment may write the next one into the same memory
-    except (TypeError, ValueError):
+        with np.errstate(over="ignore"):  # infinity is refused below
+            array = np.array(value, np.float32)  # a copy: the environment may write the next one into the same memory
+    except (TypeError, ValueError, OverflowError):
         raise EnvironmentFault(f"the environment gave {shortened(value)} for its {what}") from None
     if array.shape != shape:
         raise EnvironmentFault(f"the environment gave its {what} in shape {array.shape}, not {shape}")

@@ -1,12 +1,13 @@
 """A task: an environment and the texts that describe it, read from TOML and checked against the environment."""
 
 import hashlib
+import json
 import tomllib
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from lare.errors import Checked, LareError, did_you_mean
 
@@ -23,7 +24,7 @@ PETTINGZOO = "pettingzoo/"
 """What the environment of a spec begins with where it is a PettingZoo environment; the rest is MODULE:NAME."""
 
 OF_THE_ENVIRONMENT = ("environment", "arguments", "max_episode_steps", "judged_from", "judges")
-"""Keys that a team has from its task, unless its own spec says something else."""
+"""Keys that a team has from its task. Its own spec may say them too, to be used alone, but nothing else."""
 
 FILL_IN = "FILL IN"
 """Stands in a new spec where nobody has said something yet."""
@@ -53,15 +54,25 @@ class TaskSpec(Checked):
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` that are averaged and reported beside the return."""
     arguments: dict[str, Any] = Field(default_factory=dict)
-    """Keyword arguments of the environment, where it is made from a module (`pettingzoo/...`)."""
+    """Keyword arguments of the environment, where it is made from a module (`pettingzoo/...`); refused elsewhere."""
     agents: tuple[str, ...] = ()
-    """Names, or patterns of names like `prey_*`, of the agents that this spec speaks of; all of them, unless given."""
+    """Names, or patterns of names like `prey_*`, of the agents that this spec speaks of; all of them, unless given. Only where
+    agents have names (`pettingzoo/...`)."""
     judged_from: JudgedFrom = "observation"
     """Whether `phi` judges each agent's step by what the agent observes, or the whole team's by the global state."""
     teams: tuple["TaskSpec", ...] = ()
     """Where several teams learn, each for itself: a spec for each, with texts of its own. In TOML, their names."""
     team: str | None = None
     """The team that this spec speaks of, where it is one of several of its environment."""
+
+    @field_validator("arguments")
+    @classmethod
+    def can_be_kept(cls, arguments: dict[str, Any]) -> dict[str, Any]:
+        try:
+            json.dumps(arguments, allow_nan=False)  # as a run keeps its task, and would come back with something else
+        except (TypeError, ValueError):
+            raise ValueError("a run cannot keep dates, inf or nan: numbers, strings, lists and tables only") from None
+        return arguments
 
     @model_validator(mode="after")
     def is_filled_in(self) -> "TaskSpec":

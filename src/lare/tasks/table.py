@@ -1,16 +1,28 @@
 """The table of families: from what a task calls its environment to the environment.
 
 What stands before the first slash names the family; every other name is one of Gymnasium's. A new family is one module with a
-class that is a `JaxEnv` or a `HostEnv`, and one row here.
+class that is a `JaxEnv` or a `HostEnv`, and one row here, which says what it reads of a task.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from lare.errors import LareError
 from lare.tasks.env import EnvSpec, HostEnv, JaxEnv
-from lare.tasks.spec import TaskSpec
+from lare.tasks.spec import OF_THE_ENVIRONMENT, TaskSpec
+
+NOT_FOR_ALL = ("max_episode_steps", "arguments", "agents")
+"""Keys of a task that only some families read. The others refuse them: what is said and not heard would mislead."""
+
+
+class Family(NamedTuple):
+    """A row of the table."""
+
+    make: Callable[..., JaxEnv | HostEnv]
+    """From a task to its environment."""
+    reads: tuple[str, ...] = ()
+    """Which of `NOT_FOR_ALL` this family reads."""
 
 
 def particles(task: TaskSpec, **_: Any) -> JaxEnv:
@@ -43,12 +55,15 @@ def pettingzoo(task: TaskSpec, **kwargs: Any) -> HostEnv:
     return make(task, **kwargs)
 
 
-FAMILIES: dict[str, Callable[..., JaxEnv | HostEnv]] = {
-    "particles": particles,
-    "smax": smax,
-    "smac": smac,
-    "pettingzoo": pettingzoo,
+FAMILIES = {
+    "particles": Family(particles),
+    "smax": Family(smax),
+    "smac": Family(smac),
+    "pettingzoo": Family(pettingzoo, reads=("max_episode_steps", "arguments", "agents")),
 }
+
+GYMNASIUM = Family(gymnasium, reads=("max_episode_steps",))
+"""Of every other name."""
 
 
 def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
@@ -57,7 +72,9 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
     Raises:
         LareError: it cannot be made, or is not what the task says.
     """
-    env = FAMILIES.get(task.family, gymnasium)(task, **kwargs)
+    family = FAMILIES.get(task.family, GYMNASIUM)
+    check_keys(task, family)
+    env = family.make(task, **kwargs)
     try:
         check(task, env.spec)
     except LareError:
@@ -90,6 +107,24 @@ def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
     return OnHost(env)
 
 
+def check_keys(task: TaskSpec, family: Family) -> None:
+    """Raise `LareError` at the first key that nobody would read."""
+    for role in (task, *task.teams):
+        for key in NOT_FOR_ALL:
+            if getattr(role, key) and key not in family.reads:
+                raise LareError(f"task {role.name!r}: {key} makes no difference to {task.environment}: leave it out")
+    if not task.teams:
+        return
+    for key in ("agents", "team"):
+        if getattr(task, key):
+            raise LareError(
+                f"task {task.name!r}: {key} makes no difference to a task with teams: say it of one of them"
+            )
+    for role in task.teams:
+        if role.teams:
+            raise LareError(f"task {role.name!r} is a team of {task.name!r} and cannot have teams: leave them out")
+
+
 def check(task: TaskSpec, spec: EnvSpec) -> None:
     """Raise `LareError` at the first thing in which an environment is not what a task says."""
     names = [team.name for team in spec.teams]
@@ -99,9 +134,18 @@ def check(task: TaskSpec, spec: EnvSpec) -> None:
         raise LareError(
             f"{task.environment} has the teams {', '.join(names)}: name a spec for each of them, in this order"
         )
-    for key in ("max_episode_steps", "arguments") if spec.in_jax else ():
-        if getattr(task, key):
-            raise LareError(f"task {task.name!r}: {key} makes no difference to {task.environment}: leave it out")
+    for role in task.teams:
+        for key in OF_THE_ENVIRONMENT:  # training knows the task's only, and verifying the team's only
+            own, whole = getattr(role, key), getattr(task, key)
+            if own != whole:
+                raise LareError(
+                    f"task {role.name!r}: {key} = {own!r}, but {task.name!r}, of which it is a team, has {whole!r}: "
+                    "say the same in both"
+                )
+    if not task.teams and task.team not in (None, *names):
+        raise LareError(
+            f"task {task.name!r}: team = {task.team!r}, but {task.environment} has no such team, only {', '.join(names)}"
+        )
     if task.max_episode_steps not in (None, spec.max_steps):
         raise LareError(
             f"task {task.name!r}: max_episode_steps = {task.max_episode_steps}, but an episode of {task.environment} takes "
