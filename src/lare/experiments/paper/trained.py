@@ -152,7 +152,9 @@ def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], 
     key, printed = exhibit.measure(name), exhibit.printed.get(name, {})
     yield f"## {name}"
     yield f"![{name}]({exhibit.name}-{name}.svg)"
-    beside = ["the paper"] if printed else [] if key == ERROR else ["error of the proxy reward", "its correlation"]
+    columns = {RETURN: "return"} if key == WON else {}
+    columns |= {} if key == ERROR else {ERROR: "error of the proxy reward", CORRELATION: "its correlation"}
+    beside = ["the paper"] if printed else list(columns.values())
     several = max(len(some) for some in runs.values()) > 1
     head = ["", f"{meaning(key)}: IQM [95%]", "mean ± sd", *(["mean [95%] over draws"] if several else []), *beside]
     step, rows = int(found.curves[found.rows[0].label].x[-1]), []
@@ -166,8 +168,8 @@ def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], 
             cells.append("-" if row.over_draws is None else str(row.over_draws))
         if printed:
             cells.append(printed.get(row.label, "-"))
-        elif key != ERROR:
-            cells += [mean_and_spread(runs[row.label], of_credit, step) for of_credit in (ERROR, CORRELATION)]
+        else:
+            cells += [mean_and_spread(runs[row.label], column, step) for column in columns]
         rows.append(cells)
     yield table(head, rows)
     fewest = min(row.seeds for row in found.rows)
