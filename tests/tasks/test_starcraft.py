@@ -9,7 +9,7 @@ import pytest
 from lare.errors import LareError
 from lare.tasks.env import HostEnv
 from lare.tasks.smax.env import SMAX
-from lare.tasks.starcraft import GameCrashed, StarCraft, find_game
+from lare.tasks.starcraft import StarCraft, find_game
 from tasks.fake_smac import FROM_SMAC, FakeSmac
 
 TO_SMAC = np.array([*(FROM_SMAC.index(one) for one in range(4)), 1, *range(6, 11)])
@@ -79,16 +79,36 @@ def test_time_that_runs_out_is_no_end_of_its_own():
     assert not seen.terminated
 
 
-def test_a_crash_is_told_apart_from_a_lost_battle_and_the_next_episode_is_whole():
+STOP = np.eye(11, dtype=np.float32)[[1] * 5]
+
+
+def test_an_episode_in_which_the_game_crashes_is_truncated_and_the_next_one_is_whole():
     env = StarCraft("2s3z", game=partial(FakeSmac, crash_at=2))
-    stop = np.eye(11, dtype=np.float32)[[1] * 5]
     env.reset(0)
-    env.step(stop)
-    with pytest.raises(GameCrashed, match="StarCraft II crashed in step 2 of an episode of 2s3z"):
-        env.step(stop)
+    before = env.step(STOP)
+    said = r"^StarCraft II crashed in step 2 of an episode of 2s3z: the episode ends there, and the game starts again$"
+    with pytest.warns(RuntimeWarning, match=said):
+        seen = env.step(STOP)
+    assert seen.truncated
+    assert not seen.terminated
+    assert (seen.reward == 0).all()
+    np.testing.assert_array_equal(seen.state, before.state)
     seen = env.reset(1)
+    assert FakeSmac.launched == (0, 0, 1)
     assert seen.alive.all()
     assert env.steps == 0
+
+
+def test_a_game_that_crashes_again_and_again_ends_the_run():
+    env = StarCraft("2s3z", game=partial(FakeSmac, crash_at=1))
+    for seed in range(2):
+        env.reset(seed)
+        with pytest.warns(RuntimeWarning):
+            env.step(STOP)
+    env.reset(2)
+    said = r"^StarCraft II crashed in step 1 of an episode of 2s3z; that makes 3 crashes in a row$"
+    with pytest.raises(LareError, match=said):
+        env.step(STOP)
 
 
 def test_what_is_not_available_is_refused_before_the_game_does():

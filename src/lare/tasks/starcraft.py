@@ -6,6 +6,7 @@ game and SMAC's maps come on their own.
 
 import importlib
 import os
+import warnings
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,12 +24,10 @@ PACKAGES = {"smacv2.env": "smacv2.env", "smac.env.starcraft2": "smac.env"}
 """Modules that only these packages have, and where each has its game."""
 DIFFICULTY = "7"
 """Of the game's own player: "very hard", on which results are reported."""
+CRASHES = 3
+"""In a row, without an episode between them that came to its end: then it is not chance."""
 NOTHING = 0
 """The choice of the dead, and of nobody else."""
-
-
-class GameCrashed(LareError):
-    """StarCraft II ended within an episode, which therefore counts for nothing. The next `reset` begins another one."""
 
 
 class StarCraft:
@@ -50,6 +49,7 @@ class StarCraft:
         self.steps = 0
         self.alive = np.zeros(0, bool)
         self.goes_on = False
+        self.crashes = 0
         info = self.launch(0).get_env_info()
         agents, choices = info["n_agents"], info["n_actions"]
         self.available = np.zeros((agents, choices), bool)
@@ -87,11 +87,10 @@ class StarCraft:
         return self.show(np.zeros(self.spec.agents, np.float32), over=False, won=False)
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        """One step.
+        """One step. An episode in which the game crashes is truncated there, and the next `reset` starts the game again.
 
         Raises:
-            GameCrashed: the game has ended, not the battle.
-            LareError: an agent chose what it may not.
+            LareError: an agent chose an action that is not available, or the game crashes again and again.
         """
         choice = np.argmax(action, axis=1)
         for agent, one in enumerate(choice):
@@ -100,18 +99,28 @@ class StarCraft:
         lived = self.alive
         reward, over, info = self.game.step([int(one) for one in choice])
         if over and not info:  # all that SMAC says of a crash
-            raise GameCrashed(f"StarCraft II crashed in step {self.steps + 1} of an episode of {self.name}")
+            return self.crashed()
         self.steps += 1
-        self.goes_on = self.goes_on or bool(over)
+        if over:
+            self.goes_on, self.crashes = True, 0
         paid = np.where(lived, np.float32(reward), np.float32(0))
         return self.show(paid, over=bool(over), won=bool(info.get("battle_won", False)))
+
+    def crashed(self) -> Timestep:
+        """The step in which the game crashed: it paid nothing, and the episode ends with what was shown before it."""
+        said = f"StarCraft II crashed in step {self.steps + 1} of an episode of {self.name}"
+        self.goes_on, self.crashes = False, self.crashes + 1
+        if self.crashes == CRASHES:
+            raise LareError(f"{said}; that makes {CRASHES} crashes in a row")
+        warnings.warn(f"{said}: the episode ends there, and the game starts again", RuntimeWarning, stacklevel=3)
+        return self.shown._replace(reward=np.zeros_like(self.shown.reward), truncated=np.array(True))
 
     def show(self, paid: Float[np.ndarray, " agents"], over: bool, won: bool) -> Timestep:
         """What is seen after a step that paid so much. To SMAC the end of the time is an end like the others."""
         self.available = np.array(self.game.get_avail_actions(), bool)
         self.alive = living(self.available)
         late = self.steps >= self.spec.max_steps
-        return Timestep(
+        self.shown = Timestep(
             observation=np.stack([np.asarray(one, np.float32) for one in self.game.get_obs()]),
             state=np.asarray(self.game.get_state(), np.float32),
             available=self.available,
@@ -121,6 +130,7 @@ class StarCraft:
             truncated=np.array(late),
             measures={"won": np.array(won, np.float32)},
         )
+        return self.shown
 
     def render(self) -> Any:
         """The battle as pixels (height, width, 3)."""
