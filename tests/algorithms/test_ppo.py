@@ -101,7 +101,7 @@ def test_a_choice_has_the_probabilities_of_its_softmax():
     both = jnp.stack([policy.log_probability(observation, jnp.tile(jnp.eye(2)[i], (5, 1))) for i in range(2)])
     np.testing.assert_allclose(np.exp(both).sum(axis=0), 1, rtol=1e-5)
     np.testing.assert_allclose(policy.entropy(observation), -(np.exp(both) * both).sum(axis=0), rtol=1e-4)
-    drawn = policy.drawn(jnp.tile(observation[:1], (4000, 1)), jax.random.gumbel(jax.random.key(1), (4000, 2)))
+    drawn = policy.sample(jnp.tile(observation[:1], (4000, 1)), jax.random.gumbel(jax.random.key(1), (4000, 2)))
     np.testing.assert_allclose(drawn.mean(axis=0), np.exp(both[:, 0]), atol=0.03)
 
 
@@ -222,7 +222,7 @@ def test_must_learn_to_follow(discrete):
         keys = jax.random.split(key, 3)
         observation = jax.random.uniform(keys[0], (1, 256, 3), minval=-1, maxval=1)
         draw = jax.random.gumbel if discrete else jax.random.normal
-        action = state.params.actor.drawn(observation, draw(keys[1], (1, 256, 2)))
+        action = state.params.actor.sample(observation, draw(keys[1], (1, 256, 2)))
         reward = reward_of(observation, action)
         ends = jnp.ones((1, 256))
         rollout = Rollout(observation, action, reward, observation, 1 - ends, ends)
@@ -322,7 +322,7 @@ def test_choices_that_there_are_not_have_no_probability():
     )
     noise = jax.random.gumbel(jax.random.key(2), (500, 4))
     for action in (
-        policy.drawn(observation, noise, jnp.asarray(available)),
+        policy.sample(observation, noise, jnp.asarray(available)),
         policy.mode(observation, jnp.asarray(available)),
     ):
         assert available[np.asarray(action, bool)].all()

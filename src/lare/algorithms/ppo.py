@@ -15,13 +15,13 @@ over the rollout, so rewards of any scale train alike.
 
 from typing import Annotated, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
 from pydantic import Field
 
+from lare.algorithms.policies import Available, StochasticPolicy
 from lare.errors import Checked
 from lare.networks import MLP, clipped, descend, orthogonal, start_adam
 from lare.normalise import RunningMeanStd, deviation, new_mean_std, observe, standardise_if_known
@@ -60,76 +60,8 @@ class PPOSettings(Checked):
     """Let the networks see observations by their running mean and deviation."""
 
 
-Available = Bool[Array, "*batch action"] | None
-"""Which choices there are; all of them, and all continuous actions, where None."""
-
-
-class Policy(eqx.Module):
-    """A Gaussian of constant deviation, or, without one, a choice among the entries of the action.
-
-    A choice is a row with a single 1, so that every action is a row of numbers. Observations are as the network is given them.
-    """
-
-    network: MLP
-    log_deviation: Float[Array, "*stack action"] | None
-
-    def logits(
-        self, observation: Float[Array, "*batch observation"], available: Available
-    ) -> Float[Array, "*batch action"]:
-        """Of each choice; so low where it is not available that its probability is 0."""
-        out = self.network(observation)
-        return out if available is None else jnp.where(available, out, UNAVAILABLE)
-
-    def log_probability(
-        self,
-        observation: Float[Array, "*batch observation"],
-        action: Float[Array, "*batch action"],
-        available: Available = None,
-    ) -> Float[Array, "*batch"]:
-        """Of the action: log pi(a | s)."""
-        if self.log_deviation is None:
-            return jnp.sum(action * jax.nn.log_softmax(self.logits(observation, available)), axis=-1)
-        scaled = (action - self.network(observation)) * jnp.exp(-self.log_deviation)
-        return jnp.sum(-0.5 * scaled**2 - self.log_deviation - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
-
-    def entropy(
-        self, observation: Float[Array, "*batch observation"], available: Available = None
-    ) -> Float[Array, "*batch"]:
-        """-E log pi(a | s)."""
-        if self.log_deviation is None:
-            log = jax.nn.log_softmax(self.logits(observation, available))
-            return -jnp.sum(jnp.exp(log) * log, axis=-1)
-        of_one = self.log_deviation + 0.5 * jnp.log(2 * jnp.pi * jnp.e)
-        return jnp.broadcast_to(jnp.sum(of_one, axis=-1), observation.shape[:-1])
-
-    def drawn(
-        self,
-        observation: Float[Array, "*batch observation"],
-        noise: Float[Array, "*batch action"],
-        available: Available = None,
-    ) -> Float[Array, "*batch action"]:
-        """The action that noise decides on: standard normal noise, or Gumbel's, whose largest sum is a choice."""
-        if self.log_deviation is None:
-            logits = self.logits(observation, available)
-            return jax.nn.one_hot(jnp.argmax(logits + noise, axis=-1), logits.shape[-1])
-        return self.network(observation) + jnp.exp(self.log_deviation) * noise
-
-    def mode(
-        self, observation: Float[Array, "*batch observation"], available: Available = None
-    ) -> Float[Array, "*batch action"]:
-        """The likeliest action."""
-        if self.log_deviation is None:
-            logits = self.logits(observation, available)
-            return jax.nn.one_hot(jnp.argmax(logits, axis=-1), logits.shape[-1])
-        return self.network(observation)
-
-
-UNAVAILABLE = -1e9
-"""The logit of a choice that there is not."""
-
-
 class Networks(NamedTuple):
-    actor: Policy
+    actor: StochasticPolicy
     critic: MLP
 
 
@@ -148,7 +80,7 @@ class PPO(NamedTuple):
 class Actor(NamedTuple):
     """What is needed to act."""
 
-    policy: Policy
+    policy: StochasticPolicy
     observations: RunningMeanStd | None
 
 
@@ -190,7 +122,7 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, discrete: b
     actor_key, critic_key, *keys = jax.random.split(key, 4)
     actor = MLP(observation_size, settings.hidden, action_size, key=actor_key, activation=jnp.tanh)
     critic = MLP(observation_size, settings.hidden, 1, key=critic_key, activation=jnp.tanh)
-    policy = Policy(orthogonal(actor, 0.01, key=keys[0]), None if discrete else jnp.zeros(action_size))
+    policy = StochasticPolicy(orthogonal(actor, 0.01, key=keys[0]), None if discrete else jnp.zeros(action_size))
     params = Networks(policy, orthogonal(critic, 1.0, key=keys[1]))
     observations = new_mean_std(observation_size) if settings.normalise_observations else None
     return PPO(params, start_adam(params, settings.learning_rate), new_mean_std(1), observations)
@@ -222,7 +154,7 @@ def explore(
     noise: Float[Array, "*batch action"],
 ) -> Float[Array, "*batch action"]:
     """An action of the policy, drawn by given noise."""
-    return actor.policy.drawn(shown(observation, actor.observations), noise, available)
+    return actor.policy.sample(shown(observation, actor.observations), noise, available)
 
 
 def values(state: PPO, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch"]:

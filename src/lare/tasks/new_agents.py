@@ -10,6 +10,7 @@ from typing import Any
 
 from lare.tasks import agents as rows_of
 from lare.tasks.agents import Agent, kind
+from lare.tasks.construct import construct, limit_of
 from lare.tasks.env import Team
 from lare.tasks.new import (
     Draft,
@@ -23,7 +24,7 @@ from lare.tasks.new import (
     warning,
     without_rewards,
 )
-from lare.tasks.pettingzoo import ParallelHost, construct, limit_of
+from lare.tasks.pettingzoo import ParallelHost
 from lare.tasks.spec import PETTINGZOO, TaskSpec
 
 MAKERS = ("parallel_env", "env", "raw_env")
