@@ -15,6 +15,7 @@ from lare.training.compiled import compiled, new_learners
 from recipes import (
     ALONE,
     LENGTHS,
+    QUICK,
     RIVALS,
     TOGETHER,
     TOTAL,
@@ -65,6 +66,14 @@ def test_what_terminated_is_told_from_what_ran_out_of_time():
     _, rollout = taken(config, steps)
     assert rollout.ended.sum() == 2
     np.testing.assert_array_equal(rollout.continues[:, 0], [1.0] * 19 + [0.0])
+
+
+def test_without_discounting_a_time_limit_is_an_end():
+    """What would follow it has no finite value. The step is cut off from what comes next as if it had terminated."""
+    undiscounted = QUICK["ppo"].model_copy(update={"gamma": 1.0})
+    _, rollout = taken(ppo("dense", hyperparameters=undiscounted), steps_of())
+    assert rollout.ended.sum() == 2
+    np.testing.assert_array_equal(rollout.continues, 1 - rollout.ended)
 
 
 def test_an_episode_that_goes_on_has_not_ended():

@@ -79,7 +79,9 @@ def rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> ppo.Rol
     def each(values: Array) -> Float[Array, "time envs agents"]:
         return jnp.broadcast_to(values[..., None], (*values.shape, agents)).astype(jnp.float32)
 
-    continues, ended = each(~jnp.asarray(steps.after.terminated)), each(jnp.asarray(steps.ended))
+    # Undiscounted, what would follow a time limit has no finite value: an episode is worth its return up to there.
+    over = steps.after.terminated if settings_of(config).gamma < 1 else steps.ended
+    continues, ended = each(~jnp.asarray(over)), each(jnp.asarray(steps.ended))
     if leave:
         stays = jnp.asarray(steps.after.alive)
         continues, ended = continues * stays, jnp.maximum(ended, ~stays)
