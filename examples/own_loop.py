@@ -54,7 +54,9 @@ def main(episodes: int = 40, updates: int = 50) -> float:
         z, paid, _ = play(environment, phi)
         stored.append((z, paid))
         credit = decomposition.observe_steps(credit, jnp.asarray(z))
-        credit = decomposition.observe_returns(credit, jnp.array([paid / len(z)]), jnp.array([True]))
+        credit = decomposition.observe_returns(
+            credit, jnp.array([paid / len(z)]), jnp.array([len(z)]), jnp.array([True])
+        )
         for key in jax.random.split(jax.random.key(number), updates):
             features, returns = zip(*(stored[one] for one in draw.integers(len(stored), size=BATCH)), strict=True)
             credit, _ = fit(credit, decomposition.whole_episodes(features, returns, BATCH * LONGEST), key)

@@ -18,6 +18,7 @@ from lare.tasks.env import EnvSpec, Team, Timestep, in_units
 from lare.training import learner as common
 from lare.training.compiled import module_of
 from lare.training.config import TrainConfig
+from lare.training.episodes import learn_returns
 
 LENGTHS = (5, 12, 3, 9, 12)
 """Of the episodes of one environment; of the next ones, the same in another order."""
@@ -115,9 +116,19 @@ def untrained(config, seed=0):
 
 
 def with_steps(learner, config, steps, factors=None):
-    """A learner that has met these steps too."""
+    """A learner that has met these steps too, and been told of the episodes that have finished."""
     factors = factors_for(config, steps) if factors is None else factors
-    return jax.jit(partial(common.store, config=config))(learner, jax.tree.map(jnp.asarray, steps), factors)
+    learner = jax.jit(partial(common.store, config=config))(learner, jax.tree.map(jnp.asarray, steps), factors)
+    return told(learner, config) if learner.credit else learner
+
+
+def told(learner, config):
+    """A learner whose decoders have been told of all episodes that have finished."""
+    given = jax.tree.map(lambda leaf: leaf[None], (learner.credit, learner.replay, learner.counted))
+    with jax.enable_x64(True):
+        learned = jax.jit(partial(learn_returns, config=config))(*given)
+    credit, counted = jax.tree.map(lambda leaf: leaf[0], learned)
+    return learner._replace(credit=credit, counted=counted)
 
 
 def stored(config, seed=0):

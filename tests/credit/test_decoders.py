@@ -105,7 +105,7 @@ def test_arels_loss_is_the_published_one_in_other_units(normalise, sum_form):
     state = decomposition.init(KEY, FEATURES, method, settings, STEPS, AGENTS)
     mean_reward = jnp.asarray([3.0, -1.0, 2.0, 0.5])
     state = decomposition.observe_steps(state, features())
-    state = decomposition.observe_returns(state, mean_reward, jnp.ones(EPISODES, bool))
+    state = decomposition.observe_returns(state, mean_reward, jnp.full(EPISODES, STEPS), jnp.ones(EPISODES, bool))
     y = by_episode(decomposition.proxy_rewards(state, features(), settings))[..., 0]
     published = ((STEPS * mean_reward - y.sum(axis=1)) ** 2).mean() + 20 * y.var(axis=1, ddof=1).mean()
     episode = jnp.repeat(jnp.arange(EPISODES), STEPS)
@@ -224,7 +224,7 @@ def test_must_learn_credit_among_agents_from_the_mean_return(method):
     returns = jnp.asarray(reward.mean(axis=(1, 2)))
     state = decomposition.init(KEY, 2, method, settings, STEPS, AGENTS)
     state = decomposition.observe_steps(state, jnp.asarray(rows))
-    state = decomposition.observe_returns(state, returns, jnp.ones(episodes, bool))
+    state = decomposition.observe_returns(state, returns, jnp.full(episodes, STEPS), jnp.ones(episodes, bool))
     drawn = STEPS if method.fit is Fit.ALL_STEPS else 3
 
     def one(state, key):

@@ -26,7 +26,9 @@ def train(fit, settings, scale=1.0, feature_scale=1.0, updates=600):
     features, reward = data(scale, feature_scale)
     state = decomposition.init(jax.random.key(0), FEATURES, METHODS["rd"], settings, LENGTH, 1)
     state = decomposition.observe_steps(state, jnp.asarray(features.reshape(-1, FEATURES)))
-    state = decomposition.observe_returns(state, jnp.asarray(reward.mean(axis=1)), jnp.ones(EPISODES, bool))
+    state = decomposition.observe_returns(
+        state, jnp.asarray(reward.mean(axis=1)), jnp.full(EPISODES, LENGTH), jnp.ones(EPISODES, bool)
+    )
     steps = LENGTH if fit is Fit.ALL_STEPS else 5
     rng = np.random.default_rng(1)
     update = jax.jit(lambda state, episodes: decomposition.update(state, episodes, KEY, fit, settings))
@@ -67,8 +69,8 @@ def test_many_agents_decoder_soon_reaches_the_size_of_rare_rewards():
     rows = jnp.asarray(np.stack([paid, noise], axis=-1).reshape(-1, agents, 2), jnp.float32)
     mean_reward = jnp.asarray(10 * paid.mean(axis=(1, 2)), jnp.float32)
     state = decomposition.init(KEY, 2, METHODS["lare-rd"], settings, steps, agents)
-    state = decomposition.observe_returns(decomposition.observe_steps(state, rows), mean_reward, mean_reward > -1)
     episode, length, ones = jnp.repeat(jnp.arange(episodes), steps), jnp.full(episodes, steps), jnp.ones(episodes)
+    state = decomposition.observe_returns(decomposition.observe_steps(state, rows), mean_reward, length, ones > 0)
     batch = Episodes(rows, episode, length, mean_reward, ones)
     update = jax.jit(lambda state: decomposition.update(state, batch, KEY, Fit.ALL_STEPS, settings)[0])
     for _ in range(100):
@@ -106,7 +108,7 @@ def test_a_gradient_in_parts_is_that_of_the_whole(method, sum_form):
     features = jax.random.normal(KEY, (count * rows, agents, FEATURES))
     target = jax.random.normal(KEY, (count,))
     state = decomposition.init(KEY, FEATURES, row, settings, LENGTH, agents)
-    state = decomposition.observe_returns(state, target, jnp.ones(count, bool))
+    state = decomposition.observe_returns(state, target, jnp.full(count, LENGTH), jnp.ones(count, bool))
 
     def episodes(parts):
         episode = jnp.tile(jnp.repeat(jnp.arange(count // parts), rows), parts)

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lare.credit import closed_form
+from lare.credit.basis import Basis
 from lare.credit.closed_form import LinearDecoder
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import TABLE, Fit, Reward
@@ -69,7 +71,7 @@ def test_raw_features_are_s_a_and_the_change():
     assert (taken != a).any()
     want = np.concatenate([s, taken, s - n], axis=-1)
     np.testing.assert_array_equal(common.features(drawn, config, 0), want)
-    assert (want.shape[-1],) == config.features == (8,)
+    assert want.shape[-1] == config.bases[0].inputs == 8
 
 
 def test_state_and_action_alone():
@@ -77,7 +79,18 @@ def test_state_and_action_alone():
     drawn = every_step(stored(config))
     want = np.concatenate([drawn.before["observation"], np.clip(drawn.before["action"], -1, 1)], axis=-1)
     np.testing.assert_array_equal(common.features(drawn, config, 0), want)
-    assert (want.shape[-1],) == config.features == (5,)
+    assert want.shape[-1] == config.bases[0].inputs == 5
+
+
+@pytest.mark.parametrize("method", ["rd-linear", "bayes", "lare-linear", "lare-bayes"])
+def test_closed_forms_see_the_factors_and_the_state_that_the_step_led_to(method):
+    config, steps = config_of(method), steps_of()
+    drawn = every_step(stored(config))
+    led_to = [drawn.after["observation"], np.clip(drawn.before["action"], -1, 1)] if method != "lare-linear" else []
+    want = np.concatenate([*([factors_for(config, steps)[:, 0]] if "lare" in method else []), *led_to], axis=-1)
+    np.testing.assert_array_equal(common.features(drawn, config, 0), want)
+    assert want.shape[-1] == config.bases[0].inputs
+    assert config.bases[0].extended == (method in ("bayes", "lare-bayes"))
 
 
 @pytest.mark.parametrize("drawn", [4, 10])
@@ -158,30 +171,24 @@ def test_an_episode_under_way_is_worth_half_as_much_as_the_best():
     assert float(got[0]) != 0.5
 
 
-def fit_by_hand(z, reward):
-    """v_k, the products of what is left of them without the mean, and the ridge's weights."""
-    v = np.array([np.append(a.mean(axis=0), b.mean()) for a, b in zip(z, reward, strict=True)])
-    centred, unit = v - v.mean(axis=0), v[:, :-1].std(axis=0)
-    x = centred[:, :-1] / unit
-    weight = np.linalg.solve(x.T @ x + np.eye(len(unit)), x.T @ centred[:, -1]) / unit
-    return v, centred.T @ centred, weight
-
-
 def check_closed_form(credit, z, reward):
-    v, products, weight = fit_by_hand(z, reward)
-    assert float(credit.totals.episodes) == len(v)
-    np.testing.assert_allclose(credit.totals.mean, v.mean(axis=0), rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(credit.totals.products, products, rtol=1e-3, atol=1e-5)
-    np.testing.assert_allclose(credit.decoder.weight, weight, rtol=1e-3, atol=1e-5)
+    """Sums over episodes, weighted by their steps, of standardised factors, of R/T and of R; in NumPy. NaN: nobody was there."""
+    decoder = credit.closed.decoder
+    standard = [np.nan_to_num((one - np.asarray(decoder.mean)) / np.asarray(decoder.deviation)) for one in z]
+    v = [[*one.mean(axis=0), paid.mean(), paid.sum()] for one, paid in zip(standard, reward, strict=True)]
+    length = np.array([len(one) for one in z])
+    centred = np.array(v) - np.average(v, axis=0, weights=length)
+    with jax.enable_x64(True):
+        sums = closed_form.whole(credit.closed.summed)
+    assert (float(sums.episodes), float(sums.steps)) == (len(z), length.sum())
+    np.testing.assert_allclose(sums.mean, np.average(v, axis=0, weights=length), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(sums.products, (length * centred.T) @ centred, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("pieces", [1, 3])
-def test_closed_forms_are_fitted_to_the_episodes_that_have_ended(pieces):
+def test_closed_forms_sum_over_the_episodes_that_have_ended():
     config = config_of("lare-linear")
-    steps, learner = steps_of(), untrained(config)
-    factors = factors_for(config, steps)
-    for rows in np.array_split(np.arange(TOTAL), pieces):
-        learner = with_steps(learner, config, jax.tree.map(lambda leaf, rows=rows: leaf[rows], steps), factors[rows])
+    factors, steps = factors_for(config, steps_of()), steps_of()
+    learner, _ = begun(config)
     check_closed_form(learner.credit[0], np.split(factors[:, 0, 0], ENDS), np.split(steps.after.reward[:, 0, 0], ENDS))
 
 
@@ -190,8 +197,7 @@ def test_forgetting_the_episode_under_way_leaves_the_fit(method):
     config = config_of(method)
     longer, learner = begun(config)
     back = common.forget_episodes(longer, jnp.array([True]))
-    assert longer.credit[0].totals.steps.tolist() == [2]
-    jax.tree.map(np.testing.assert_array_equal, back.credit[0].totals, learner.credit[0].totals)
+    jax.tree.map(np.testing.assert_array_equal, back.credit[0].closed, learner.credit[0].closed)
     assert back.replay.transitions.tolist() == learner.replay.transitions.tolist()
 
 
@@ -217,7 +223,9 @@ def test_accuracy_is_of_the_newest_steps():
 def says_its_factor(learner, signs):
     """With decoders that say the number that stands in their only factor, each with a sign of its own."""
     credit = tuple(
-        one._replace(decoder=LinearDecoder(jnp.array([sign]), jnp.zeros(())))
+        one._replace(
+            decoder=LinearDecoder(Basis(1, 0, False), *(jnp.array([x]) for x in (0.0, 1.0, sign)), jnp.zeros(()))
+        )
         for one, sign in zip(learner.credit, signs, strict=True)
     )
     return learner._replace(credit=credit)
@@ -238,8 +246,7 @@ def test_two_environments_are_one_twice_as_long(method):
 
     one = with_steps(untrained(wide), wide, steps, factors)
     other = with_steps(untrained(long), long, jax.tree.map(in_a_row, steps), in_a_row(factors))
-    same = [[of_one._replace(totals=None) for of_one in learner.credit] for learner in (one, other)]
-    close(same[0], same[1], 1e-3, 1e-4)
+    close(one.credit, other.credit, 1e-3, 1e-4)
     close(one.scale, other.scale)
     number = jnp.broadcast_to(jnp.arange(TOTAL), (2, TOTAL))
     env = jnp.broadcast_to(jnp.arange(2)[:, None], (2, TOTAL))
@@ -266,7 +273,7 @@ def test_what_decoders_see_of_many(method):
         "lare-rd": factors_for(config, steps)[:, 0],
     }[method]
     np.testing.assert_array_equal(common.features(drawn, config, 0), want)
-    assert config.features == (want.shape[-1],)
+    assert config.bases[0].inputs == want.shape[-1]
 
 
 def test_each_team_has_a_decoder_and_a_return_of_its_own():
@@ -361,7 +368,7 @@ def test_a_closed_form_takes_the_mean_over_steps_and_over_agents_who_are_there()
         for of_step, alive in zip(
             factors[:, 0, team.agents, :size], steps.before.alive[:, 0, team.agents], strict=True
         ):
-            rows.append(of_step[alive].mean(axis=0) if alive.any() else np.zeros(size))
+            rows.append(of_step[alive].mean(axis=0) if alive.any() else np.full(size, np.nan))
         check_closed_form(credit, np.split(np.array(rows), ENDS), np.split(earnings(steps, team), ENDS))
 
 
@@ -473,6 +480,8 @@ def test_credit_of_the_state_is_one_row_a_step_and_pays_all_who_are_there_alike(
     drawn = every_step(learner)
     rows = common.features(drawn, config, 0) if config.method.fit else drawn.before["factors"]
     want = factors_for(config, steps)[:, 0] if config.method.latent else drawn.after["state"][:, None]
+    if method == "rd-linear":
+        want = np.concatenate([want, np.clip(drawn.before["action"], -1, 1).reshape(TOTAL, 1, -1)], axis=-1)
     np.testing.assert_array_equal(rows, want)
     assert rows.shape[:2] == (TOTAL, 1)
     got = np.asarray(common.rewards(drawn, paid_by(learner), config))

@@ -80,7 +80,7 @@ def test_seeds_in_lockstep_are_seeds_alone():
         jax.tree.map(lambda leaf: np.stack([leaf] * 3), part) for part in (steps, factors_for(config, steps))
     )
     alone = jax.tree.map(lambda leaf: leaf[1], start)
-    together, _ = functions.improve(functions.store(start, many, factors), many, keys, 0)
+    together, _ = functions.improve(functions.learn_returns(functions.store(start, many, factors)), many, keys, 0)
     alone = with_steps(alone, config, steps)
     alone, _ = jax.jit(partial(off_policy.improve_one, config=config))(alone, steps, keys[1], jnp.array(0))
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):

@@ -1,24 +1,19 @@
-"""Decoders that are linear in the factors, fitted to returns in closed form from running statistics of whole episodes.
+"""A decoder that is fitted in closed form to all episodes so far, and takes each new one as it comes.
 
-    r_hat = w . z + b
+    r_hat = b + w . f(u),    u = (x - mean) / deviation
 
-With z_k the mean of the factors over the steps of episode k, and R_k/T its mean reward:
+f are the features of `basis.py`, w and b come from running sums over episodes (`evidence.py`), and nothing descends a gradient.
+LaRe without the reward model has signs for w instead:
 
-    ridge    w = argmin sum_k (R_k/T - w . z_k - b)^2 + lambda |S w|^2    (LaRe, appendix B, the estimator of Proposition 1)
-    signs    w = argmin sum_k (R_k/T - w . z_k)^2  over  w in {-1, 1}^d,  b = 0    (LaRe without the reward model)
+    w = argmin sum_k T_k (R_k/T_k - w . m_k)^2  over  w in {-1, 1}^d,    b = 0,    f(u) = x
 
-S holds the deviations of the z_k, so that the scale of a factor changes nothing. Nothing here descends a gradient: what has
-been learned after k episodes is exact, and costs the same for each new episode.
+By which mean and deviation u is standardised decides what the features are. Both move while steps come in, and sums of features
+that were standardised by old ones would be stale. So they stay as they are for a while, and each time that the steps have
+grown by a quarter, all stored episodes are summed again with new ones: a step is summed five times or less, however many
+there are.
 
-The estimator comes with a confidence radius, after Proposition 1. With x_k = (1, S^-1 (z_k - their mean)) in d + 1 entries and
-A = sum_k x_k x_k^T + lambda diag(0, 1, ..., 1),
-
-    l_k = sigma sqrt((d + 1) log((1 + k L^2 / lambda) / (delta / 10))) + B sqrt(lambda d),    |r - r_hat| <= l_k |x|_{A^-1}
-
-(L the largest |x_k|; sum_k |x_k|^2, which is no more, stands for k L^2; B the largest |R/T|). The proposition knows that the
-reward of a step lies between 0 and 1, so that the noise of R/T deviates by 1/(2 sqrt(T)) at most; nobody knows that here, and
-sigma is the deviation of the residuals. So the band is the proposition's by analogy: to be expected where rewards are linear in
-the factors, w x + b with |w| <= B sqrt(d), and no theorem. Nearly equal factors whose large weights cancel break it.
+The sums need float64: features that nearly repeat each other leave nothing of float32. Where they are kept, each number is the
+sum of two of float32; functions that take or return `Sums` are to be called within `jax.enable_x64(True)`.
 """
 
 import itertools
@@ -28,139 +23,133 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int
 
+from lare.credit import evidence
+from lare.credit.basis import Basis, expand
 from lare.credit.decoders import Decoded
+from lare.credit.evidence import Posterior, Sums
+from lare.normalise import RunningMeanStd, deviation
 
 LARGEST_CHOICE = 16
 """Factors whose signs are searched through, all 2^d of them."""
+GROWTH_OF_SUMS = 1.25
+"""Of the steps, until all episodes are summed again."""
+GROWTH_OF_FIT = 1.05
+"""Of the episodes, until the decoder is fitted again."""
+ROUNDS = 20
+"""Of the evidence's fixed point, in each fit. It begins where the last one ended."""
 
 
 class LinearDecoder(eqx.Module):
-    """r_hat = w . z + b, on the factors as they are."""
+    """r_hat = b + w . f(u)."""
 
-    weight: Float[Array, " features"]
-    bias: Float[Array, ""]
+    basis: Basis = eqx.field(static=True)
+    mean: Float[Array, " inputs"]
+    deviation: Float[Array, " inputs"]
+    """0 for an input that never varied: it says nothing."""
+    weight: Float[Array, "*forms features"]
+    bias: Float[Array, "*forms"]
 
-    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
-        return Decoded(features @ self.weight + self.bias, jnp.zeros(features.shape[:-1]))
+    def __call__(self, rows: Float[Array, "rows *agents inputs"], key: object = None) -> Decoded:
+        r_hat = self.features(rows) @ self.weight + self.bias
+        return Decoded(r_hat, jnp.zeros_like(r_hat))
 
-
-class Totals(NamedTuple):
-    """Running statistics of v_k = (z_k, R_k/T) over episodes, and of those that are under way."""
-
-    episodes: Float[Array, ""]
-    mean: Float[Array, " features_and_reward"]
-    products: Float[Array, "features_and_reward features_and_reward"]
-    """sum_k (v_k - mean)(v_k - mean)^T"""
-    farthest: Float[Array, ""]
-    """The largest |R/T|."""
-    running: Float[Array, "envs features"]
-    """Mean of the factors since the episode began: of a constant it is that constant, however long the episode is."""
-    steps: Float[Array, " envs"]
-    """Steps since then."""
+    def features(self, rows: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
+        """f(u)."""
+        known = self.deviation > 0
+        return expand(self.basis, jnp.where(known, (rows - self.mean) / jnp.where(known, self.deviation, 1), 0))
 
 
-def new_totals(features: int, envs: int = 1) -> Totals:
-    """The totals of no episodes."""
-    zero, size = jnp.zeros(()), features + 1
-    running = jnp.zeros((envs, features)), jnp.zeros(envs)
-    return Totals(zero, jnp.zeros(size), jnp.zeros((size, size)), jnp.copy(zero), *running)
+class ClosedForm(NamedTuple):
+    """What a fit in closed form goes by."""
+
+    decoder: LinearDecoder
+    """With a leading axis: one for each form that the score may have."""
+    summed: Sums
+    """Each number as the sum of two."""
+    steps: Float[Array, ""]
+    """Steps that mean and deviation are of."""
+    fitted: Float[Array, ""]
+    """Episodes that the decoder is fitted to."""
+    posterior: Posterior
+    """Of each form."""
 
 
-def add_steps(
-    totals: Totals,
-    features: Float[Array, "time envs features"],
-    mean_reward: Float[Array, "time envs"],
-    ended: Bool[Array, "time envs"],
-) -> Totals:
-    """Add steps that follow each other in each environment; `mean_reward` is R/T where an episode has `ended`.
+def init(basis: Basis, forms: int) -> ClosedForm:
+    """Of no episodes."""
+    zeros, ones = jnp.zeros(basis.inputs), jnp.ones(basis.inputs)
+    decoder = LinearDecoder(basis, zeros, ones, jnp.zeros((forms, basis.size)), jnp.zeros(forms))
+    posterior = evidence.unknown(basis.size, len(basis.sizes))
+    posterior = jax.tree.map(lambda leaf: jnp.tile(leaf, (forms, *[1] * leaf.ndim)), posterior)
+    zero = jnp.zeros(())
+    return ClosedForm(decoder, kept(evidence.no_sums(basis.size)), zero, jnp.copy(zero), posterior)
 
-    The products grow by Welford's update (1962): no catastrophic cancellation.
+
+def kept(sums: Sums) -> Sums:
+    """Each number as two of float32, behind each other, whose sum it is."""
+
+    def two(number: Array) -> Float[Array, "2 *shape"]:
+        first = number.astype(jnp.float32)
+        return jnp.stack([first, (number - first).astype(jnp.float32)])
+
+    return jax.tree.map(two, sums)
+
+
+def whole(sums: Sums) -> Sums:
+    """The opposite of `kept`: in float64, where that is enabled."""
+    return jax.tree.map(lambda number: jnp.sum(number.astype(float), axis=0), sums)
+
+
+def is_stale(state: ClosedForm, statistics: RunningMeanStd) -> Bool[Array, ""]:
+    """Whether all episodes are to be summed again."""
+    return statistics.rows >= GROWTH_OF_SUMS * state.steps
+
+
+def begin_again(state: ClosedForm, statistics: RunningMeanStd) -> ClosedForm:
+    """Without a sum, and with the mean and deviation of all steps so far.
+
+    Precisions stay, as a place to begin. The weights do not fit the features any more, until the next fit.
     """
-
-    def one(totals: Totals, step: tuple[Float[Array, "envs features"], Float[Array, " envs"], Bool[Array, " envs"]]):
-        rows, reward, last = step
-        steps = totals.steps + 1
-        running = totals.running + (rows - totals.running) / steps[:, None]
-
-        def with_episode(place: Array, totals: Totals) -> Totals:
-            longer = add_episode(totals, jnp.append(running[place], reward[place]))
-            return jax.tree.map(lambda new, old: jnp.where(last[place], new, old), longer, totals)
-
-        totals = jax.lax.fori_loop(0, len(last), with_episode, totals)
-        return totals._replace(running=jnp.where(last[:, None], 0, running), steps=jnp.where(last, 0, steps)), None
-
-    return jax.lax.scan(one, totals, (features, mean_reward, ended))[0]
+    known = statistics.mean, deviation(statistics)
+    decoder = eqx.tree_at(lambda d: (d.mean, d.deviation), state.decoder, known)
+    nothing = jax.tree.map(jnp.zeros_like, state.summed)
+    return state._replace(decoder=decoder, summed=nothing, steps=statistics.rows, fitted=jnp.zeros_like(state.fitted))
 
 
-def add_episode(totals: Totals, v: Float[Array, " features_and_reward"]) -> Totals:
-    """With one more episode."""
-    count, gap = totals.episodes + 1, v - totals.mean
-    mean = totals.mean + gap / count
-    products = totals.products + jnp.outer(gap, v - mean)
-    return totals._replace(
-        episodes=count, mean=mean, products=products, farthest=jnp.maximum(totals.farthest, jnp.abs(v[-1]))
-    )
+def is_due(state: ClosedForm) -> Bool[Array, ""]:
+    """Whether there are enough new episodes for another fit."""
+    return jnp.sum(state.summed.episodes) >= jnp.maximum(GROWTH_OF_FIT * state.fitted, 1)
 
 
-def forget_running(totals: Totals, dropped: Bool[Array, " envs"]) -> Totals:
-    """Without the episodes that are under way in some of the environments."""
-    return totals._replace(
-        running=jnp.where(dropped[:, None], 0, totals.running), steps=jnp.where(dropped, 0, totals.steps)
-    )
+def fit(state: ClosedForm, forms: tuple[int, ...], rounds: int = ROUNDS) -> ClosedForm:
+    """With the decoder that follows from the sums, for each of some forms: 0 a sum over steps, 1 an average."""
+    basis, sums = state.decoder.basis, whole(state.summed)
+    found = []
+    for place, form in enumerate(forms):
+        start = jax.tree.map(lambda leaf, place=place: leaf[place].astype(float), state.posterior)
+        found.append(evidence.fit(sums, form, basis.group, start, rounds))
+    posterior = jax.tree.map(lambda *leaves: jnp.stack(leaves).astype(jnp.float32), *found)
+    return with_weights(state, posterior.weight, posterior.bias)._replace(posterior=posterior)
 
 
-def deviations(totals: Totals) -> Float[Array, " features"]:
-    """S: the deviations of the episodes' mean factors; 1 for one that never varied."""
-    of_each = jnp.sqrt(jnp.diagonal(totals.products)[:-1] / jnp.maximum(totals.episodes, 1))
-    return jnp.where(of_each > 1e-6 * jnp.abs(totals.mean[:-1]), of_each, 1)
-
-
-def design_matrix(totals: Totals, ridge: float) -> Float[Array, "features features"]:
-    """A."""
-    unit = deviations(totals)
-    return totals.products[:-1, :-1] / jnp.outer(unit, unit) + ridge * jnp.eye(len(unit))
-
-
-def ridge_regression(totals: Totals, ridge: float) -> LinearDecoder:
-    """The regularised least-squares estimate of the rewards."""
-    unit, mean = deviations(totals), totals.mean
-    weight = jnp.linalg.solve(design_matrix(totals, ridge), totals.products[:-1, -1] / unit) / unit
-    return LinearDecoder(weight, mean[-1] - weight @ mean[:-1])
-
-
-def best_signs(totals: Totals) -> LinearDecoder:
-    """The signs for which the sum of the factors comes nearest to the returns; the first of them where some are equal."""
-    count, mean = totals.episodes, totals.mean
-    signs = jnp.asarray(np.array(list(itertools.product((1.0, -1.0), repeat=len(mean) - 1)), np.float32))
-    # Of v = (z, R/T) times (w, -1): the sum of the squares is that about the mean and k times that of the mean.
+def fit_signs(state: ClosedForm) -> ClosedForm:
+    """With the signs for which the sum of the factors comes nearest to the returns; the first of them where some are equal."""
+    sums, size = whole(state.summed), state.decoder.basis.size
+    signs = jnp.asarray(np.array(list(itertools.product((1.0, -1.0), repeat=size))))
+    # Of v = (m, R/T) times (w, -1): the sum of the squares is that about the mean, and that of the mean for each step.
     v = jnp.concatenate([signs, -jnp.ones((len(signs), 1))], axis=1)
-    error = jnp.sum((v @ totals.products) * v, axis=1) + count * (v @ mean) ** 2
-    return LinearDecoder(signs[jnp.argmin(error)], jnp.zeros(()))
+    error = jnp.sum((v @ sums.products[:-1, :-1]) * v, axis=1) + sums.steps * (v @ sums.mean[:-1]) ** 2
+    return with_weights(state, signs[jnp.argmin(error)][None], jnp.zeros(1))
 
 
-def uncertainty(
-    totals: Totals, features: Float[Array, "rows features"], ridge: float, delta: float
-) -> Float[Array, " rows"]:
-    """l_k |x|_{A^-1}: how far r_hat may be from the true reward of each row, in the rewards' units."""
-    x = (features - totals.mean[:-1]) / deviations(totals)
-    inverse = jnp.linalg.inv(design_matrix(totals, ridge))
-    length = 1 / jnp.maximum(totals.episodes, 1) + jnp.sum((x @ inverse) * x, axis=1)
-    return radius(totals, ridge, delta) * jnp.sqrt(length)
+def with_weights(state: ClosedForm, weight: Float[Array, "forms features"], bias: Float[Array, " forms"]) -> ClosedForm:
+    """With a decoder that is fitted to all episodes that are summed."""
+    found = weight.astype(jnp.float32), bias.astype(jnp.float32)
+    decoder = eqx.tree_at(lambda d: (d.weight, d.bias), state.decoder, found)
+    return state._replace(decoder=decoder, fitted=jnp.sum(state.summed.episodes))
 
 
-def radius(totals: Totals, ridge: float, delta: float) -> Float[Array, ""]:
-    """l_k, in the rewards' units."""
-    size = len(totals.mean) - 1
-    squares = totals.episodes + jnp.trace(design_matrix(totals, 0.0))
-    grown = jnp.log((1 + squares / ridge) / (delta / 10))
-    return noise(totals, ridge) * jnp.sqrt((size + 1) * grown) + totals.farthest * jnp.sqrt(ridge * size)
-
-
-def noise(totals: Totals, ridge: float) -> Float[Array, ""]:
-    """The deviation of the residuals R_k/T - r_hat(z_k); the largest |R/T| as long as there are no more episodes than weights."""
-    v = jnp.append(ridge_regression(totals, ridge).weight, -1.0)
-    free = totals.episodes - len(v)
-    left = jnp.maximum(v @ totals.products @ v, 0)
-    return jnp.where(free > 0, jnp.sqrt(left / jnp.maximum(free, 1)), totals.farthest)
+def of_form(decoder: LinearDecoder, form: Int[Array, ""] | int) -> LinearDecoder:
+    """The decoder of one form."""
+    return eqx.tree_at(lambda d: (d.weight, d.bias), decoder, (decoder.weight[form], decoder.bias[form]))

@@ -17,7 +17,7 @@ but the scale of r_hat. `normalise = false` is the published form: raw features,
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,20 +26,14 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from pydantic import Field
 
-from lare.credit import losses
+from lare.credit import closed_form, evidence, losses
 from lare.credit.arel import AREL
-from lare.credit.closed_form import (
-    LinearDecoder,
-    Totals,
-    add_steps,
-    best_signs,
-    forget_running,
-    new_totals,
-    ridge_regression,
-)
+from lare.credit.basis import Basis
+from lare.credit.closed_form import ClosedForm, LinearDecoder
 from lare.credit.decoders import Bottleneck, Decoded, StepDecoder
 from lare.credit.diaster import Diaster
 from lare.credit.methods import Decoder, Fit, Method
+from lare.credit.prediction import Predictions, no_predictions, remember, squared_errors
 from lare.credit.stas import STAS
 from lare.errors import Checked, LareError
 from lare.networks import descend, start_adam
@@ -56,6 +50,9 @@ from lare.normalise import (
 
 Network = StepDecoder | Bottleneck | AREL | STAS | Diaster | LinearDecoder
 """A decoder of any kind."""
+
+SUM, AVERAGE = 0, 1
+"""Forms that a score may have: the sum of something over the steps, or its average."""
 
 
 class CreditSettings(Checked):
@@ -78,8 +75,9 @@ class CreditSettings(Checked):
     episodes are equally long: of so many whole episodes, whatever is drawn from them."""
     episodes: Annotated[int, Field(ge=1)] = 8
     """diaster (single agents): whole episodes in one update of its decoder."""
-    ridge: Annotated[float, Field(gt=0)] = 1.0
-    """Strength of the ridge penalty (lambda), in episodes."""
+    score: Literal["auto", "sum", "average"] = "auto"
+    """Whether the score of an episode is a sum over its steps, or an average or a mark, which does not grow with them. `auto`: as
+    the task says or, where it says nothing, the form that has predicted returns better so far."""
     encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of VIB's encoder."""
     bottleneck: Annotated[int, Field(ge=1)] = 8
@@ -116,8 +114,17 @@ class Decomposition(NamedTuple):
     statistics: RunningMeanStd
     """Of the features."""
     scale: Scale
-    totals: Totals | None
-    """For a decoder that is fitted in closed form."""
+    """Of R/T."""
+    return_scale: Scale
+    """Of R."""
+    average: Bool[Array, ""]
+    """Whether the score is taken for an average over the steps: r_hat is what the decoder says, divided by T."""
+    predictions: Predictions
+    """By the decoder in force."""
+    closed: ClosedForm | None
+    """For a decoder that is fitted in closed form; and for one that is not where the form of the score is to be found out."""
+    rivals: Predictions | None
+    """By both forms in closed form, where the form of the score is to be found out."""
 
 
 def whole_episodes(
@@ -148,21 +155,36 @@ def whole_episodes(
     )
 
 
+def forms_of(settings: CreditSettings, fixed_length: bool) -> tuple[int, ...]:
+    """The forms that are fitted: both where it is not known which the score has, and it makes a difference."""
+    if settings.score == "auto":
+        return (SUM,) if fixed_length else (SUM, AVERAGE)
+    return (SUM,) if settings.score == "sum" else (AVERAGE,)
+
+
 def init(
-    key: PRNGKeyArray, features: int, method: Method, settings: CreditSettings, steps: int, agents: int, envs: int = 1
+    key: PRNGKeyArray,
+    features: Basis | int,
+    method: Method,
+    settings: CreditSettings,
+    steps: int,
+    agents: int,
+    forms: tuple[int, ...] = (SUM,),
 ) -> Decomposition:
     """An untrained decoder of the method's kind.
 
     Args:
         key: what its weights are drawn by.
-        features: size of what it sees of a step.
+        features: what it sees of a step and, in closed form, makes of that; or how many numbers it sees, and is to take as they are.
         method: a row of the table.
         settings: of the decoder and its fit; the same ones go to every other function of this file.
         steps: of the longest episode.
         agents: 1, or how many a step has.
-        envs: how many environments' episodes are under way at a time.
+        forms: that the score may have; the same ones go to every other function of this file that asks for them.
     """
     gain = 1.0 if agents == 1 else math.sqrt(steps * agents)
+    basis = Basis(0, features, extended=False) if isinstance(features, int) else features
+    features, optimizer = basis.inputs, ()
     match method.decoder:
         case Decoder.STEP:
             decoder = StepDecoder(features, settings.hidden, gain, key=key)
@@ -175,11 +197,22 @@ def init(
             decoder = STAS(features, steps, agents, gain, key=key)
         case Decoder.DIASTER:
             decoder = Diaster(features, settings.hidden, key=key)
-        case Decoder.LINEAR:
-            decoder = LinearDecoder(jnp.zeros(features), jnp.zeros(()))
-            return Decomposition(decoder, (), new_mean_std(features), new_scale(), new_totals(features, envs))
-    optimizer = start_adam(decoder, settings.learning_rate)
-    return Decomposition(decoder, optimizer, new_mean_std(features), new_scale(), None)
+        case Decoder.LINEAR | Decoder.ADDITIVE:
+            decoder = closed_form.of_form(closed_form.init(basis, 1).decoder, 0)
+    if method.descends:
+        optimizer = start_adam(decoder, settings.learning_rate)
+    both = len(forms) > 1
+    return Decomposition(
+        decoder,
+        optimizer,
+        new_mean_std(features),
+        new_scale(),
+        new_scale(),
+        jnp.asarray(forms == (AVERAGE,)),
+        no_predictions(1),
+        closed_form.init(basis, len(forms)) if both or not method.descends else None,
+        no_predictions(len(forms)) if both else None,
+    )
 
 
 def observe_steps(
@@ -194,38 +227,118 @@ def observe_steps(
 
 
 def observe_returns(
-    state: Decomposition, mean_reward: Float[Array, " batch"], finished: Bool[Array, " batch"]
-) -> Decomposition:
-    """Add R/T of newly finished episodes to `scale`: every episode once. Places where `finished` is false are passed over."""
-    return state._replace(scale=observe_scale(state.scale, mean_reward, finished))
-
-
-def fit_in_closed_form(
     state: Decomposition,
-    features: Float[Array, "time envs features"],
-    mean_reward: Float[Array, "time envs"],
-    ended: Bool[Array, "time envs"],
-    fit: Fit,
-    settings: CreditSettings,
+    mean_reward: Float[Array, " batch"],
+    length: Int[Array, " batch"],
+    finished: Bool[Array, " batch"],
 ) -> Decomposition:
-    """Add steps that follow each other in some environments, and fit the decoder to all episodes that have ended.
+    """Add newly finished episodes to the scales: every episode once, by R/T and T.
 
-    Of several agents the features are their mean: what is linear in them has the mean of the agents' proxy rewards.
+    Places where `finished` is false are passed over.
     """
-    assert state.totals is not None
-    totals = add_steps(state.totals, features, mean_reward, ended)
-    decoder = best_signs(totals) if fit is Fit.SIGNS else ridge_regression(totals, settings.ridge)
-    return state._replace(decoder=decoder, totals=totals)
+    scale = observe_scale(state.scale, mean_reward, finished)
+    return state._replace(scale=scale, return_scale=observe_scale(state.return_scale, mean_reward * length, finished))
 
 
-def forget_episodes(state: Decomposition, dropped: Bool[Array, " envs"]) -> Decomposition:
-    """Without the episodes that are under way in some of the environments."""
-    return state if state.totals is None else state._replace(totals=forget_running(state.totals, dropped))
+def is_fitted(state: Decomposition) -> Bool[Array, ""]:
+    """Whether the decoder has learned anything yet."""
+    if isinstance(state.decoder, LinearDecoder):
+        assert state.closed is not None
+        return state.closed.fitted > 1  # of one episode it knows the mean reward, and no more
+    return optax.tree_utils.tree_get(state.optimizer, "count") > 0
+
+
+def predict(
+    state: Decomposition, episodes: Episodes, new: Bool[Array, " episodes"], settings: CreditSettings
+) -> Decomposition:
+    """Remember what the decoder says of episodes before it is fitted to them, and what they returned.
+
+    Those where `new` is false are passed over, and all as long as nothing has been fitted. At most `prediction.LAST` episodes.
+    """
+    new = new & is_fitted(state)
+    returns, count = episodes.mean_reward * episodes.length, len(episodes.length)
+    long = episodes.length[jnp.clip(episodes.episode, 0, count - 1)]
+    r_hat = over_agents(proxy_rewards(state, episodes.features, settings, long), episodes.share)
+    total = jax.ops.segment_sum(r_hat, episodes.episode, count)
+    state = state._replace(predictions=remember(state.predictions, returns, total[:, None], new))
+    if state.rivals is None or state.closed is None:
+        return state
+    features = mean_features(state.closed.decoder, episodes)
+    of_each = features @ state.closed.decoder.weight.T + state.closed.decoder.bias
+    of_each = of_each * jnp.stack([episodes.length, jnp.ones_like(episodes.length)], axis=1)
+    return state._replace(rivals=remember(state.rivals, returns, of_each, new))
+
+
+def mean_features(decoder: LinearDecoder, episodes: Episodes) -> Float[Array, "episodes features"]:
+    """The mean of a linear decoder's features over the steps of each episode, and over the agents that are there."""
+    features = decoder.features(episodes.features)
+    if features.ndim == 3:
+        share = jnp.full(features.shape[:2], 1 / features.shape[1]) if episodes.share is None else episodes.share
+        features = jnp.einsum("raf,ra->rf", features, share)
+    total = jax.ops.segment_sum(features.astype(float), episodes.episode, len(episodes.length))
+    return total / jnp.maximum(episodes.length, 1)[:, None]
+
+
+def is_stale(state: Decomposition) -> Bool[Array, ""]:
+    """Whether the sums over episodes are of features that were standardised long ago."""
+    assert state.closed is not None
+    return closed_form.is_stale(state.closed, state.statistics)
+
+
+def begin_again(state: Decomposition) -> Decomposition:
+    """Without sums over episodes, and with features that are standardised anew: all stored episodes are to be added."""
+    assert state.closed is not None
+    return state._replace(closed=closed_form.begin_again(state.closed, state.statistics))
+
+
+def add_episodes(state: Decomposition, episodes: Episodes, new: Bool[Array, " episodes"]) -> Decomposition:
+    """Add whole episodes to the sums. Those where `new` is false are passed over. In float64, where that is enabled."""
+    assert state.closed is not None
+    means = mean_features(state.closed.decoder, episodes)
+    length = jnp.where(new, episodes.length, 0)
+    sums = evidence.add_episodes(
+        closed_form.whole(state.closed.summed), means, episodes.mean_reward * episodes.length, length
+    )
+    return state._replace(closed=state.closed._replace(summed=closed_form.kept(sums)))
+
+
+def fit_in_closed_form(state: Decomposition, method: Method, forms: tuple[int, ...]) -> Decomposition:
+    """Fit what is fitted in closed form to all episodes that have been added, and settle the form of the score."""
+    assert state.closed is not None
+    signs = method.fit is Fit.SIGNS
+    closed = closed_form.fit_signs(state.closed) if signs else closed_form.fit(state.closed, forms)
+    average = state.average
+    if state.rivals is not None:
+        of_sum, of_average = squared_errors(state.rivals)
+        average = of_average < of_sum
+    decoder = state.decoder
+    if not method.descends:
+        decoder = closed_form.of_form(closed.decoder, average.astype(int) if len(forms) > 1 else 0)
+    return state._replace(closed=closed, decoder=decoder, average=average)
+
+
+def deviation(
+    state: Decomposition, rows: Float[Array, "rows features"], forms: tuple[int, ...]
+) -> Float[Array, " rows"]:
+    """The posterior deviation of r_hat (of T r_hat, where the score is an average). Of `Fit.EVIDENCE`, in float64."""
+    assert state.closed is not None
+    assert isinstance(state.decoder, LinearDecoder)
+    place = int(state.average) if len(forms) > 1 else 0
+    known = jax.tree.map(lambda leaf: leaf[place].astype(float), state.closed.posterior)
+    sums, features = closed_form.whole(state.closed.summed), state.decoder.features(rows)
+    return evidence.deviation(sums, forms[place], state.decoder.basis.group, known, features)
 
 
 def normalised(state: Decomposition, settings: CreditSettings) -> bool:
     """Whether the decoder works in units of its own. One that was fitted in closed form has no need to."""
-    return settings.normalise and state.totals is None
+    return settings.normalise and not isinstance(state.decoder, LinearDecoder)
+
+
+def unit(state: Decomposition, settings: CreditSettings) -> Float[Array, ""]:
+    """What the decoder's output is in units of: the size of R/T, or of R for an average."""
+    if not normalised(state, settings):
+        return jnp.ones(())
+    return jnp.where(state.average, magnitude(state.return_scale), magnitude(state.scale))
 
 
 def inputs(
@@ -247,11 +360,24 @@ def decode(
 
 
 def proxy_rewards(
-    state: Decomposition, features: Float[Array, "rows *agents features"], settings: CreditSettings
+    state: Decomposition,
+    features: Float[Array, "rows *agents features"],
+    settings: CreditSettings,
+    length: Float[Array, " rows"] | Int[Array, " rows"] | None = None,
 ) -> Float[Array, "rows *agents"]:
-    """r_hat of some steps, in the unit of the true rewards, by the decoder as it stands (also before its first update)."""
-    r_hat = decode(state.decoder, state, features, settings).r_hat
-    return magnitude(state.scale) * r_hat if normalised(state, settings) else r_hat
+    """r_hat of some steps, in the unit of the true rewards, by the decoder as it stands (also before its first update).
+
+    Args:
+        state: with the decoder.
+        features: what it sees of the steps.
+        settings: as everywhere.
+        length: T, the steps of each row's episode. Without it, the score is taken for a sum.
+    """
+    r_hat = unit(state, settings) * decode(state.decoder, state, features, settings).r_hat
+    if length is None:
+        return r_hat
+    parts = jnp.where(state.average, length, 1).astype(jnp.float32)
+    return r_hat / parts.reshape(-1, *[1] * (r_hat.ndim - 1))
 
 
 def loss_and_gradient(
@@ -265,8 +391,8 @@ def loss_and_gradient(
 def targets(
     state: Decomposition, episodes: Episodes, settings: CreditSettings
 ) -> tuple[Float[Array, " episodes"], Float[Array, " episodes"]]:
-    """R/T in units of the scale, and the weight of each episode."""
-    target = episodes.mean_reward / magnitude(state.scale) if normalised(state, settings) else episodes.mean_reward
+    """R/T, or R where it is an average, in units of their size; and the weight of each episode."""
+    target = episodes.mean_reward * jnp.where(state.average, episodes.length, 1) / unit(state, settings)
     return target, losses.episode_weight(episodes.length, episodes.mask, settings.sum_form)
 
 

@@ -19,8 +19,12 @@ class Encoder(StrEnum):
     """As published for RD and RRD: [s, a, s - s'] of a single agent, the next observation of each of many."""
     STATE_ACTION = "state and action"
     """[s, a]."""
+    NEXT = "next state and action"
+    """[s', a]."""
     LATENT = "latent"
     """The factors z = phi(s, a), and nothing else."""
+    LATENT_AND_NEXT = "latent, next state and action"
+    """[z, s', a]."""
 
 
 class Fit(StrEnum):
@@ -34,15 +38,15 @@ class Fit(StrEnum):
     """RRD-unbiased: the same, less the variance that the drawing adds."""
     SUBTRAJECTORIES = "two pieces of an episode"
     """Diaster: the two pieces of an episode that was cut somewhere (equations in `diaster.py`)."""
-    RIDGE = "ridge regression"
-    """In closed form, on all episodes (equations in `closed_form.py`)."""
+    EVIDENCE = "evidence"
+    """In closed form, on all episodes (equations in `evidence.py`)."""
     SIGNS = "best signs"
-    """The same, over the signs of a sum."""
+    """The same, over the signs of a sum (equation in `closed_form.py`)."""
 
     @property
     def closed_form(self) -> bool:
         """Whether nothing descends a gradient."""
-        return self in (Fit.RIDGE, Fit.SIGNS)
+        return self in (Fit.EVIDENCE, Fit.SIGNS)
 
     @property
     def apart(self) -> bool:
@@ -64,7 +68,9 @@ class Decoder(StrEnum):
     DIASTER = "diaster"
     """A recurrent model of pieces of an episode, and an MLP on each step that learns its differences."""
     LINEAR = "linear"
-    """A weighted sum."""
+    """A weighted sum of what it is given."""
+    ADDITIVE = "additive"
+    """A weighted sum of that, of functions of each number in it, and of pairs of factors (`basis.py`)."""
 
 
 class Reward(StrEnum):
@@ -107,7 +113,7 @@ class Method:
     @property
     def latent(self) -> bool:
         """Whether it needs a function that a language model wrote."""
-        return self.encoder is Encoder.LATENT
+        return self.encoder in (Encoder.LATENT, Encoder.LATENT_AND_NEXT)
 
     @property
     def descends(self) -> bool:
@@ -143,11 +149,11 @@ class Method:
 
 DESCENT = frozenset({"learning_rate", "weight_decay", "normalise"})
 OF_FIT: dict[Fit, frozenset[str]] = {
-    Fit.ALL_STEPS: frozenset({"sum_form", "steps"}),
-    Fit.DRAWN_STEPS: frozenset({"sum_form", "steps", "drawn_steps"}),
-    Fit.DRAWN_STEPS_UNBIASED: frozenset({"sum_form", "steps", "drawn_steps"}),
+    Fit.ALL_STEPS: frozenset({"score", "sum_form", "steps"}),
+    Fit.DRAWN_STEPS: frozenset({"score", "sum_form", "steps", "drawn_steps"}),
+    Fit.DRAWN_STEPS_UNBIASED: frozenset({"score", "sum_form", "steps", "drawn_steps"}),
     Fit.SUBTRAJECTORIES: frozenset({"episodes"}),
-    Fit.RIDGE: frozenset({"ridge"}),
+    Fit.EVIDENCE: frozenset({"score"}),
     Fit.SIGNS: frozenset(),
 }
 OF_DECODER: dict[Decoder, frozenset[str]] = {
@@ -162,6 +168,7 @@ OF_DECODER: dict[Decoder, frozenset[str]] = {
 LARE = "Qu et al., LaRe, AAAI 2025"
 RD = "Efroni et al., AAAI 2021; Arjona-Medina et al., RUDDER, 2019"
 RRD = "Ren et al., RRD, ICLR 2022"
+BAYES = "this package, docs/closed-form.md; Efroni et al., AAAI 2021; MacKay, 1992"
 VIB = "Alemi et al., ICLR 2017; LaRe, appendix F.2"
 
 TABLE = (
@@ -179,13 +186,30 @@ TABLE = (
     Method("rrd", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS, "randomized return decomposition", RRD),
     Method("rrdu", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS_UNBIASED, "RRD without the bias of the drawing", RRD),
     Method(
+        "rrdu-next",
+        Reward.PROXY,
+        Encoder.NEXT,
+        Fit.DRAWN_STEPS_UNBIASED,
+        "rrdu on the next state and the action",
+        RRD,
+    ),
+    Method(
         "rd-linear",
         Reward.PROXY,
-        Encoder.RAW,
-        Fit.RIDGE,
-        "ridge regression on raw features, with a confidence radius",
-        "Efroni et al., AAAI 2021",
+        Encoder.NEXT,
+        Fit.EVIDENCE,
+        "linear regression on the next state and the action",
+        BAYES,
         Decoder.LINEAR,
+    ),
+    Method(
+        "bayes",
+        Reward.PROXY,
+        Encoder.NEXT,
+        Fit.EVIDENCE,
+        "regression on functions of each entry of the next state and the action",
+        BAYES,
+        Decoder.ADDITIVE,
     ),
     Method(
         "vib-rd", Reward.PROXY, Encoder.RAW, Fit.ALL_STEPS, "RD behind a bottleneck of its own", VIB, Decoder.BOTTLENECK
@@ -232,10 +256,19 @@ TABLE = (
         "lare-linear",
         Reward.PROXY,
         Encoder.LATENT,
-        Fit.RIDGE,
-        "ridge regression on latent rewards, with a confidence radius",
-        "LaRe, appendix B; Efroni et al., AAAI 2021",
+        Fit.EVIDENCE,
+        "linear regression on latent rewards",
+        BAYES,
         Decoder.LINEAR,
+    ),
+    Method(
+        "lare-bayes",
+        Reward.PROXY,
+        Encoder.LATENT_AND_NEXT,
+        Fit.EVIDENCE,
+        "regression on latent rewards and, where the returns ask for them, on functions of them and of raw features",
+        BAYES,
+        Decoder.ADDITIVE,
     ),
     Method(
         "lare-signs",

@@ -77,6 +77,8 @@ class StoredSteps(NamedTuple):
     """R/T of the step's episode; of what there is of it where it has not finished."""
     finished: Bool[Array, "*batch"]
     """Whether the step's episode has finished."""
+    length: Int[Array, "*batch"]
+    """Steps of its episode; where that has not finished, at least as many as finished ones have on average."""
 
 
 def empty(columns: Mapping[str, jax.ShapeDtypeStruct], envs: int, capacity: int, teams: int) -> Replay:
@@ -225,6 +227,7 @@ def read(replay: Replay, index: Index) -> StoredSteps:
     end, done = end_of(replay, index.env, episode), episode < replay.episodes[index.env]
     total, length = flat(replay.episode_return)[slot], end - flat(replay.first)[slot]
     last = (index.number + 1 == end) & done
+    usual = jnp.sum(replay.transitions) // jnp.maximum(jnp.sum(replay.episodes), 1)
     columns = {name: flat(values) for name, values in replay.columns.items()}
     return StoredSteps(
         before={name: values[here] for name, values in columns.items()},
@@ -232,6 +235,7 @@ def read(replay: Replay, index: Index) -> StoredSteps:
         episodic_reward=jnp.where(last[..., None], total, 0),
         mean_reward=total / jnp.maximum(length, 1)[..., None],
         finished=done,
+        length=jnp.where(done, length, jnp.maximum(length, usual)),
     )
 
 

@@ -119,20 +119,46 @@ def sample_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, l
 
 def pack(replay: Replay, key: PRNGKeyArray, steps: int, longest: int) -> CreditSample:
     """One update's share of `sample_packed`."""
-    budget, places = max(steps, longest), steps
-    drawn = sample_episodes(replay, key, (places,))
+    drawn = sample_episodes(replay, key, (steps,))
     wanted = steps * jnp.sum(finished(replay)) // jnp.maximum(stored_steps(replay), 1)
-    end = jnp.cumsum(drawn.length)
-    mask = drawn.mask * (jnp.arange(places) < jnp.maximum(wanted, 1)) * (end <= budget)
-    row = jnp.arange(budget)
+    mask = drawn.mask * (jnp.arange(steps) < jnp.maximum(wanted, 1))
+    return one_behind_the_other(drawn._replace(mask=mask), max(steps, longest))
+
+
+def one_behind_the_other(episodes: EpisodeSample, rows: int) -> CreditSample:
+    """All steps of some episodes in so many rows, as far as they fit. Rows behind the last episode belong to none."""
+    end, places = jnp.cumsum(episodes.length), len(episodes.length)
+    mask = episodes.mask * (end <= rows)
+    row = jnp.arange(rows)
     place = jnp.minimum(jnp.searchsorted(end, row, side="right"), places - 1)
-    number = drawn.first.number[place] + row - (end - drawn.length)[place]
+    number = episodes.first.number[place] + row - (end - episodes.length)[place]
     belongs = (mask[place] > 0) & (row < end[place])
     index = Index(
-        jnp.where(belongs, drawn.first.env[place], drawn.first.env[0]),
-        jnp.where(belongs, number, drawn.first.number[0]),
+        jnp.where(belongs, episodes.first.env[place], episodes.first.env[0]),
+        jnp.where(belongs, number, episodes.first.number[0]),
     )
-    return CreditSample(index, jnp.where(belongs, place, places), drawn._replace(mask=mask))
+    return CreditSample(index, jnp.where(belongs, place, places), episodes._replace(mask=mask))
+
+
+def episodes_since(replay: Replay, since: Int[Array, " envs"]) -> Int[Array, " envs"]:
+    """How many finished episodes of each environment have this number or a later one, and are still there."""
+    return jnp.maximum(replay.episodes - jnp.maximum(since, replay.oldest), 0)
+
+
+def in_order(
+    replay: Replay, since: Int[Array, " envs"], start: Int[Scalar, ""], places: int, rows: int
+) -> CreditSample:
+    """Of the finished episodes that `episodes_since` counts, one environment after the other: those from the `start`-th on.
+
+    As many as there are places and as fit, whole, in the rows.
+    """
+    counts = episodes_since(replay, since)
+    ends = jnp.cumsum(counts)
+    at = start + jnp.arange(places)
+    env = jnp.minimum(jnp.searchsorted(ends, at, side="right"), len(counts) - 1)
+    number = jnp.maximum(since, replay.oldest)[env] + at - (ends - counts)[env]
+    found = episodes_at(replay, Index(env, number - replay.oldest[env]))
+    return one_behind_the_other(found._replace(mask=found.mask * (at < ends[-1])), rows)
 
 
 def stored_steps(replay: Replay) -> Int[Scalar, ""]:

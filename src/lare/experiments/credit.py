@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lare.credit import closed_form
 from lare.credit.accuracy import RECENT
+from lare.credit.decomposition import deviation
 from lare.credit.methods import Fit
 from lare.data import replay
 from lare.experiments.watch import newest_episode
@@ -17,9 +17,6 @@ from lare.training.config import TrainConfig
 from lare.training.learner import Learner, Paid, features, rewards
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
-
-DELTA = 0.5
-"""Of the confidence radius: a band of 95%."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +28,7 @@ class Credit:
     proxy: Float[np.ndarray, "steps agents"]
     """By the decoders of the last checkpoint."""
     uncertainty: Float[np.ndarray, " steps"] | None
-    """How far the proxy reward of a single agent may be off, by the confidence radius of a decoder in closed form."""
+    """How far the proxy reward of a single agent may be off: two posterior deviations of a decoder in closed form."""
     factors: Float[np.ndarray, "steps rows factors"]
     correlations: Float[np.ndarray, " factors"]
     """Pearson's, of each factor with the true reward, over the last steps of all seeds. NaN where one never varies."""
@@ -57,10 +54,10 @@ def credit_of(run: Run) -> Credit | None:
     steps = replay.read(one.replay, index)
     proxy = rewards(steps, Paid(one.credit, one.scale), config)
     uncertainty = None
-    totals = one.credit[0].totals if one.credit else None
-    if totals is not None and config.method.fit is Fit.RIDGE and config.judged_rows == 1:
-        rows = features(steps, config, 0)[:, 0]
-        uncertainty = np.asarray(closed_form.uncertainty(totals, rows, config.credit.ridge, DELTA))
+    if one.credit and config.method.fit is Fit.EVIDENCE and config.judged_rows == 1:
+        with jax.enable_x64(True):
+            known = deviation(one.credit[0], features(steps, config, 0)[:, 0], config.forms)
+        uncertainty = 2 * np.asarray(known) / np.where(one.credit[0].average, steps.length, 1)
     factors = np.asarray(steps.before["factors"]) if "factors" in steps.before else np.zeros((len(proxy), 1, 0))
     correlations = factor_correlations(learner, config)
     return Credit(np.asarray(steps.before["reward"]), np.asarray(proxy), uncertainty, factors, correlations)

@@ -12,7 +12,7 @@ from lare.credit.methods import find_method
 from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
-from lare.experiments.credit import DELTA, credit_of, factor_labels
+from lare.experiments.credit import credit_of, factor_labels
 from lare.experiments.html import factor_table, function_text, note, table, write_page
 from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN
 from lare.experiments.statistics import mean_and_deviation, plus_minus
@@ -171,8 +171,8 @@ def one_agent_details(run: Run) -> Iterable[str]:
             + (
                 ""
                 if credit.uncertainty is None
-                else f" The band is of {1 - DELTA / 10:.0%}, after Proposition 1 of the paper: to be relied on where rewards are "
-                "linear in what the decoder sees, with weights that are not large."
+                else " The band is two posterior deviations wide on either side: what the returns so far leave open, where the "
+                "true rewards are made of what the decoder sees."
             )
         )
     if run.function is not None:

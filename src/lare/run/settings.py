@@ -171,7 +171,7 @@ class ResolvedSettings(Checked):
     @property
     def rereads(self) -> bool:
         """Whether steps are read again when the policy has learned from them."""
-        return ALGORITHMS[self.algorithm].consumes is not Consumes.ROLLOUTS or find_method(self.method).descends
+        return ALGORITHMS[self.algorithm].consumes is not Consumes.ROLLOUTS or find_method(self.method).fit is not None
 
     def judged_by(self, task: TaskSpec) -> Judges:
         """Which observation the factors judge a step by."""

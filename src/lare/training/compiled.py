@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float, Key
 
 from lare.algorithms.table import Consumes
 from lare.data.trajectory import Trajectory
+from lare.training import episodes, off_policy, on_policy, sequences
 from lare.training import learner as common
-from lare.training import off_policy, on_policy, sequences
 from lare.training.config import TrainConfig
 from lare.training.learner import Learner
 
@@ -24,6 +24,8 @@ class Compiled(NamedTuple):
 
     store: Callable[[Learner, Trajectory, Any], Learner]
     """From learner, new steps, and their factors."""
+    learn_returns: Callable[[Learner], Learner]
+    """When episodes have finished: `episodes.learn_returns`."""
     fit: Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, Metrics]]
     """The decoders' own updates; the mean of each metric over them."""
     improve: Callable[..., tuple[Learner, Metrics]]
@@ -89,7 +91,15 @@ def compiled(config: TrainConfig) -> Compiled:
         credit, measured = jax.lax.map(lambda one: common.fit_often(one[0], one[1], config), (learner, keys))
         return learner._replace(credit=credit), measured
 
+    learn = jax.jit(partial(episodes.learn_returns, config=config))
+
+    def learn_returns(learner: Learner) -> Learner:
+        with jax.enable_x64(True):
+            credit, counted = learn(learner.credit, learner.replay, learner.counted)
+        return learner._replace(credit=credit, counted=counted)
+
     return Compiled(
+        learn_returns=learn_returns,
         store=jax.jit(jax.vmap(partial(common.store, config=config)), donate_argnums=0),
         fit=jax.jit(fit_in_turn, donate_argnums=0),
         improve=jax.jit(partial(module.improve, config=config), donate_argnums=0),

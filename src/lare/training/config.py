@@ -6,8 +6,9 @@ import jax
 import numpy as np
 
 from lare.algorithms.table import Algorithm, AlgorithmSettings, Consumes, Noise
-from lare.credit.decomposition import CreditSettings
-from lare.credit.methods import Encoder, Method
+from lare.credit.basis import Basis
+from lare.credit.decomposition import SUM, CreditSettings, forms_of
+from lare.credit.methods import Decoder, Encoder, Method
 from lare.tasks.env import EnvSpec
 from lare.tasks.spec import JudgedFrom
 
@@ -77,15 +78,33 @@ class TrainConfig:
         )
 
     @property
-    def features(self) -> tuple[int, ...]:
-        """Size of what each team's decoder sees of a judged row."""
-        if self.method.encoder is Encoder.LATENT:
-            return self.factors
-        shown = self.env.state_size if self.of_state else self.env.observation_size
-        size = {None: 0, Encoder.RAW: shown, Encoder.STATE_ACTION: shown}[self.method.encoder]
-        if self.method.encoder is Encoder.STATE_ACTION or self.raw_differences:
-            size += self.env.action_size * (self.env.agents if self.of_state else 1)
-        return (size + (shown if self.raw_differences else 0),) * len(self.env.teams)
+    def shown(self) -> int:
+        """Size of what a judged row is of: an observation, or the global state."""
+        return self.env.state_size if self.of_state else self.env.observation_size
+
+    @property
+    def entries(self) -> int:
+        """Size of the raw part of what a team's decoder sees of a judged row."""
+        action = self.env.action_size * (self.env.agents if self.of_state else 1)
+        match self.method.encoder:
+            case None | Encoder.LATENT:
+                return 0
+            case Encoder.RAW:
+                return 2 * self.shown + action if self.raw_differences else self.shown
+            case _:
+                return self.shown + action
+
+    @property
+    def bases(self) -> tuple[Basis, ...]:
+        """What each team's decoder sees of a judged row, and what it makes of that in closed form."""
+        extended = self.method.decoder is Decoder.ADDITIVE
+        factors = self.factors if self.method.latent else (0,) * len(self.env.teams)
+        return tuple(Basis(size, self.entries, extended) for size in factors)
+
+    @property
+    def forms(self) -> tuple[int, ...]:
+        """Which forms of the score are fitted."""
+        return forms_of(self.credit, self.env.fixed_length) if "score" in self.method.settings else (SUM,)
 
     @property
     def raw_differences(self) -> bool:
@@ -98,10 +117,10 @@ class TrainConfig:
         env, consumes = self.env, self.algorithm.consumes
         stored = consumes is not Consumes.ROLLOUTS
         encoder = self.method.encoder
-        raw = encoder in (Encoder.RAW, Encoder.STATE_ACTION)
+        raw = encoder not in (None, Encoder.LATENT)
         wanted = {
             "observation": stored or (raw and not self.of_state),
-            "action": stored or encoder is Encoder.STATE_ACTION or self.raw_differences,
+            "action": stored or (raw and encoder is not Encoder.RAW) or self.raw_differences,
             "factors": self.method.latent,
             "reward": True,
             "state": env.state_size > 0 and ((raw and self.of_state) or consumes is Consumes.SEQUENCES),

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lare.credit import accuracy, decomposition
+from lare.credit import accuracy, decomposition, prediction
 from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Encoder, Fit, Reward
@@ -41,6 +41,8 @@ class Learner(NamedTuple):
     scale: tuple[Scale, ...]
     """Of each team's R/T."""
     replay: Replay
+    counted: Int[Array, " envs"]
+    """Finished episodes of each environment that the decoders have been told of."""
 
 
 class Paid(NamedTuple):
@@ -58,14 +60,14 @@ def init_credit(keys: Sequence[PRNGKeyArray], config: TrainConfig) -> tuple[Deco
     return tuple(
         decomposition.init(
             key,
-            size,
+            basis,
             config.method,
             config.credit,
             steps=env.max_steps,
             agents=1 if config.of_state else team.size,
-            envs=config.environments,
+            forms=config.forms,
         )
-        for key, size, team in zip(keys, config.features, env.teams, strict=True)
+        for key, basis, team in zip(keys, config.bases, env.teams, strict=True)
     )
 
 
@@ -78,26 +80,39 @@ def init(key: PRNGKeyArray, config: TrainConfig, algorithm: Any) -> Learner:
         init_credit(keys, config),
         tuple(new_scale() for _ in config.env.teams),
         replay.empty(config.columns, config.environments, config.capacity, teams),
+        jnp.zeros(config.environments, jnp.int32),
     )
 
 
 def features(steps: StoredSteps, config: TrainConfig, place: int) -> Float[Array, "*batch rows features"]:
     """What a team's decoder sees of some steps."""
-    before, after, rows = steps.before, steps.after, config.judged(place)
+    rows, encoder, found = config.judged(place), config.method.encoder, []
     if config.method.latent:
-        return before["factors"][..., rows, : config.factors[place]]
+        found.append(steps.before["factors"][..., rows, : config.factors[place]])
+    if encoder is not Encoder.LATENT:
+        found += raw_features(steps, config, rows)
+    return jnp.concatenate(found, axis=-1)
+
+
+def raw_features(steps: StoredSteps, config: TrainConfig, rows: slice) -> list[Float[Array, "*batch rows _"]]:
+    """The raw part of what a decoder sees of some steps."""
+    before, after, encoder = steps.before, steps.after, config.method.encoder
+    name = "state" if config.of_state else "observation"
+    shown, led_to = (
+        part[name][..., None, :] if config.of_state else part[name][..., rows, :] for part in (before, after)
+    )
+    if encoder is Encoder.RAW and not config.raw_differences:
+        return [led_to]
     # A Gaussian may choose beyond the bounds; what happened is that the bound was taken.
-    if config.of_state:
-        found = [after["state"] if config.method.encoder is Encoder.RAW else before["state"]]
-        if config.method.encoder is Encoder.STATE_ACTION:
-            action = jnp.clip(before["action"], -1, 1)
-            found.append(action.reshape(*action.shape[:-2], -1))
-        return jnp.concatenate(found, axis=-1)[..., None, :]
-    shown, led_to = (part["observation"][..., rows, :] for part in (before, after))
-    if config.method.encoder is Encoder.RAW and not config.raw_differences:
-        return led_to
-    found = [shown, jnp.clip(before["action"][..., rows, :], -1, 1)]
-    return jnp.concatenate([*found, shown - led_to] if config.raw_differences else found, axis=-1)
+    action = jnp.clip(before["action"], -1, 1)
+    action = action.reshape(*action.shape[:-2], 1, -1) if config.of_state else action[..., rows, :]
+    match encoder:
+        case Encoder.RAW:
+            return [shown, action, shown - led_to]
+        case Encoder.STATE_ACTION:
+            return [shown, action]
+        case _:
+            return [led_to, action]
 
 
 def alive(steps: StoredSteps, config: TrainConfig) -> Bool[Array, "*batch agents"]:
@@ -153,26 +168,11 @@ def team_rewards(steps: Trajectory, config: TrainConfig) -> Float[Array, "time e
 def with_steps(
     credit: Decomposition, steps: StoredSteps, ended: Bool[Array, "time envs"], config: TrainConfig, place: int
 ) -> Decomposition:
-    """A team's decoder with new steps in its statistics; one in closed form is fitted to the episodes that have ended."""
-    rows, mask, mean_reward = (
-        features(steps, config, place),
-        alive_rows(steps, config, place),
-        steps.mean_reward[..., place],
-    )
+    """A team's decoder with new steps in its statistics."""
+    rows, mask = features(steps, config, place), alive_rows(steps, config, place)
     credit = decomposition.observe_steps(credit, rows, mask)
-    credit = decomposition.observe_returns(credit, mean_reward.ravel(), ended.ravel())
-    fit = config.method.fit
-    if fit is not None and fit.closed_form:
-        mean_row = jnp.mean(rows, axis=-2) if mask is None else mean_of_rows(rows, mask)
-        credit = decomposition.fit_in_closed_form(credit, mean_row, mean_reward, ended, fit, config.credit)
-    return credit
-
-
-def mean_of_rows(
-    rows: Float[Array, "*batch rows features"], mask: Bool[Array, "*batch rows"]
-) -> Float[Array, "*batch features"]:
-    """The mean over the agents that are alive; 0 where none is."""
-    return jnp.einsum("...rf,...r->...f", rows, shares(mask))
+    mean_reward = steps.mean_reward[..., place].ravel()
+    return decomposition.observe_returns(credit, mean_reward, steps.length.ravel(), ended.ravel())
 
 
 def shares(mask: Bool[Array, "*batch rows"]) -> Float[Array, "*batch rows"]:
@@ -182,8 +182,7 @@ def shares(mask: Bool[Array, "*batch rows"]) -> Float[Array, "*batch rows"]:
 
 def forget_episodes(learner: Learner, dropped: Bool[Array, " envs"]) -> Learner:
     """Without the episodes that are under way in some of the environments."""
-    credit = tuple(decomposition.forget_episodes(one, dropped) for one in learner.credit)
-    return learner._replace(credit=credit, replay=replay.drop_running(learner.replay, dropped))
+    return learner._replace(replay=replay.drop_running(learner.replay, dropped))
 
 
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditSample | None:
@@ -212,23 +211,26 @@ def fit(
 ) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
     """One update of every team's decoder."""
     assert config.method.fit is not None
-    steps, chosen = replay.read(buffer, sample.steps), sample.episodes
+    steps = replay.read(buffer, sample.steps)
     fitted, measured = [], []
     for place, (one, own) in enumerate(zip(credit, jax.random.split(key, len(credit)), strict=True)):
-        mask = alive_rows(steps, config, place)
-        rows = features(steps, config, place)
-        batch = Episodes(
-            rows,
-            sample.episode,
-            chosen.length,
-            chosen.mean_reward[..., place],
-            chosen.mask,
-            None if mask is None else shares(mask),
-        )
-        new, metrics = update_decoder(one, batch, own, config)
+        new, metrics = update_decoder(one, episodes_of(steps, sample, config, place), own, config)
         fitted.append(new)
         measured.append(metrics)
     return tuple(fitted), by_team(measured, config)
+
+
+def episodes_of(steps: StoredSteps, sample: CreditSample, config: TrainConfig, place: int) -> Episodes:
+    """What a team's decoder is given of the steps that were chosen."""
+    mask, chosen = alive_rows(steps, config, place), sample.episodes
+    return Episodes(
+        features(steps, config, place),
+        sample.episode,
+        chosen.length,
+        chosen.mean_reward[..., place],
+        chosen.mask,
+        None if mask is None else shares(mask),
+    )
 
 
 def update_decoder(
@@ -295,7 +297,8 @@ def proxy_rewards(steps: StoredSteps, paid: Paid, config: TrainConfig, place: in
         share = within_range(paid.scale[place], steps.mean_reward[..., place])
         return jnp.where(steps.finished, share, 0.5)[..., None]
     rows = features(steps, config, place)
-    r_hat = decomposition.proxy_rewards(paid.credit[place], rows.reshape(-1, *rows.shape[-2:]), config.credit)
+    flat = rows.reshape(-1, *rows.shape[-2:])
+    r_hat = decomposition.proxy_rewards(paid.credit[place], flat, config.credit, steps.length.ravel())
     return r_hat.reshape(rows.shape[:-1])
 
 
@@ -319,6 +322,8 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
             true, mask = true[..., team.agents], there[..., None] & acting[..., team.agents]
         r_hat = jnp.broadcast_to(proxy_rewards(recent, paid, config, place), true.shape)
         found.append(accuracy.metrics(r_hat.ravel(), true.ravel(), mask.ravel(), config.method.in_units))
+        if learner.credit:
+            found[-1]["credit/return_r2"] = prediction.r2(learner.credit[place].predictions)[0]
     return by_team(found, config)
 
 

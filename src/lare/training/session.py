@@ -79,6 +79,8 @@ class Session:
         """One iteration: steps, factors, replay, sometimes the decoder, the algorithm."""
         steps = self.collector.collect(self.actor, self.step)
         self.learner = self.functions.store(self.learner, steps, annotate(self.run, self.config, steps))
+        if self.learner.credit and np.any(steps.ended):
+            self.learner = self.functions.learn_returns(self.learner)
         if self.step >= self.config.warmup:
             self.update(steps)
         self.step += self.settings.iteration_steps

@@ -1,0 +1,100 @@
+"""What the score of a step may be made of: features that a closed-form decoder is linear in, in groups.
+
+With u = (x - mean) / deviation over all steps, for the factors z of a step and for its raw entries [s', a]:
+
+    factors             u_i
+    shapes of factors   cos(k pi u_i / 4) / k,  sin(k pi u_i / 4) / k,   k = 1, 2, 3
+    pairs of factors    u_i u_j,  i < j
+    entries             u_i
+    shapes of entries   as those of the factors
+
+Shapes are the first terms of the Fourier series of a function of one number, within four deviations of its mean: they say
+"more is better up to here", "near this value", "beyond this value". Pairs say "this while that". Which groups are needed is
+decided by the returns (`evidence.py`).
+
+The entries [s', a] are the state that a step led to and the action: the mean of the published s - s' over an episode is
+next to nothing, because the differences cancel.
+"""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+FREQUENCIES = 3
+HALF_PERIOD = 4.0
+"""Deviations from the mean within which shapes tell values apart."""
+LARGEST = 512
+"""Features. Where entries are so many that their shapes would exceed it, they get fewer frequencies, or none."""
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Which features there are. Inputs are rows [z, s', a], or the part of it that there is."""
+
+    factors: int
+    entries: int
+    extended: bool
+    """With shapes and pairs, not only what is given."""
+
+    @property
+    def inputs(self) -> int:
+        """Size of a row that is given."""
+        return self.factors + self.entries
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Features in each group that there is, in order."""
+        pairs = self.factors * (self.factors - 1) // 2
+        sizes = {"factors": self.factors}
+        if self.extended:
+            sizes |= {"shapes of factors": 2 * FREQUENCIES * self.factors, "pairs of factors": pairs}
+        sizes["entries"] = self.entries
+        if self.extended:
+            sizes["shapes of entries"] = 2 * self.frequencies_of_entries * self.entries
+        return {name: size for name, size in sizes.items() if size}
+
+    @property
+    def frequencies_of_entries(self) -> int:
+        """Terms of the series of each entry."""
+        factors = self.factors * (1 + 2 * FREQUENCIES) + self.factors * (self.factors - 1) // 2
+        left = max(0, LARGEST - factors - self.entries)
+        return min(FREQUENCIES, left // max(1, 2 * self.entries))
+
+    @property
+    def size(self) -> int:
+        """Features in all."""
+        return sum(self.sizes.values())
+
+    @property
+    def group(self) -> Int[np.ndarray, " features"]:
+        """The number of each feature's group."""
+        return np.repeat(np.arange(len(self.sizes)), list(self.sizes.values()))
+
+
+def shapes(u: Float[Array, "*batch inputs"], frequencies: int) -> Float[Array, "*batch features"]:
+    """The terms of the series, one frequency after the other, the cosine of all inputs before their sines."""
+    within = jnp.clip(u, -HALF_PERIOD, HALF_PERIOD)
+    angles = [k * jnp.pi / HALF_PERIOD * within for k in range(1, frequencies + 1)]
+    terms = [wave(angle) / k for k, angle in enumerate(angles, 1) for wave in (jnp.cos, jnp.sin)]
+    return jnp.concatenate(terms, axis=-1) if terms else u[..., :0]
+
+
+def expand(basis: Basis, u: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
+    """The features of standardised inputs."""
+    if not basis.extended:
+        return u
+    factors, entries = u[..., : basis.factors], u[..., basis.factors :]
+    one, other = np.triu_indices(basis.factors, 1)
+    within = jnp.clip(factors, -HALF_PERIOD, HALF_PERIOD)
+    return jnp.concatenate(
+        [
+            factors,
+            shapes(factors, FREQUENCIES),
+            within[..., one] * within[..., other],
+            entries,
+            shapes(entries, basis.frequencies_of_entries),
+        ],
+        axis=-1,
+    )

@@ -1,0 +1,64 @@
+"""How well returns are predicted before anything is fitted to them.
+
+    R^2 = 1 - sum_k (R_k - R_hat_k)^2 / sum_k (R_k - mean R)^2
+
+over the last episodes, where R_hat_k is the sum of the proxy rewards that the decoder gave to the steps of episode k when
+it had not seen R_k yet. It needs no true reward of a step: where the environment pays only at the end, nothing else says
+whether the proxy rewards are any good. Below 0, the mean return predicts better.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+LAST = 64
+"""Episodes that are looked back on."""
+FEWEST = 8
+"""Below so many, nothing is said."""
+
+
+class Predictions(NamedTuple):
+    """Of the last episodes, in no order: what they returned, and what was predicted in several ways."""
+
+    episodes: Float[Array, ""]
+    """That were ever predicted."""
+    returns: Float[Array, " last"]
+    predicted: Float[Array, "last ways"]
+
+
+def no_predictions(ways: int) -> Predictions:
+    """Of no episodes."""
+    return Predictions(jnp.zeros(()), jnp.zeros(LAST), jnp.zeros((LAST, ways)))
+
+
+def remember(
+    before: Predictions,
+    returns: Float[Array, " episodes"],
+    predicted: Float[Array, "episodes ways"],
+    mask: Bool[Array, " episodes"],
+) -> Predictions:
+    """With new episodes, at most `LAST` of them; those where `mask` is false are passed over."""
+    place = (before.episodes.astype(jnp.int32) + jnp.cumsum(mask) - 1) % LAST
+    place = jnp.where(mask, place, LAST)  # a place that there is not, which is dropped
+    return Predictions(
+        before.episodes + jnp.sum(mask),
+        before.returns.at[place].set(returns.astype(jnp.float32), mode="drop"),
+        before.predicted.at[place].set(predicted.astype(jnp.float32), mode="drop"),
+    )
+
+
+def squared_errors(known: Predictions) -> Float[Array, " ways"]:
+    """sum_k (R_k - R_hat_k)^2 of each way."""
+    there = jnp.arange(LAST) < known.episodes
+    return jnp.sum(jnp.where(there[:, None], (known.returns[:, None] - known.predicted) ** 2, 0), axis=0)
+
+
+def r2(known: Predictions) -> Float[Array, " ways"]:
+    """R^2 of each way; NaN while episodes are few, or all returned the same."""
+    there = jnp.arange(LAST) < known.episodes
+    count = jnp.sum(there)
+    mean = jnp.sum(jnp.where(there, known.returns, 0)) / jnp.maximum(count, 1)
+    spread = jnp.sum(jnp.where(there, (known.returns - mean) ** 2, 0))
+    told = (count >= FEWEST) & (spread > 1e-10 * count * mean**2)
+    return jnp.where(told, 1 - squared_errors(known) / jnp.where(told, spread, 1), jnp.nan)

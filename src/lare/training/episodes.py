@@ -1,0 +1,116 @@
+"""What the decoders are told of episodes that have finished: their returns are predicted, then added to sums, then fitted to.
+
+One order for every method that predicts returns, whatever fits it: predict, then learn. So `credit/return_r2` is of returns
+that nothing had been fitted to.
+
+Written for all seeds: steps are read in lockstep, fits in closed form are made one seed after the other, as each one's turn comes.
+What is in float64 (`closed_form.py`) is so where all this is called within `jax.enable_x64(True)`.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from lare.credit import closed_form, decomposition, prediction
+from lare.credit.decomposition import Decomposition, Episodes
+from lare.credit.methods import Fit
+from lare.data import replay
+from lare.data.replay import Replay
+from lare.data.sampling import episodes_since, in_order
+from lare.training.config import TrainConfig
+from lare.training.learner import episodes_of
+
+ROWS = 1000
+"""Judged rows, about, that are read at a time."""
+PLACES = prediction.LAST
+"""The most episodes that are read at a time."""
+GROWTH = 0.02
+"""By which the episodes must have grown. Where they are short, a few of them are waited for."""
+
+Credit = tuple[Decomposition, ...]
+
+
+def learn_returns(
+    credit: Credit, buffer: Replay, counted: Int[Array, "seeds envs"], config: TrainConfig
+) -> tuple[Credit, Int[Array, "seeds envs"]]:
+    """The decoders of each team, with a leading seed axis, when they have been told of what has finished; and how much that is."""
+    before = jnp.sum(counted, axis=1)
+    new = jnp.sum(buffer.episodes, axis=1) - before
+    due = new >= jnp.maximum(GROWTH * before, 1)
+    learn = partial(learn_those_due, buffer=buffer, counted=counted, due=due, config=config)
+    credit = jax.lax.cond(jnp.any(due), learn, lambda same: same, credit)
+    return credit, jnp.where(due[:, None], buffer.episodes, counted).astype(counted.dtype)
+
+
+def learn_those_due(
+    credit: Credit,
+    buffer: Replay,
+    counted: Int[Array, "seeds envs"],
+    due: Bool[Array, " seeds"],
+    config: TrainConfig,
+) -> Credit:
+    """The same, where at least one seed is due."""
+    since = jnp.where(due[:, None], counted, buffer.episodes)
+    learned = jax.vmap(partial(tell, config=config))(credit, buffer, since)
+    if learned[0].closed is None:
+        return learned
+    if config.method.fit is not Fit.SIGNS:  # which takes the factors as they are
+        again = due & jax.vmap(decomposition.is_stale)(learned[0])
+        everything = jax.vmap(partial(sum_again, config=config))
+        learned = jax.lax.cond(jnp.any(again), everything, lambda same, *_: same, learned, buffer, again)
+    return tuple(fit_those_due(one, due, config) for one in learned)
+
+
+def pieces(
+    credit: Credit,
+    buffer: Replay,
+    since: Int[Array, " envs"],
+    take: Callable[[Decomposition, Episodes, Bool[Array, " episodes"]], Decomposition],
+    config: TrainConfig,
+) -> Credit:
+    """What each team's decoder becomes when it `take`s all finished episodes from some number on, some at a time."""
+    longest = config.env.max_steps
+    rows = max(1, ROWS // (config.judged_rows * longest)) * longest
+    total = jnp.sum(episodes_since(buffer, since))
+
+    def piece(carry: tuple[Int[Array, ""], Credit]) -> tuple[Int[Array, ""], Credit]:
+        start, credit = carry
+        sample = in_order(buffer, since, start, PLACES, rows)
+        steps, there = replay.read(buffer, sample.steps), sample.episodes.mask > 0
+        credit = tuple(take(one, episodes_of(steps, sample, config, place), there) for place, one in enumerate(credit))
+        return start + jnp.sum(there), credit
+
+    return jax.lax.while_loop(lambda carry: carry[0] < total, piece, (jnp.zeros_like(total), credit))[1]
+
+
+def tell(credit: Credit, buffer: Replay, since: Int[Array, " envs"], config: TrainConfig) -> Credit:
+    """One seed: predict the returns of new episodes, and add them to the sums."""
+
+    def take(one: Decomposition, episodes: Episodes, there: Bool[Array, " episodes"]) -> Decomposition:
+        one = decomposition.predict(one, episodes, there, config.credit)
+        return one if one.closed is None else decomposition.add_episodes(one, episodes, there)
+
+    return pieces(credit, buffer, since, take, config)
+
+
+def sum_again(credit: Credit, buffer: Replay, again: Bool[Array, ""], config: TrainConfig) -> Credit:
+    """One seed: where `again` is true, sums over all stored episodes, of features that are standardised anew."""
+    empty = tuple(decomposition.begin_again(one) for one in credit)
+    since = jnp.where(again, buffer.oldest, buffer.episodes)
+    summed = pieces(empty, buffer, since, decomposition.add_episodes, config)
+    return jax.tree.map(lambda new, old: jnp.where(again, new, old), summed, credit)
+
+
+def fit_those_due(credit: Decomposition, due: Bool[Array, " seeds"], config: TrainConfig) -> Decomposition:
+    """Fit in closed form, of those seeds that have been told enough."""
+
+    def one(of_seed: tuple[Decomposition, Bool[Array, ""]]) -> Decomposition:
+        credit, due = of_seed
+        assert credit.closed is not None
+        fit = partial(decomposition.fit_in_closed_form, method=config.method, forms=config.forms)
+        return jax.lax.cond(due & closed_form.is_due(credit.closed), fit, lambda same: same, credit)
+
+    return jax.lax.map(one, (credit, due))
