@@ -118,15 +118,29 @@ def untrained(config, seed=0):
 def with_steps(learner, config, steps, factors=None):
     """A learner that has met these steps too, and been told of the episodes that have finished."""
     factors = factors_for(config, steps) if factors is None else factors
-    learner = jax.jit(partial(common.store, config=config))(learner, jax.tree.map(jnp.asarray, steps), factors)
+    learner = jitted(common.store, config)(learner, jax.tree.map(jnp.asarray, steps), factors)
     return told(learner, config) if learner.credit else learner
+
+
+COMPILED = {}
+
+
+def jitted(function, config):
+    """A function for one configuration, compiled once."""
+    key = function, id(config)
+    if key not in COMPILED:
+        COMPILED[key] = (
+            config,
+            jax.jit(partial(function, config=config)),
+        )  # which keeps the configuration, and so its number
+    return COMPILED[key][1]
 
 
 def told(learner, config):
     """A learner whose decoders have been told of all episodes that have finished."""
     given = jax.tree.map(lambda leaf: leaf[None], (learner.credit, learner.replay, learner.counted))
     with jax.enable_x64(True):
-        learned = jax.jit(partial(learn_returns, config=config))(*given)
+        learned = jitted(learn_returns, config)(*given)
     credit, counted = jax.tree.map(lambda leaf: leaf[0], learned)
     return learner._replace(credit=credit, counted=counted)
 

@@ -175,7 +175,7 @@ def init(
 
     Args:
         key: what its weights are drawn by.
-        features: what it sees of a step and, in closed form, makes of that; or how many numbers it sees, and is to take as they are.
+        features: what it sees of a step and, in closed form, makes of that; or how many numbers it sees and takes as they are.
         method: a row of the table.
         settings: of the decoder and its fit; the same ones go to every other function of this file.
         steps: of the longest episode.
@@ -255,18 +255,18 @@ def predict(
 
     Those where `new` is false are passed over, and all as long as nothing has been fitted. At most `prediction.LAST` episodes.
     """
-    new = new & is_fitted(state)
     returns, count = episodes.mean_reward * episodes.length, len(episodes.length)
     long = episodes.length[jnp.clip(episodes.episode, 0, count - 1)]
     r_hat = over_agents(proxy_rewards(state, episodes.features, settings, long), episodes.share)
     total = jax.ops.segment_sum(r_hat, episodes.episode, count)
-    state = state._replace(predictions=remember(state.predictions, returns, total[:, None], new))
+    known = remember(state.predictions, returns, total[:, None], new & is_fitted(state))
+    state = state._replace(predictions=known)
     if state.rivals is None or state.closed is None:
         return state
     features = mean_features(state.closed.decoder, episodes)
     of_each = features @ state.closed.decoder.weight.T + state.closed.decoder.bias
     of_each = of_each * jnp.stack([episodes.length, jnp.ones_like(episodes.length)], axis=1)
-    return state._replace(rivals=remember(state.rivals, returns, of_each, new))
+    return state._replace(rivals=remember(state.rivals, returns, of_each, new & (state.closed.fitted > 1)))
 
 
 def mean_features(decoder: LinearDecoder, episodes: Episodes) -> Float[Array, "episodes features"]:
