@@ -6,7 +6,7 @@ import pytest
 
 import lare
 from lare.algorithms.table import ALGORITHMS
-from lare.credit.methods import METHODS, Encoder
+from lare.credit.methods import METHODS
 from lare.errors import LareError
 from lare.latent.function import verified
 from lare.tasks.spec import read_task
@@ -68,7 +68,7 @@ def test_every_method_trains_and_reports_or_is_refused(method, kind, small, smal
     assert ("credit/error" in lines[-1]) == row.in_units
     assert ("credit/loss" in lines[-1]) == row.descends
     assert "critic/loss" in lines[-1]
-    assert (run.directory / "latent_function.py").exists() == (row.encoder is Encoder.LATENT)
+    assert (run.directory / "latent_function.py").exists() == row.latent
     if (kind, method) == ("td3", "lare-rrdu"):
         assert lare.write_report([run.directory]).read_text().count("<svg") >= 1
 

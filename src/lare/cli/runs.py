@@ -74,6 +74,7 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
     from lare.experiments.video import check_video, record_video
     from lare.run.directory import open_run
     from lare.tasks.table import env_spec
+    from lare.training.explain import explanation_of
 
     opened = open_run(run)
     if video is not None:
@@ -89,6 +90,8 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
         for seed, of_seed in zip(opened.seeds, of_team, strict=True):
             named = f"{team}, " if len(returns) > 1 else ""
             say(f"{named}seed {seed}: return {plus_minus(*mean_and_deviation(of_seed))} over {episodes} episodes")
+    for line in explanation_of(opened):
+        say(line)
 
 
 def report(runs: RunDirectories, out: Path | None = None) -> None:

@@ -8,11 +8,20 @@ RECENT = 5000
 
 
 def metrics(
-    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"], in_units: bool
+    r_hat: Float[Array, " steps"],
+    reward: Float[Array, " steps"],
+    last: Bool[Array, " steps"],
+    mask: Bool[Array, " steps"],
+    in_units: bool,
 ) -> dict[str, Float[Array, ""]]:
-    """By the keys of metrics.jsonl; the error only of proxy rewards that are in the unit of the true ones."""
+    """By the keys of metrics.jsonl; the error only of proxy rewards that are in the unit of the true ones.
+
+    NaN where nothing but the last step of an episode has paid: what each step is truly worth is not known there.
+    """
+    known = jnp.any((reward != 0) & mask & ~last)
     found = {"credit/correlation": correlation(r_hat, reward, mask)}
-    return found | ({"credit/error": mean_error(r_hat, reward, mask)} if in_units else {})
+    found |= {"credit/error": mean_error(r_hat, reward, mask)} if in_units else {}
+    return {name: jnp.where(known, value, jnp.nan) for name, value in found.items()}
 
 
 def mean_error(

@@ -125,11 +125,13 @@ def is_due(state: ClosedForm) -> Bool[Array, ""]:
 def fit(state: ClosedForm, forms: tuple[int, ...], rounds: int = ROUNDS) -> ClosedForm:
     """With the decoder that follows from the sums, for each of some forms: 0 a sum over steps, 1 an average."""
     basis, sums = state.decoder.basis, whole(state.summed)
-    found = []
-    for place, form in enumerate(forms):
-        start = jax.tree.map(lambda leaf, place=place: leaf[place].astype(float), state.posterior)
-        found.append(evidence.fit(sums, form, basis.group, start, rounds))
-    posterior = jax.tree.map(lambda *leaves: jnp.stack(leaves).astype(jnp.float32), *found)
+
+    def one(of_form: tuple[Int[Array, ""], Posterior]) -> Posterior:
+        form, start = of_form
+        return evidence.fit(sums, form, basis.group, jax.tree.map(lambda leaf: leaf.astype(float), start), rounds)
+
+    found = jax.lax.map(one, (jnp.asarray(forms), state.posterior))
+    posterior = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), found)
     return with_weights(state, posterior.weight, posterior.bias)._replace(posterior=posterior)
 
 

@@ -77,6 +77,8 @@ class StoredSteps(NamedTuple):
     """R/T of the step's episode; of what there is of it where it has not finished."""
     finished: Bool[Array, "*batch"]
     """Whether the step's episode has finished."""
+    last: Bool[Array, "*batch"]
+    """Whether the step is the last one of a finished episode."""
     length: Int[Array, "*batch"]
     """Steps of its episode; where that has not finished, at least as many as finished ones have on average."""
 
@@ -235,6 +237,7 @@ def read(replay: Replay, index: Index) -> StoredSteps:
         episodic_reward=jnp.where(last[..., None], total, 0),
         mean_reward=total / jnp.maximum(length, 1)[..., None],
         finished=done,
+        last=last,
         length=jnp.where(done, length, jnp.maximum(length, usual)),
     )
 

@@ -38,10 +38,9 @@ def factor_labels(run: Run, place: int = 0) -> list[tuple[str, str]]:
     """Name and meaning of each column of z, by the function of one of the task's roles."""
     if not run.functions:
         return []
-    labels = list(zip(run.functions[place].names, run.functions[place].meanings, strict=True))
-    if run.judges != "both":
-        return labels
-    return [(f"{name} ({which})", meaning) for which in ("before", "after") for name, meaning in labels]
+    function = run.functions[place]
+    columns = function.columns_by(run.judges)
+    return list(zip(columns, function.meanings * (len(columns) // function.size), strict=True))
 
 
 def credit_of(run: Run) -> Credit | None:

@@ -14,7 +14,7 @@ from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
 from lare.experiments.credit import credit_of, factor_labels
 from lare.experiments.html import factor_table, function_text, note, table, write_page
-from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN
+from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN, RETURN_R2
 from lare.experiments.statistics import mean_and_deviation, plus_minus
 from lare.run.directory import Run, open_run
 from lare.run.settings import Settings
@@ -22,6 +22,7 @@ from lare.run.usual import resolve
 from lare.source import source
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import env_spec
+from lare.training.explain import explanation_of
 
 TOP = "True rewards, for a million steps of the best public TD3,"
 """What the upper ends of `REFERENCES` are."""
@@ -86,23 +87,25 @@ def at_the_end(run: Run, key: str) -> str:
 
 
 def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
-    head = ("task", "method", "seeds", "steps", "return", "credit error", "correlation")
+    head = ("task", "method", "seeds", "steps", "return", "credit error", "correlation", "R² of returns")
     rows = [
         (
             run.config.task.name,
             name,
             str(len(run.seeds)),
             f"{run.metrics()[-1]['step']:,}",
-            *(at_the_end(run, key) for key in (RETURN, ERROR, CORRELATION)),
+            *(at_the_end(run, key) for key in (RETURN, ERROR, CORRELATION, RETURN_R2)),
         )
         for name, run in zip(names, runs, strict=True)
     ]
     explained = (
         "Return: mean true return at the last evaluation. Credit error: mean |proxy reward - "
-        "true reward| over the newest steps; correlation: Pearson's, over the same."
+        "true reward| over the newest steps; correlation: Pearson's, over the same; both only where "
+        "the environment pays before the end of an episode. R² of returns: how well the last episodes' returns were predicted "
+        "before anything was fitted to them."
         + (" ±: standard deviation over seeds." if max(len(run.seeds) for run in runs) > 1 else "")
     )
-    return table(head, rows, range(2, 7)) + note(explained)
+    return table(head, rows, range(2, 8)) + note(explained)
 
 
 def learning(task: str, runs: dict[str, Run]) -> Iterable[str]:
@@ -140,6 +143,7 @@ def curves_of(task: TaskSpec) -> Iterable[tuple[str, str, str]]:
         *((f"evaluation/{name}", name, name) for name in task.measures),
         (ERROR, "mean |proxy - true reward|", "reward"),
         (CORRELATION, "correlation of proxy and true reward", "correlation"),
+        (RETURN_R2, "R² of returns, predicted before they were learned from", "R²"),
     ):
         for suffix, of_team in teams.items():
             yield key + suffix, title + of_team, unit
@@ -151,6 +155,9 @@ def details(name: str, run: Run) -> Iterable[str]:
     yield f"<h2>{escape(name)} on {escape(run.config.task.name)}</h2>"
     yield f"<p>{escape(method.summary[0].upper() + method.summary[1:])}. Source: {escape(method.source)}.</p>"
     if run.has_checkpoint():
+        if said := explanation_of(run):
+            yield "<h3>What the returns say</h3>"
+            yield from (f"<p>{escape(line)}</p>" for line in said)
         yield from agents_details(run) if env_spec(run.config.task).agents > 1 else one_agent_details(run)
     else:
         yield note("Its checkpoint is not there any more, and with it what credit and factors would be drawn from.")

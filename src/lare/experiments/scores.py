@@ -28,7 +28,7 @@ RETURN = "evaluation/return"
 SUMMED_RETURN = "evaluation/summed_return"
 """The sum over a team's agents, where there are many."""
 
-ERROR, CORRELATION = "credit/error", "credit/correlation"
+ERROR, CORRELATION, RETURN_R2 = "credit/error", "credit/correlation", "credit/return_r2"
 """How near the proxy rewards come to the true ones."""
 
 

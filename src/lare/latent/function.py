@@ -118,6 +118,12 @@ class LatentFunction:
         """How many factors `of_steps` gives."""
         return 2 * self.size if judges == "both" else self.size
 
+    def columns_by(self, judges: Judges) -> list[str]:
+        """Names of the columns that `of_steps` gives."""
+        if judges != "both":
+            return list(self.names)
+        return [f"{name} ({which})" for which in ("before", "after") for name in self.names]
+
     def __getstate__(self) -> dict[str, Any]:
         """What goes to another process: everything but the workers, which start there anew."""
         return {name: value for name, value in self.__dict__.items() if name != "evaluators"}

@@ -23,6 +23,9 @@ def decide(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     resolved = resolve(settings, env)
     if resolved.judges == task.judges:  # what the task says anyway makes no other run
         resolved = resolved.model_copy(update={"judges": None})
+    if resolved.credit.score == "auto" and task.score is not None:
+        credit = resolved.credit.model_copy(update={"score": task.score})
+        resolved = resolved.model_copy(update={"credit": credit})
     check_algorithm(resolved, task, env)
     check_method(resolved, task, env)
     check_room(resolved, task, env)

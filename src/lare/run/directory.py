@@ -40,7 +40,7 @@ VERSIONS = ("jax", "optax", "gymnasium", "mujoco", "numpy")
 """Packages that results depend on."""
 
 
-FORMAT = 2
+FORMAT = 3
 """Of config.json and of the checkpoint. What stands in them changed with every number."""
 
 

@@ -51,6 +51,9 @@ class TaskSpec(Checked):
     """What each entry of the action means."""
     max_episode_steps: Annotated[int | None, Field(ge=1)] = None
     """Time limit, for an environment that has none of its own."""
+    score: Literal["sum", "average"] | None = None
+    """Whether what an episode returns is a sum over its steps, or an average or a mark, which does not grow with them. Where the
+    task does not say, training finds out which predicts returns better."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` that are averaged and reported beside the return."""
     arguments: dict[str, Any] = Field(default_factory=dict)

@@ -320,8 +320,12 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
             true, mask = team_mean(true, acting, team)[..., None], there[..., None]
         else:
             true, mask = true[..., team.agents], there[..., None] & acting[..., team.agents]
-        r_hat = jnp.broadcast_to(proxy_rewards(recent, paid, config, place), true.shape)
-        found.append(accuracy.metrics(r_hat.ravel(), true.ravel(), mask.ravel(), config.method.in_units))
+        r_hat, last = (
+            jnp.broadcast_to(values, true.shape)
+            for values in (proxy_rewards(recent, paid, config, place), recent.last[..., None])
+        )
+        compared = (values.ravel() for values in (r_hat, true, last, mask))
+        found.append(accuracy.metrics(*compared, in_units=config.method.in_units))
         if learner.credit:
             found[-1]["credit/return_r2"] = prediction.r2(learner.credit[place].predictions)[0]
     return by_team(found, config)

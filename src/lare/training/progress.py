@@ -48,6 +48,7 @@ def summary(metrics: Metrics) -> str:
         ("evaluation/won", "won", ".2f"),
         ("credit/error", "credit error", ".3g"),
         ("credit/correlation", "correlation", ".2f"),
+        ("credit/return_r2", "R² of returns", ".2f"),
     ):
         if (value := mean(metrics, key)) is not None:
             parts.append(f"{label} {value:{form}}")

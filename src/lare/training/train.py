@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from lare.run.settings import ResolvedSettings, Settings, set_in_vain
 from lare.tasks.spec import TaskSpec, load_task
 from lare.training import session as sessions
 from lare.training.collect_host import Diverged
+from lare.training.explain import described
 from lare.training.process import enough_memory, stop_requests
 from lare.training.progress import Clock, Listener, TensorBoard, Terminal, summary_writer
 from lare.training.session import Session
@@ -143,7 +145,7 @@ def finish(
     """Run a session to its end, or until the user stops it."""
     run, settings = session.run, session.settings
     told: list[Listener] = [Terminal()] if listeners is None else list(listeners)
-    clock = Clock(session.step)
+    clock, explained = Clock(session.step), False
     try:
         if tensorboard:
             told.append(TensorBoard(run.directory / "tensorboard", session.step, run.seeds))
@@ -161,6 +163,11 @@ def finish(
                     session.save()
                     for listener in told:
                         listener.evaluated(lines)
+                    if session.step == settings.steps or not explained:
+                        sentences = explanation(session)
+                        for listener, line in product(told, sentences):
+                            listener.said(line)
+                        explained = explained or bool(sentences)
                 if stop.is_set() and session.step < settings.steps:
                     check_losses(session)
                     session.save()
@@ -172,6 +179,13 @@ def finish(
             listener.stopped()
         session.close()
     return run
+
+
+def explanation(session: Session) -> list[str]:
+    """How well returns can be told, in words; nothing before the first updates and as long as there are few episodes."""
+    if session.step < session.settings.warmup:
+        return []
+    return described(session.run, session.learner, session.config)
 
 
 def introduce(session: Session, listener: Listener, messages: Sequence[str]) -> None:

@@ -1,0 +1,122 @@
+"""The sentences that a user without dense rewards reads."""
+
+import jax
+import numpy as np
+import pytest
+
+import lare
+from lare.credit.explanation import Explanation
+from lare.latent.function import verified
+from lare.tasks.spec import read_task
+from lare.training.explain import entry_names, explanation_of, words
+from toys import toy_spec
+
+
+def found(**changes):
+    values = {
+        "episodes": 40,
+        "by_factors": 0.9,
+        "by_all": 0.97,
+        "weight": np.array([1.0, 2.0]),
+        "deviation": np.array([0.1, 0.1]),
+        "share": np.array([0.25, 0.65]),
+        "left": np.array([0.1, -0.8]),
+    }
+    return Explanation(**(values | changes))
+
+
+FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
+
+
+@pytest.mark.parametrize(
+    ("given", "form", "factors", "entries", "said"),
+    [
+        (
+            found(),
+            None,
+            FACTORS,
+            ENTRIES,
+            [
+                "The factors explain 90% of the variation of the returns of 40 episodes, raw features another 7%.",
+                "Most goes with cost (65%), speed (25%).",
+                "Returns are higher than the factors predict when entry 1 (the foot) is small (correlation -0.80): "
+                "a factor may be missing.",
+            ],
+        ),
+        (
+            found(by_factors=0.05, by_all=0.05, left=np.zeros(2)),
+            "average",
+            FACTORS,
+            ENTRIES,
+            [
+                "The score is taken for an average over the steps of an episode: longer episodes do not score more.",
+                "The factors explain 5% of the variation of the returns of 40 episodes.",
+                "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of.",
+            ],
+        ),
+        (
+            found(by_factors=0.99, by_all=0.99, share=np.array([0.99, 0.001])),
+            "sum",
+            FACTORS,
+            [],
+            [
+                "The score is taken for a sum over the steps of an episode.",
+                "The factors explain 99% of the variation of the returns of 40 episodes.",
+                "Most goes with speed (99%).",
+            ],
+        ),
+        (found(), None, [], [], ["Raw features explain 97% of the variation of the returns of 40 episodes."]),
+        (found(episodes=19), None, FACTORS, ENTRIES, []),
+        (found(by_all=np.nan), None, FACTORS, ENTRIES, []),
+    ],
+)
+def test_sentences(given, form, factors, entries, said):
+    assert words(given, form, factors, entries) == said
+
+
+def test_entries_have_the_names_that_the_tasks_text_gives_them():
+    names = entry_names(read_task("HalfCheetah-v4"), 23)
+    assert names[7] == "entry 7 of the observation (angle of the front foot (rad))"
+    assert names[17].startswith("entry 0 of the action")
+    assert len(names) == 23
+    assert entry_names(toy_spec(), 3)[0].startswith("entry 0 of the observation")
+
+
+@pytest.mark.parametrize("method", ["lare-bayes", "lare-rd", "rrdu"])
+def test_a_run_is_explained(method, small, tmp_path):
+    source = "def evaluation_func(o, a):\n    return [o[:, 0:1] * a[:, 0:1], o[:, 1:2]]\n"
+    function = verified(source, toy_spec()) if method != "rrdu" else None
+    settings = small(method=method, algorithm="td3", seeds=1, steps=600)
+    heard = []
+
+    class Ear:
+        def said(self, message):
+            heard.append(message)
+
+        def started(self, *_): ...
+        def stepped(self, *_): ...
+        def evaluated(self, *_): ...
+        def stopped(self): ...
+
+    run = lare.train(toy_spec(), settings, function=function, out=tmp_path / "run", listeners=[Ear()])
+    lines = explanation_of(run)
+    assert any("of the variation of the returns of" in line for line in lines)
+    assert heard[-len(lines) :] == lines
+    assert ("The factors explain" in " ".join(lines)) == (method != "rrdu")
+    assert "What the returns say" in lare.write_report([run.directory]).read_text()
+
+
+def test_many_agents_are_explained_by_factors_alone(small_many, tmp_path):
+    source = "def evaluation_func(o, a):\n    return [o[:, 0:1] * a[:, 0:1], o[:, 1:2]]\n"
+    task = read_task("CN-6")
+    run = lare.train(
+        task,
+        small_many(method="lare-rd", seeds=1, steps=800, capacity=2000),
+        function=verified(source, task),
+        out=tmp_path / "run",
+        listeners=[],
+    )
+    lines = explanation_of(run)
+    assert lines
+    assert "raw features" not in " ".join(lines)
+    assert jax.config.jax_enable_x64 is False
