@@ -1,0 +1,172 @@
+"""Which features a closed-form decoder should have: credit for scores that no text tells, by what its features are.
+
+    python benchmarks/basis.py RUN
+
+RUN is a finished run of HalfCheetah-v4 or Walker2d-v4 whose replay is still there. Its stored episodes are scored anew, in
+eight ways. Each basis is fitted in closed form to the returns of the first N episodes of a seed, and asked about the steps of the
+five that follow. Written down, for every basis: the mean over scores, N and seeds of the correlation with the true rewards of
+those steps and of the mean error (in their standard deviations), and the median error.
+"""
+
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from measure import write
+
+from lare.credit import evidence
+from lare.data import replay
+from lare.run.directory import open_run
+from lare.training.seeds import of_seed
+from lare.training.session import load_learner
+
+EPISODES = (8, 15, 25, 40, 60)
+ASKED = 5
+ROUNDS = 60
+SPEED = {"HalfCheetah-v4": 8, "Walker2d-v4": 8}
+"""The entry of the observation that is the speed; 1 is the pitch of the body in both."""
+
+
+def scores(after: np.ndarray, action: np.ndarray, reward: np.ndarray, speed: int) -> dict[str, np.ndarray]:
+    """Rewards of steps that add up to eight scores."""
+    v, effort = after[:, speed], (action**2).sum(axis=1)
+    return {
+        "the task's own": reward,
+        "target speed": np.exp(-((v - 2) ** 2)) - 0.02 * effort,
+        "saturating": np.tanh(v) - 0.05 * effort + 0.5 * np.cos(after[:, 1]),
+        "no more than 3 m/s": np.minimum(v, 3) - 0.1 * effort,
+        "threshold": (v > 2).astype(float),
+        "an entry no factor sees": v - 0.1 * effort + after[:, 7],
+        "its square": v - 0.1 * effort - 2 * after[:, 3] ** 2,
+        "product": v * np.cos(after[:, 1]) - 0.1 * effort,
+    }
+
+
+Shape = Callable[[Float[Array, "rows inputs"]], Float[Array, "rows features"]]
+
+
+def fourier(u: Array, frequencies: int) -> Array:
+    within = jnp.clip(u, -4, 4)
+    angles = [(k, k * jnp.pi * within / 4) for k in range(1, frequencies + 1)]
+    return jnp.concatenate([wave(angle) / k for k, angle in angles for wave in (jnp.cos, jnp.sin)], axis=1)
+
+
+def random_fourier(u: Array, count: int, width: float) -> Array:
+    draw = np.random.default_rng(0)
+    waves = [(draw.normal() * width, draw.uniform(0, 2 * np.pi)) for _ in range(count)]
+    return jnp.concatenate([jnp.cos(w * jnp.clip(u, -5, 5) + b) for w, b in waves], axis=1)
+
+
+def bumps(u: Array, count: int) -> Array:
+    centres = np.linspace(-2, 2, count)
+    return jnp.concatenate([jnp.exp(-0.5 * ((jnp.clip(u, -5, 5) - c) * (count - 1) / 4) ** 2) for c in centres], axis=1)
+
+
+def hinges(u: Array, count: int) -> Array:
+    return jnp.concatenate([jnp.maximum(jnp.clip(u, -5, 5) - c, 0) for c in np.linspace(-1.5, 1.5, count)], axis=1)
+
+
+def powers(u: Array, highest: int) -> Array:
+    return jnp.concatenate([jnp.clip(u, -3, 3) ** k for k in range(2, highest + 1)], axis=1)
+
+
+SHAPES: dict[str, Shape] = {
+    "6 random Fourier features": partial(random_fourier, count=6, width=1.0),
+    "10 random Fourier features": partial(random_fourier, count=10, width=1.0),
+    "6 random Fourier features, twice as fast": partial(random_fourier, count=6, width=2.0),
+    "Fourier series, 2 frequencies": partial(fourier, frequencies=2),
+    "Fourier series, 3 frequencies": partial(fourier, frequencies=3),
+    "Fourier series, 5 frequencies": partial(fourier, frequencies=5),
+    "powers to 4": partial(powers, highest=4),
+    "6 bumps": partial(bumps, count=6),
+    "6 hinges": partial(hinges, count=6),
+}
+
+
+def pairs(u: Array) -> Array:
+    one, other = np.triu_indices(u.shape[1], 1)
+    return jnp.clip(u, -4, 4)[:, one] * jnp.clip(u, -4, 4)[:, other]
+
+
+CHOSEN = SHAPES["Fourier series, 3 frequencies"]
+
+
+def bases(z: Array, x: Array) -> Iterator[tuple[str, list[Array]]]:
+    """Each basis by its name: the groups of features of standardised factors and entries."""
+    yield "factors", [z]
+    yield "factors, shapes", [z, CHOSEN(z)]
+    yield "factors, shapes, pairs", [z, CHOSEN(z), pairs(z)]
+    yield "factors, entries", [z, x]
+    yield "entries", [x]
+    yield "entries, shapes", [x, CHOSEN(x)]
+    yield "factors, pairs, entries", [z, pairs(z), x]
+    yield "factors, entries, shapes of both; 3 frequencies, no pairs", [z, CHOSEN(z), x, CHOSEN(x)]
+    for name, shape in SHAPES.items():
+        yield f"all: {name}", [z, shape(z), pairs(z), x, shape(x)]
+
+
+@partial(jax.jit, static_argnames="group")
+def fitted(means: Array, returns: Array, length: Array, group: tuple[int, ...]) -> tuple[Array, Array]:
+    numbers = np.array(group)
+    sums = evidence.add_episodes(evidence.no_sums(len(numbers)), means, returns, length)
+    known = evidence.unknown(len(numbers), int(numbers.max()) + 1)
+    found = evidence.fit(sums, 0, numbers, known, ROUNDS)
+    return found.weight, found.bias
+
+
+def main(directory: str) -> None:
+    run = open_run(directory)
+    learner = load_learner(run)[1]
+    found: dict[str, list[tuple[float, float]]] = {}
+    for place in range(len(run.seeds)):
+        one = of_seed(learner, place)
+        number = int(one.replay.transitions[0])
+        steps = replay.read(one.replay, replay.newest(one.replay, number))
+        after, action, z = (
+            np.asarray(part)[0, :, 0]
+            for part in (steps.after["observation"], steps.before["action"], steps.before["factors"])
+        )
+        action = np.clip(action, -1, 1)
+        ends = np.flatnonzero(np.asarray(steps.last)[0]) + 1
+        truths = scores(after, action, np.asarray(steps.before["reward"])[0, :, 0], SPEED[run.config.task.name])
+        for count in (n for n in EPISODES if n + ASKED <= len(ends)):
+            known, until = ends[count - 1], ends[count + ASKED - 1]
+            standard = []
+            for rows in (z, np.concatenate([after, action], axis=1)):
+                deviation = rows[:known].std(axis=0)
+                standard.append(
+                    jnp.asarray((rows[:until] - rows[:known].mean(axis=0)) / np.where(deviation > 0, deviation, 1))
+                )
+            begins, length = np.append(0, ends[: count - 1]), np.diff(np.append(0, ends[:count]))
+            for name, groups in bases(*standard):
+                features = np.asarray(jnp.concatenate(groups, axis=1), np.float64)
+                group = tuple(np.repeat(np.arange(len(groups)), [part.shape[1] for part in groups]).tolist())
+                means = np.add.reduceat(features[:known], begins) / length[:, None]
+                for reward in truths.values():
+                    true = reward[known:until]
+                    if true.std() == 0 or reward[:known].std() == 0:
+                        continue
+                    with jax.enable_x64(True):
+                        weight, bias = fitted(means, np.add.reduceat(reward[:known], begins), length, group)
+                    r_hat = features[known:until] @ np.asarray(weight) + float(bias)
+                    error = np.abs(r_hat - true).mean() / true.std()
+                    found.setdefault(name, []).append((np.corrcoef(r_hat, true)[0, 1], error))
+    table = {}
+    for name, each in found.items():
+        correlation, error = np.array(each).T
+        table[name] = {
+            "correlation": round(float(np.nanmean(correlation)), 3),
+            "error": round(float(error.mean()), 3),
+            "median error": round(float(np.median(error)), 3),
+            "fits": len(each),
+        }
+        print(f"{name:62s} {table[name]}")
+    write("basis", {"task": run.config.task.name, "episodes": EPISODES, "asked": ASKED, "bases": table})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
