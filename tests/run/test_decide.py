@@ -6,7 +6,7 @@ from lare.errors import LareError
 from lare.run.decide import decide
 from lare.run.settings import Settings
 from lare.tasks.spec import read_task
-from toys import pick_spec
+from toys import pick_spec, toy_spec
 
 
 def decided(settings, task):
@@ -112,3 +112,13 @@ def test_who_acts_within_bounds_cannot_choose():
         LareError, match=r"^sac acts by numbers within bounds, and Pick offers a choice: ppo can choose$"
     ):
         decide(Settings(algorithm="sac"), pick_spec())
+
+
+@pytest.mark.parametrize(
+    ("said_by_task", "set_by_user", "taken"),
+    [(None, "auto", "auto"), ("average", "auto", "average"), ("average", "sum", "sum"), ("sum", "average", "average")],
+)
+def test_the_form_of_the_score_is_the_users_else_the_tasks(said_by_task, set_by_user, taken):
+    task = toy_spec(score=said_by_task)
+    settings = Settings(method="lare-linear", algorithm="td3", credit={"score": set_by_user})
+    assert decide(settings, task).credit.score == taken

@@ -29,6 +29,7 @@ SENTENCE = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
 FIGURE = re.compile(r"^```\{.*?^```|<[^<>\n]+>", re.MULTILINE | re.DOTALL)
 NOISE = re.compile(r"^!\[|^:?-{3,}|^```|^\s*$")
+SCORE = '# score = "sum" # or "average", or a mark: it does not grow with the steps. Without it, training finds out'
 ELSEWHERE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.IGNORECASE)
 """What says nothing without a page around it."""
 
@@ -107,6 +108,7 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
         f"observation_size = {observation_size}",
         f"action_size = {action_size}",
         'judges = "after"',
+        SCORE,
         *([] if limit else ["max_episode_steps = 1000 # the environment has no limit of its own"]),
         *bodies(texts, heads),
     ]

@@ -13,6 +13,7 @@ from lare.tasks.agents import Agent, kind
 from lare.tasks.construct import construct, limit_of
 from lare.tasks.env import Team
 from lare.tasks.new import (
+    SCORE,
     Draft,
     bodies,
     bounds,
@@ -72,6 +73,7 @@ def draft_of_agents(environment_id: str) -> Draft:
         *head,
         *sizes,
         'judges = "after"',
+        SCORE,
         *([] if limit else ["max_episode_steps = 1000 # the environment tells no limit of its own"]),
         *([f"# arguments = {{ {arguments} }} # unless this says something else"] if arguments else []),
         *bodies(own, heads),
