@@ -12,8 +12,10 @@ from toys import Chase, toy_spec
 
 NAMES = (
     "CN-15, CN-30, CN-6, CompetitivePP-6, CompetitivePP-6-predator, CompetitivePP-6-prey, HalfCheetah-v4, "
-    "HalfCheetahSparse-v4, HumanoidStandup-v4, PP-15, PP-30, PP-6, Reacher-v4, SMAC-1c3s5z, SMAC-2s3z, SMAC-3s_vs_5z, "
-    "SMAX-1c3s5z, SMAX-2s3z, SMAX-3s_vs_5z, TriangleArea, Walker2d-v4"
+    "HalfCheetahFoot-v4, HalfCheetahSaturating-v4, HalfCheetahSparse-v4, HalfCheetahTarget-v4, HalfCheetahThreshold-v4, "
+    "HumanoidStandup-v4, PP-15, PP-30, PP-6, Reacher-v4, SMAC-1c3s5z, SMAC-2s3z, SMAC-3s_vs_5z, "
+    "SMAX-1c3s5z, SMAX-2s3z, SMAX-3s_vs_5z, TriangleArea, Walker2d-v4, "
+    "Walker2dFoot-v4, Walker2dSaturating-v4, Walker2dTarget-v4, Walker2dThreshold-v4"
 )
 
 

@@ -11,10 +11,11 @@ import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
 from lare.errors import LareError, shortened
-from lare.tasks import mujoco
+from lare.tasks import hidden, mujoco
 from lare.tasks.spaces import as_rows
 
 mujoco.register()
+hidden.register()
 
 
 class EnvironmentFault(LareError):

@@ -73,6 +73,11 @@ class Exhibit:
 
 SPARSE = "HalfCheetahSparse-v4"
 STARCRAFT = ("SMAX-2s3z", "SMAX-3s_vs_5z", "SMAX-1c3s5z")
+HIDDEN = tuple(
+    f"{body}{score}-v4"
+    for score in ("Target", "Threshold", "Saturating", "Foot")
+    for body in ("HalfCheetah", "Walker2d")
+)
 PARTICLES = ("CN-6", "PP-6", "CN-15", "PP-15", "CN-30", "PP-30", "TriangleArea")
 MUJOCO = ("Reacher-v4", "HalfCheetah-v4", "Walker2d-v4", "HumanoidStandup-v4")
 
@@ -81,6 +86,7 @@ EPISODIC = Contender("episodic", "episodic")
 RD, RRD, RRDU = Contender("RD", "rd"), Contender("RRD", "rrd"), Contender("RRD-unbiased", "rrdu")
 IRCR, DIASTER = Contender("IRCR", "ircr"), Contender("Diaster", "diaster")
 LARE_RD, LARE_RRDU = Contender("LaRe-RD", "lare-rd"), Contender("LaRe-RRDu", "lare-rrdu")
+BAYES, LARE_BAYES = Contender("closed form, raw features", "bayes"), Contender("LaRe, closed form", "lare-bayes")
 SHARED = Contender("LaRe without agent decomposition", "lare-rd-shared")
 VIB = Contender("bottleneck", "vib-rrdu")
 
@@ -295,6 +301,20 @@ TABLE = (
             "As the text has it: 1 for more than 500 m. The published code pays 100 for more than 50 m.",
             "500 m are 10 m in each second of an episode, which TD3 hardly reaches on true rewards. As long as no episode comes "
             "that far, every return is 0 and says nothing about any method.",
+        ),
+    ),
+    Exhibit(
+        "hidden",
+        "Scores that no text tells",
+        "not in the paper",
+        HIDDEN,
+        HIDDEN,
+        (DENSE, EPISODIC, RRDU, LARE_RRDU, BAYES, LARE_BAYES),
+        (Claim("LaRe, closed form", ("LaRe-RRDu", "RRD-unbiased"), at_least=True),),
+        differences=(
+            "Ours. The bodies are those of the usual tasks, and so are their texts and the recorded replies; what is paid for is "
+            "something else (src/lare/tasks/hidden.py). The language model cannot know this reward by heart.",
+            "The claim is ours, made before the runs.",
         ),
     ),
 )
