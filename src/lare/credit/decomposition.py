@@ -53,6 +53,9 @@ Network = StepDecoder | Bottleneck | AREL | STAS | Diaster | LinearDecoder
 
 SUM, AVERAGE = 0, 1
 """Forms that a score may have: the sum of something over the steps, or its average."""
+BETTER = 0.95
+"""Times the squared error of a sum's predictions must be that of an average's, before it is taken for one. Where all episodes are
+equally long, both are the same but for rounding."""
 
 
 class CreditSettings(Checked):
@@ -302,6 +305,16 @@ def add_episodes(state: Decomposition, episodes: Episodes, new: Bool[Array, " ep
     return state._replace(closed=state.closed._replace(summed=closed_form.kept(sums)))
 
 
+def form_found(state: Decomposition) -> Literal["sum", "average"] | None:
+    """The form that has predicted returns clearly better; None where it was not looked for, or makes no difference."""
+    if state.rivals is None:
+        return None
+    of_sum, of_average = np.asarray(squared_errors(state.rivals))
+    if of_average < BETTER * of_sum:
+        return "average"
+    return "sum" if of_sum < BETTER * of_average else None
+
+
 def fit_in_closed_form(state: Decomposition, method: Method, forms: tuple[int, ...]) -> Decomposition:
     """Fit what is fitted in closed form to all episodes that have been added, and settle the form of the score."""
     assert state.closed is not None
@@ -310,7 +323,7 @@ def fit_in_closed_form(state: Decomposition, method: Method, forms: tuple[int, .
     average = state.average
     if state.rivals is not None:
         of_sum, of_average = squared_errors(state.rivals)
-        average = of_average < of_sum
+        average = of_average < BETTER * of_sum
     decoder = state.decoder
     if not method.descends:
         decoder = closed_form.of_form(closed.decoder, average.astype(int) if len(forms) > 1 else 0)

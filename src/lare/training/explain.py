@@ -138,8 +138,7 @@ def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
     for place, found in enumerate(explanations(learner, config)):
         function = run.functions[place] if run.functions else None
         factors = [] if function is None else function.columns_by(run.judges)
-        both = len(config.forms) > 1
-        form = ("average" if bool(learner.credit[place].average[0]) else "sum") if both else None
+        form = decomposition.form_found(of_seed(learner.credit[place]))
         entries = entry_names(roles[place], basis[place].entries) if len(found.left) and not config.of_state else []
         team = f"{config.env.teams[place].name}: " if len(roles) > 1 else ""
         lines += [team + line for line in words(found, form, factors, entries)]
