@@ -11,7 +11,7 @@ from lare.credit.methods import find_method
 from lare.experiments import figures
 from lare.experiments.jobs import Job, job_of
 from lare.experiments.paper.budgets import Budget
-from lare.experiments.paper.exhibits import TRAVELLED, WON, Claim, Contender, Exhibit
+from lare.experiments.paper.exhibits import OURS, TRAVELLED, WON, Claim, Contender, Exhibit
 from lare.experiments.paper.pages import Page, items, table
 from lare.experiments.scores import CORRELATION, ERROR, RETURN, SUMMED_RETURN, Group
 from lare.experiments.statistics import (
@@ -95,13 +95,19 @@ def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
     pictures = {
         f"{exhibit.name}-{name}.svg": picture(one, exhibit, exhibit.measure(name)) for name, one in found.items()
     }
+    ours = exhibit.source == OURS
+    origin = "Not in the paper" if ours else f"The paper's {exhibit.source}"
+    claims = "What was expected" if ours else "What the paper says"
     parts = [
         f"# {exhibit.title}",
-        f"The paper's {exhibit.source}, by `{command}`.",
+        f"{origin}, by `{command}`.",
         protocol(every),
         *(part for name in jobs for part in of_one_task(exhibit, name, runs[name], found[name])),
-        "## What the paper says, and what came out",
-        table(["the paper", *found, "p", "here"], (claimed(*one, exhibit, found) for one in pairs(exhibit.claims))),
+        f"## {claims}, and what came out",
+        table(
+            ["expected" if ours else "the paper", *found, "p", "here"],
+            (claimed(*one, exhibit, found) for one in pairs(exhibit.claims)),
+        ),
         JUDGED,
         "## What differs from the paper",
         items(differences(exhibit, budget, len(runs), every)),
