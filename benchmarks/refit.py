@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from measure import write
 
-from lare.credit import accuracy, decomposition
+from lare.credit import accuracy, decomposition, descent
 from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Fit
@@ -38,7 +38,7 @@ def updates(credit: Decomposition, held: replay.Replay, key: jax.Array, fit: Fit
         features = common.features(replay.read(held, drawn.steps), config, 0)
         chosen = drawn.episodes
         episodes = Episodes(features, drawn.episode, chosen.length, chosen.mean_reward[..., 0], chosen.mask)
-        return decomposition.update(credit, episodes, key, fit, config.credit)[0], None
+        return descent.update(credit, episodes, key, fit, config.credit)[0], None
 
     drawn_steps = min(config.credit.drawn_steps, config.env.max_steps)
     return jax.lax.scan(one, credit, sample_parts(held, key, STRETCH, common.parts_count(config), drawn_steps))[0]

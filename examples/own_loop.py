@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import lare
-from lare.credit import decomposition
+from lare.credit import decomposition, descent
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import Fit, find_method
 from lare.tasks.episodic import TRUE_REWARD
@@ -47,7 +47,7 @@ def main(episodes: int = 40, updates: int = 50) -> float:
     draw = np.random.default_rng(0)
 
     credit = decomposition.init(jax.random.key(0), phi.size, METHOD, SETTINGS, steps=LONGEST, agents=1)
-    fit = jax.jit(partial(decomposition.update, fit=Fit.ALL_STEPS, settings=SETTINGS))
+    fit = jax.jit(partial(descent.update, fit=Fit.ALL_STEPS, settings=SETTINGS))
     reward = partial(decomposition.proxy_rewards, settings=SETTINGS)
     stored: list[tuple[np.ndarray, float]] = []
     for number in range(episodes):

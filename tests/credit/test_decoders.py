@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit import decomposition
+from lare.credit import decomposition, descent
 from lare.credit.arel import AREL, Block
 from lare.credit.attention import LayerNorm, attend, causal
 from lare.credit.decoders import Bottleneck, StepDecoder
@@ -111,7 +111,7 @@ def test_arels_loss_is_the_published_one_in_other_units(normalise, sum_form):
     episode = jnp.repeat(jnp.arange(EPISODES), STEPS)
     length, ones = jnp.full(EPISODES, STEPS), jnp.ones(EPISODES)
     batch = Episodes(features(), episode, length, mean_reward, ones)
-    loss = decomposition.update(state, batch, KEY, method.fit, settings)[1]["credit/loss"]
+    loss = descent.update(state, batch, KEY, method.fit, settings)[1]["credit/loss"]
     unit = float(jnp.mean(mean_reward**2)) if normalise else 1.0
     assert float(loss) * unit * (1 if sum_form else STEPS**2) == pytest.approx(float(published), rel=1e-4)
 
@@ -232,7 +232,7 @@ def test_must_learn_credit_among_agents_from_the_mean_return(method):
         seen = jnp.asarray(rows)[jnp.arange(episodes)[:, None], jnp.sort(order, axis=1)].reshape(-1, AGENTS, 2)
         episode, length = jnp.repeat(jnp.arange(episodes), drawn), jnp.full(episodes, STEPS)
         batch = Episodes(seen, episode, length, returns, jnp.ones(episodes))
-        state, measured = decomposition.update(state, batch, key, method.fit, settings)
+        state, measured = descent.update(state, batch, key, method.fit, settings)
         return state, measured["credit/loss"]
 
     keys = jax.random.split(jax.random.key(0), updates)

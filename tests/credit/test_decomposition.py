@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit import decomposition
+from lare.credit import decomposition, descent
 from lare.credit.decomposition import CreditSettings, Episodes
 from lare.credit.methods import METHODS, Fit
 from lare.errors import LareError
@@ -31,7 +31,7 @@ def train(fit, settings, scale=1.0, feature_scale=1.0, updates=600):
     )
     steps = LENGTH if fit is Fit.ALL_STEPS else 5
     rng = np.random.default_rng(1)
-    update = jax.jit(lambda state, episodes: decomposition.update(state, episodes, KEY, fit, settings))
+    update = jax.jit(lambda state, episodes: descent.update(state, episodes, KEY, fit, settings))
     losses = []
     for _ in range(updates):
         chosen = rng.choice(EPISODES, 16, replace=False)
@@ -72,7 +72,7 @@ def test_many_agents_decoder_soon_reaches_the_size_of_rare_rewards():
     episode, length, ones = jnp.repeat(jnp.arange(episodes), steps), jnp.full(episodes, steps), jnp.ones(episodes)
     state = decomposition.observe_returns(decomposition.observe_steps(state, rows), mean_reward, length, ones > 0)
     batch = Episodes(rows, episode, length, mean_reward, ones)
-    update = jax.jit(lambda state: decomposition.update(state, batch, KEY, Fit.ALL_STEPS, settings)[0])
+    update = jax.jit(lambda state: descent.update(state, batch, KEY, Fit.ALL_STEPS, settings)[0])
     for _ in range(100):
         state = update(state)
     r_hat = np.asarray(decomposition.proxy_rewards(state, rows, settings)).ravel()
@@ -94,7 +94,7 @@ def test_without_an_episode_nothing_is_learned():
     settings = CreditSettings(hidden=(8,), sum_form=True)
     state = decomposition.init(jax.random.key(0), FEATURES, METHODS["rd"], settings, LENGTH, 1)
     episodes = Episodes(jnp.ones((4, FEATURES)), jnp.zeros(4, int), jnp.ones(1, int), jnp.zeros(1), jnp.zeros(1))
-    after, metrics = decomposition.update(state, episodes, KEY, Fit.ALL_STEPS, settings)
+    after, metrics = descent.update(state, episodes, KEY, Fit.ALL_STEPS, settings)
     assert float(metrics["credit/loss"]) == 0.0
     assert jax.tree.all(jax.tree.map(jnp.array_equal, state.decoder, after.decoder))
 
@@ -115,12 +115,12 @@ def test_a_gradient_in_parts_is_that_of_the_whole(method, sum_form):
         whole = Episodes(features, episode, jnp.full(count, LENGTH), target, jnp.ones(count))
         return jax.tree.map(lambda leaf: leaf.reshape(parts, -1, *leaf.shape[1:]), whole)
 
-    one, _ = jax.jit(lambda: decomposition.update_in_parts(state, episodes(1), KEY, row.fit, settings))()
-    four, _ = jax.jit(lambda: decomposition.update_in_parts(state, episodes(4), KEY, row.fit, settings))()
+    one, _ = jax.jit(lambda: descent.update_in_parts(state, episodes(1), KEY, row.fit, settings))()
+    four, _ = jax.jit(lambda: descent.update_in_parts(state, episodes(4), KEY, row.fit, settings))()
     assert jax.tree.map(jnp.shape, one) == jax.tree.map(jnp.shape, four)
     for whole, parts in zip(jax.tree.leaves(one.optimizer), jax.tree.leaves(four.optimizer), strict=True):
         np.testing.assert_allclose(whole, parts, rtol=1e-4, atol=1e-6)
-    alone, _ = decomposition.update(state, jax.tree.map(lambda leaf: leaf[0], episodes(1)), KEY, row.fit, settings)
+    alone, _ = descent.update(state, jax.tree.map(lambda leaf: leaf[0], episodes(1)), KEY, row.fit, settings)
     for whole, parts in zip(jax.tree.leaves(one.optimizer), jax.tree.leaves(alone.optimizer), strict=True):
         np.testing.assert_allclose(whole, parts, rtol=1e-4, atol=1e-6)
 
@@ -136,7 +136,7 @@ def test_whole_episodes_and_padding():
     for rows in (9, 30):
         episodes = decomposition.whole_episodes(features, returns, rows)
         assert episodes.features.shape == (rows, FEATURES)
-        _, metrics = decomposition.update(state, episodes, KEY, Fit.ALL_STEPS, settings)
+        _, metrics = descent.update(state, episodes, KEY, Fit.ALL_STEPS, settings)
         assert float(metrics["credit/loss"]) == pytest.approx(want, rel=1e-4)
 
 

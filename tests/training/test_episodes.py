@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit import closed_form, decomposition
+from lare.credit import closed_form, decomposition, returns
 from lare.credit.decomposition import CreditSettings
 from lare.training import episodes
 from lare.training import learner as common
@@ -65,7 +65,7 @@ def from_scratch(learner, config):
 
 
 def add_all(credit, buffer, config):
-    return episodes.pieces(credit, buffer, jnp.zeros_like(buffer.oldest), decomposition.add_episodes, config)
+    return episodes.pieces(credit, buffer, jnp.zeros_like(buffer.oldest), returns.add_episodes, config)
 
 
 @pytest.mark.parametrize("env", [None, TOGETHER], ids=["one", "many"])

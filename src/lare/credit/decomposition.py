@@ -1,6 +1,8 @@
-"""Return decomposition as a pure learner: statistics in, proxy rewards out, one gradient step at a time.
+"""Return decomposition as a pure learner: what is learned about credit, statistics in, proxy rewards out.
 
     r_hat = scale * f_psi(normalise(x)),    psi <- descend loss(r_hat / scale, R / (T * scale))
+
+How psi is fitted stands in `descent.py` and, in closed form, in `returns.py`.
 
 x is what the method's encoder gives (the factors z = phi(s, a), or raw features), `scale` the running root mean square of
 R/T. Where there are many agents, every one has proxy rewards of its own, R is the mean over the agents of their returns,
@@ -16,27 +18,25 @@ but the scale of r_hat. `normalise = false` is the published form: raw features,
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Annotated, Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from pydantic import Field
 
-from lare.credit import closed_form, evidence, losses
+from lare.credit import closed_form
 from lare.credit.arel import AREL
 from lare.credit.basis import Basis
 from lare.credit.closed_form import ClosedForm, LinearDecoder
 from lare.credit.decoders import Bottleneck, Decoded, StepDecoder
 from lare.credit.diaster import Diaster
-from lare.credit.methods import Decoder, Fit, Method
-from lare.credit.prediction import Predictions, no_predictions, remember, squared_errors
+from lare.credit.methods import Decoder, Method
+from lare.credit.prediction import Predictions, no_predictions
 from lare.credit.stas import STAS
 from lare.errors import Checked, LareError
-from lare.networks import descend, start_adam
+from lare.networks import start_adam
 from lare.normalise import (
     RunningMeanStd,
     Scale,
@@ -53,9 +53,6 @@ Network = StepDecoder | Bottleneck | AREL | STAS | Diaster | LinearDecoder
 
 SUM, AVERAGE = 0, 1
 """Forms that a score may have: the sum of something over the steps, or its average."""
-BETTER = 0.95
-"""Times the squared error of a sum's predictions must be that of an average's, before it is taken for one. Where all episodes are
-equally long, both are the same but for rounding."""
 
 
 class CreditSettings(Checked):
@@ -243,105 +240,6 @@ def observe_returns(
     return state._replace(scale=scale, return_scale=observe_scale(state.return_scale, mean_reward * length, finished))
 
 
-def is_fitted(state: Decomposition) -> Bool[Array, ""]:
-    """Whether the decoder has learned anything yet."""
-    if isinstance(state.decoder, LinearDecoder):
-        assert state.closed is not None
-        return state.closed.fitted > 1  # of one episode it knows the mean reward, and no more
-    return optax.tree_utils.tree_get(state.optimizer, "count") > 0
-
-
-def predict(
-    state: Decomposition, episodes: Episodes, new: Bool[Array, " episodes"], settings: CreditSettings
-) -> Decomposition:
-    """Remember what the decoder says of episodes before it is fitted to them, and what they returned.
-
-    Those where `new` is false are passed over, and all as long as nothing has been fitted. At most `prediction.LAST` episodes.
-    """
-    returns, count = episodes.mean_reward * episodes.length, len(episodes.length)
-    long = episodes.length[jnp.clip(episodes.episode, 0, count - 1)]
-    r_hat = over_agents(proxy_rewards(state, episodes.features, settings, long), episodes.share)
-    total = jax.ops.segment_sum(r_hat, episodes.episode, count)
-    known = remember(state.predictions, returns, total[:, None], new & is_fitted(state))
-    state = state._replace(predictions=known)
-    if state.rivals is None or state.closed is None:
-        return state
-    features = mean_features(state.closed.decoder, episodes)
-    of_each = features @ state.closed.decoder.weight.T + state.closed.decoder.bias
-    of_each = of_each * jnp.stack([episodes.length, jnp.ones_like(episodes.length)], axis=1)
-    return state._replace(rivals=remember(state.rivals, returns, of_each, new & (state.closed.fitted > 1)))
-
-
-def mean_features(decoder: LinearDecoder, episodes: Episodes) -> Float[Array, "episodes features"]:
-    """The mean of a linear decoder's features over the steps of each episode, and over the agents that are there."""
-    features = decoder.features(episodes.features)
-    if features.ndim == 3:
-        share = jnp.full(features.shape[:2], 1 / features.shape[1]) if episodes.share is None else episodes.share
-        features = jnp.einsum("raf,ra->rf", features, share)
-    total = jax.ops.segment_sum(features.astype(float), episodes.episode, len(episodes.length))
-    return total / jnp.maximum(episodes.length, 1)[:, None]
-
-
-def is_stale(state: Decomposition) -> Bool[Array, ""]:
-    """Whether the sums over episodes are of features that were standardised long ago."""
-    assert state.closed is not None
-    return closed_form.is_stale(state.closed, state.statistics)
-
-
-def begin_again(state: Decomposition) -> Decomposition:
-    """Without sums over episodes, and with features that are standardised anew: all stored episodes are to be added."""
-    assert state.closed is not None
-    return state._replace(closed=closed_form.begin_again(state.closed, state.statistics))
-
-
-def add_episodes(state: Decomposition, episodes: Episodes, new: Bool[Array, " episodes"]) -> Decomposition:
-    """Add whole episodes to the sums. Those where `new` is false are passed over. In float64, where that is enabled."""
-    assert state.closed is not None
-    means = mean_features(state.closed.decoder, episodes)
-    length = jnp.where(new, episodes.length, 0)
-    sums = evidence.add_episodes(
-        closed_form.whole(state.closed.summed), means, episodes.mean_reward * episodes.length, length
-    )
-    return state._replace(closed=state.closed._replace(summed=closed_form.kept(sums)))
-
-
-def form_found(state: Decomposition) -> Literal["sum", "average"] | None:
-    """The form that has predicted returns clearly better; None where it was not looked for, or makes no difference."""
-    if state.rivals is None:
-        return None
-    of_sum, of_average = np.asarray(squared_errors(state.rivals))
-    if of_average < BETTER * of_sum:
-        return "average"
-    return "sum" if of_sum < BETTER * of_average else None
-
-
-def fit_in_closed_form(state: Decomposition, method: Method, forms: tuple[int, ...]) -> Decomposition:
-    """Fit what is fitted in closed form to all episodes that have been added, and settle the form of the score."""
-    assert state.closed is not None
-    signs = method.fit is Fit.SIGNS
-    closed = closed_form.fit_signs(state.closed) if signs else closed_form.fit(state.closed, forms)
-    average = state.average
-    if state.rivals is not None:
-        of_sum, of_average = squared_errors(state.rivals)
-        average = of_average < BETTER * of_sum
-    decoder = state.decoder
-    if not method.descends:
-        decoder = closed_form.of_form(closed.decoder, average.astype(int) if len(forms) > 1 else 0)
-    return state._replace(closed=closed, decoder=decoder, average=average)
-
-
-def deviation(
-    state: Decomposition, rows: Float[Array, "rows features"], forms: tuple[int, ...]
-) -> Float[Array, " rows"]:
-    """The posterior deviation of r_hat (of T r_hat, where the score is an average). Of `Fit.EVIDENCE`, in float64."""
-    assert state.closed is not None
-    assert isinstance(state.decoder, LinearDecoder)
-    place = int(state.average) if len(forms) > 1 else 0
-    known = jax.tree.map(lambda leaf: leaf[place].astype(float), state.closed.posterior)
-    sums, features = closed_form.whole(state.closed.summed), state.decoder.features(rows)
-    return evidence.deviation(sums, forms[place], state.decoder.basis.group, known, features)
-
-
 def normalised(state: Decomposition, settings: CreditSettings) -> bool:
     """Whether the decoder works in units of its own. One that was fitted in closed form has no need to."""
     return settings.normalise and not isinstance(state.decoder, LinearDecoder)
@@ -393,22 +291,6 @@ def proxy_rewards(
     return r_hat / parts.reshape(-1, *[1] * (r_hat.ndim - 1))
 
 
-def loss_and_gradient(
-    state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
-) -> tuple[Float[Array, ""], Network]:
-    """The loss that `fit` names, and its gradient by the decoder's weights."""
-    loss = loss_of_pieces if fit is Fit.SUBTRAJECTORIES else partial(loss_of_means, fit=fit)
-    return jax.value_and_grad(loss)(state.decoder, state, episodes, key, settings=settings)
-
-
-def targets(
-    state: Decomposition, episodes: Episodes, settings: CreditSettings
-) -> tuple[Float[Array, " episodes"], Float[Array, " episodes"]]:
-    """R/T, or R where it is an average, in units of their size; and the weight of each episode."""
-    target = episodes.mean_reward * jnp.where(state.average, episodes.length, 1) / unit(state, settings)
-    return target, losses.episode_weight(episodes.length, episodes.mask, settings.sum_form)
-
-
 def over_agents(
     values: Float[Array, "rows *agents"], share: Float[Array, "rows *agents"] | None
 ) -> Float[Array, " rows"]:
@@ -416,70 +298,3 @@ def over_agents(
     if share is None:
         return jnp.mean(values.reshape(len(values), -1), axis=1)
     return jnp.sum((values * share).reshape(len(values), -1), axis=1)
-
-
-def loss_of_means(
-    decoder: Network, state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
-) -> Float[Array, ""]:
-    """RD, RRD and RRD-unbiased: mean r_hat of an episode's steps against R/T; and what the decoder adds of its own."""
-    target, weight = targets(state, episodes, settings)
-    decoded = decode(decoder, state, episodes.features, settings, key)
-    r_hat, penalty = (over_agents(values, episodes.share) for values in decoded)
-    steps = episodes.length if fit is Fit.ALL_STEPS else jnp.minimum(episodes.length, len(r_hat) // len(target))
-    mean = losses.episode_means(r_hat, episodes.episode, steps)
-    if fit is Fit.DRAWN_STEPS_UNBIASED:
-        variance = losses.subsampling_variance(r_hat.reshape(len(target), -1), episodes.length)
-        loss = losses.unbiased_squared_error(mean, target, weight, variance)
-    else:
-        loss = losses.squared_error(mean, target, weight)
-    belongs = (episodes.episode >= 0) & (episodes.episode < len(target))
-    penalty = jnp.sum(jnp.where(belongs, penalty, 0)) / jnp.maximum(jnp.sum(belongs), 1)
-    return loss + penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
-
-
-def loss_of_pieces(
-    decoder: Network, state: Decomposition, episodes: Episodes, key: PRNGKeyArray, settings: CreditSettings
-) -> Float[Array, ""]:
-    """Diaster."""
-    assert isinstance(decoder, Diaster)
-    target, _ = targets(state, episodes, settings)
-    whole = episodes.features.reshape(len(target), -1, episodes.features.shape[-1])
-    return decoder.loss(inputs(state, whole, settings), episodes.length, target, episodes.mask, key)
-
-
-def update(
-    state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
-) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """One step of gradient descent on a batch of episodes; returns the new state, and `credit/loss`.
-
-    The loss is in squared units of `scale`, or of the reward where `normalise` is off.
-    """
-    return step(state, *loss_and_gradient(state, episodes, key, fit, settings), settings)
-
-
-def update_in_parts(
-    state: Decomposition, parts: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
-) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """One step by the mean of the gradients of several parts: equally many episodes each, all of which count.
-
-    `parts` has a leading axis. The gradient is that of all the episodes together, but no intermediate is larger than a
-    part of them, so that all stay in the processor's cache.
-    """
-    keys = jax.random.split(key, len(parts.length))
-
-    def add(total: tuple[Array, Network], part: tuple[Episodes, PRNGKeyArray]):
-        return jax.tree.map(jnp.add, total, loss_and_gradient(state, *part, fit, settings)), None
-
-    none = jnp.zeros(()), jax.tree.map(jnp.zeros_like, state.decoder)
-    total, _ = jax.lax.scan(add, none, (parts, keys))
-    loss, gradient = jax.tree.map(lambda one: one / len(keys), total)
-    return step(state, loss, gradient, settings)
-
-
-def step(
-    state: Decomposition, loss: Float[Array, ""], gradient: Network, settings: CreditSettings
-) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """Adam by a gradient, with the decay of the weights added to it."""
-    gradient = jax.tree.map(lambda slope, weight: slope + settings.weight_decay * weight, gradient, state.decoder)
-    decoder, optimizer = descend(state.decoder, gradient, state.optimizer, settings.learning_rate)
-    return state._replace(decoder=decoder, optimizer=optimizer), {"credit/loss": loss}

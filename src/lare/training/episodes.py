@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from lare.credit import closed_form, decomposition, prediction
+from lare.credit import closed_form, prediction, returns
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Fit
 from lare.data import replay
@@ -58,7 +58,7 @@ def learn_those_due(
     if learned[0].closed is None:
         return learned
     if config.method.fit is not Fit.SIGNS:  # which takes the factors as they are
-        again = due & jax.vmap(decomposition.is_stale)(learned[0])
+        again = due & jax.vmap(returns.is_stale)(learned[0])
         everything = jax.vmap(partial(sum_again, config=config))
         learned = jax.lax.cond(jnp.any(again), everything, lambda same, *_: same, learned, buffer, again)
     return tuple(fit_those_due(one, due, config) for one in learned)
@@ -90,17 +90,17 @@ def tell(credit: Credit, buffer: Replay, since: Int[Array, " envs"], config: Tra
     """One seed: predict the returns of new episodes, and add them to the sums."""
 
     def take(one: Decomposition, episodes: Episodes, there: Bool[Array, " episodes"]) -> Decomposition:
-        one = decomposition.predict(one, episodes, there, config.credit)
-        return one if one.closed is None else decomposition.add_episodes(one, episodes, there)
+        one = returns.predict(one, episodes, there, config.credit)
+        return one if one.closed is None else returns.add_episodes(one, episodes, there)
 
     return pieces(credit, buffer, since, take, config)
 
 
 def sum_again(credit: Credit, buffer: Replay, again: Bool[Array, ""], config: TrainConfig) -> Credit:
     """One seed: where `again` is true, sums over all stored episodes, of features that are standardised anew."""
-    empty = tuple(decomposition.begin_again(one) for one in credit)
+    empty = tuple(returns.begin_again(one) for one in credit)
     since = jnp.where(again, buffer.oldest, buffer.episodes)
-    summed = pieces(empty, buffer, since, decomposition.add_episodes, config)
+    summed = pieces(empty, buffer, since, returns.add_episodes, config)
     return jax.tree.map(lambda new, old: jnp.where(again, new, old), summed, credit)
 
 
@@ -110,7 +110,7 @@ def fit_those_due(credit: Decomposition, due: Bool[Array, " seeds"], config: Tra
     def one(of_seed: tuple[Decomposition, Bool[Array, ""]]) -> Decomposition:
         credit, due = of_seed
         assert credit.closed is not None
-        fit = partial(decomposition.fit_in_closed_form, method=config.method, forms=config.forms)
+        fit = partial(returns.fit_in_closed_form, method=config.method, forms=config.forms)
         return jax.lax.cond(due & closed_form.is_due(credit.closed), fit, lambda same: same, credit)
 
     return jax.lax.map(one, (credit, due))

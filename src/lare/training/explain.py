@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from lare.credit import closed_form, decomposition
+from lare.credit import closed_form, decomposition, returns
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.explanation import Explanation, explain
 from lare.credit.methods import METHODS, Decoder
@@ -138,7 +138,7 @@ def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
     for place, found in enumerate(explanations(learner, config)):
         function = run.functions[place] if run.functions else None
         factors = [] if function is None else function.columns_by(run.judges)
-        form = decomposition.form_found(of_seed(learner.credit[place]))
+        form = returns.form_found(of_seed(learner.credit[place]))
         entries = entry_names(roles[place], basis[place].entries) if len(found.left) and not config.of_state else []
         team = f"{config.env.teams[place].name}: " if len(roles) > 1 else ""
         lines += [team + line for line in words(found, form, factors, entries)]

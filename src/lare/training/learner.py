@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lare.credit import accuracy, decomposition, prediction
+from lare.credit import accuracy, decomposition, descent, prediction
 from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Encoder, Fit, Reward
@@ -244,11 +244,11 @@ def update_decoder(
         fitting = max(1, PART * count // rows)
         parts = min(parts for parts in range(1, count + 1) if count % parts == 0 and count // parts <= fitting)
     if parts == 1:
-        return decomposition.update(credit, batch, key, config.method.fit, config.credit)
+        return descent.update(credit, batch, key, config.method.fit, config.credit)
     # Every part counts its episodes from 0.
     batch = batch._replace(episode=batch.episode % (count // parts))
     batch = jax.tree.map(lambda whole: whole.reshape(parts, -1, *whole.shape[1:]), batch)
-    return decomposition.update_in_parts(credit, batch, key, config.method.fit, config.credit)
+    return descent.update_in_parts(credit, batch, key, config.method.fit, config.credit)
 
 
 def fit_often(

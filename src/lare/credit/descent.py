@@ -1,0 +1,105 @@
+"""Decoders that descend a gradient: the loss that a method's fit names, and one step of Adam by it."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare.credit import losses
+from lare.credit.decomposition import (
+    CreditSettings,
+    Decomposition,
+    Episodes,
+    Network,
+    decode,
+    inputs,
+    over_agents,
+    unit,
+)
+from lare.credit.diaster import Diaster
+from lare.credit.methods import Fit
+from lare.networks import descend
+
+
+def loss_and_gradient(
+    state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+) -> tuple[Float[Array, ""], Network]:
+    """The loss that `fit` names, and its gradient by the decoder's weights."""
+    loss = loss_of_pieces if fit is Fit.SUBTRAJECTORIES else partial(loss_of_means, fit=fit)
+    return jax.value_and_grad(loss)(state.decoder, state, episodes, key, settings=settings)
+
+
+def targets(
+    state: Decomposition, episodes: Episodes, settings: CreditSettings
+) -> tuple[Float[Array, " episodes"], Float[Array, " episodes"]]:
+    """R/T, or R where it is an average, in units of their size; and the weight of each episode."""
+    target = episodes.mean_reward * jnp.where(state.average, episodes.length, 1) / unit(state, settings)
+    return target, losses.episode_weight(episodes.length, episodes.mask, settings.sum_form)
+
+
+def loss_of_means(
+    decoder: Network, state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+) -> Float[Array, ""]:
+    """RD, RRD and RRD-unbiased: mean r_hat of an episode's steps against R/T; and what the decoder adds of its own."""
+    target, weight = targets(state, episodes, settings)
+    decoded = decode(decoder, state, episodes.features, settings, key)
+    r_hat, penalty = (over_agents(values, episodes.share) for values in decoded)
+    steps = episodes.length if fit is Fit.ALL_STEPS else jnp.minimum(episodes.length, len(r_hat) // len(target))
+    mean = losses.episode_means(r_hat, episodes.episode, steps)
+    if fit is Fit.DRAWN_STEPS_UNBIASED:
+        variance = losses.subsampling_variance(r_hat.reshape(len(target), -1), episodes.length)
+        loss = losses.unbiased_squared_error(mean, target, weight, variance)
+    else:
+        loss = losses.squared_error(mean, target, weight)
+    belongs = (episodes.episode >= 0) & (episodes.episode < len(target))
+    penalty = jnp.sum(jnp.where(belongs, penalty, 0)) / jnp.maximum(jnp.sum(belongs), 1)
+    return loss + penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
+
+
+def loss_of_pieces(
+    decoder: Network, state: Decomposition, episodes: Episodes, key: PRNGKeyArray, settings: CreditSettings
+) -> Float[Array, ""]:
+    """Diaster."""
+    assert isinstance(decoder, Diaster)
+    target, _ = targets(state, episodes, settings)
+    whole = episodes.features.reshape(len(target), -1, episodes.features.shape[-1])
+    return decoder.loss(inputs(state, whole, settings), episodes.length, target, episodes.mask, key)
+
+
+def update(
+    state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    """One step of gradient descent on a batch of episodes; returns the new state, and `credit/loss`.
+
+    The loss is in squared units of `scale`, or of the reward where `normalise` is off.
+    """
+    return step(state, *loss_and_gradient(state, episodes, key, fit, settings), settings)
+
+
+def update_in_parts(
+    state: Decomposition, parts: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    """One step by the mean of the gradients of several parts: equally many episodes each, all of which count.
+
+    `parts` has a leading axis. The gradient is that of all the episodes together, but no intermediate is larger than a
+    part of them, so that all stay in the processor's cache.
+    """
+    keys = jax.random.split(key, len(parts.length))
+
+    def add(total: tuple[Array, Network], part: tuple[Episodes, PRNGKeyArray]):
+        return jax.tree.map(jnp.add, total, loss_and_gradient(state, *part, fit, settings)), None
+
+    none = jnp.zeros(()), jax.tree.map(jnp.zeros_like, state.decoder)
+    total, _ = jax.lax.scan(add, none, (parts, keys))
+    loss, gradient = jax.tree.map(lambda one: one / len(keys), total)
+    return step(state, loss, gradient, settings)
+
+
+def step(
+    state: Decomposition, loss: Float[Array, ""], gradient: Network, settings: CreditSettings
+) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    """Adam by a gradient, with the decay of the weights added to it."""
+    gradient = jax.tree.map(lambda slope, weight: slope + settings.weight_decay * weight, gradient, state.decoder)
+    decoder, optimizer = descend(state.decoder, gradient, state.optimizer, settings.learning_rate)
+    return state._replace(decoder=decoder, optimizer=optimizer), {"credit/loss": loss}

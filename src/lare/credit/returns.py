@@ -1,0 +1,121 @@
+"""What whole episodes teach: their returns are predicted, then added to sums, then fitted to in closed form.
+
+Every decoder predicts. Sums are for a fit in closed form: of the decoder itself, or one that finds out the form of the score.
+"""
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float
+
+from lare.credit import closed_form, evidence
+from lare.credit.closed_form import LinearDecoder
+from lare.credit.decomposition import CreditSettings, Decomposition, Episodes, over_agents, proxy_rewards
+from lare.credit.methods import Fit, Method
+from lare.credit.prediction import remember, squared_errors
+
+BETTER = 0.95
+"""Times the squared error of a sum's predictions must be that of an average's, before it is taken for one. Where all episodes are
+equally long, both are the same but for rounding."""
+
+
+def is_fitted(state: Decomposition) -> Bool[Array, ""]:
+    """Whether the decoder has learned anything yet."""
+    if isinstance(state.decoder, LinearDecoder):
+        assert state.closed is not None
+        return state.closed.fitted > 1  # of one episode it knows the mean reward, and no more
+    return optax.tree_utils.tree_get(state.optimizer, "count") > 0
+
+
+def predict(
+    state: Decomposition, episodes: Episodes, new: Bool[Array, " episodes"], settings: CreditSettings
+) -> Decomposition:
+    """Remember what the decoder says of episodes before it is fitted to them, and what they returned.
+
+    Those where `new` is false are passed over, and all as long as nothing has been fitted. At most `prediction.LAST` episodes.
+    """
+    returns, count = episodes.mean_reward * episodes.length, len(episodes.length)
+    long = episodes.length[jnp.clip(episodes.episode, 0, count - 1)]
+    r_hat = over_agents(proxy_rewards(state, episodes.features, settings, long), episodes.share)
+    total = jax.ops.segment_sum(r_hat, episodes.episode, count)
+    known = remember(state.predictions, returns, total[:, None], new & is_fitted(state))
+    state = state._replace(predictions=known)
+    if state.rivals is None or state.closed is None:
+        return state
+    features = mean_features(state.closed.decoder, episodes)
+    of_each = features @ state.closed.decoder.weight.T + state.closed.decoder.bias
+    of_each = of_each * jnp.stack([episodes.length, jnp.ones_like(episodes.length)], axis=1)
+    return state._replace(rivals=remember(state.rivals, returns, of_each, new & (state.closed.fitted > 1)))
+
+
+def mean_features(decoder: LinearDecoder, episodes: Episodes) -> Float[Array, "episodes features"]:
+    """The mean of a linear decoder's features over the steps of each episode, and over the agents that are there."""
+    features = decoder.features(episodes.features)
+    if features.ndim == 3:
+        share = jnp.full(features.shape[:2], 1 / features.shape[1]) if episodes.share is None else episodes.share
+        features = jnp.einsum("raf,ra->rf", features, share)
+    total = jax.ops.segment_sum(features.astype(float), episodes.episode, len(episodes.length))
+    return total / jnp.maximum(episodes.length, 1)[:, None]
+
+
+def is_stale(state: Decomposition) -> Bool[Array, ""]:
+    """Whether the sums over episodes are of features that were standardised long ago."""
+    assert state.closed is not None
+    return closed_form.is_stale(state.closed, state.statistics)
+
+
+def begin_again(state: Decomposition) -> Decomposition:
+    """Without sums over episodes, and with features that are standardised anew: all stored episodes are to be added."""
+    assert state.closed is not None
+    return state._replace(closed=closed_form.begin_again(state.closed, state.statistics))
+
+
+def add_episodes(state: Decomposition, episodes: Episodes, new: Bool[Array, " episodes"]) -> Decomposition:
+    """Add whole episodes to the sums. Those where `new` is false are passed over. In float64, where that is enabled."""
+    assert state.closed is not None
+    means = mean_features(state.closed.decoder, episodes)
+    length = jnp.where(new, episodes.length, 0)
+    sums = evidence.add_episodes(
+        closed_form.whole(state.closed.summed), means, episodes.mean_reward * episodes.length, length
+    )
+    return state._replace(closed=state.closed._replace(summed=closed_form.kept(sums)))
+
+
+def form_found(state: Decomposition) -> Literal["sum", "average"] | None:
+    """The form that has predicted returns clearly better; None where it was not looked for, or makes no difference."""
+    if state.rivals is None:
+        return None
+    of_sum, of_average = np.asarray(squared_errors(state.rivals))
+    if of_average < BETTER * of_sum:
+        return "average"
+    return "sum" if of_sum < BETTER * of_average else None
+
+
+def fit_in_closed_form(state: Decomposition, method: Method, forms: tuple[int, ...]) -> Decomposition:
+    """Fit what is fitted in closed form to all episodes that have been added, and settle the form of the score."""
+    assert state.closed is not None
+    signs = method.fit is Fit.SIGNS
+    closed = closed_form.fit_signs(state.closed) if signs else closed_form.fit(state.closed, forms)
+    average = state.average
+    if state.rivals is not None:
+        of_sum, of_average = squared_errors(state.rivals)
+        average = of_average < BETTER * of_sum
+    decoder = state.decoder
+    if not method.descends:
+        decoder = closed_form.of_form(closed.decoder, average.astype(int) if len(forms) > 1 else 0)
+    return state._replace(closed=closed, decoder=decoder, average=average)
+
+
+def deviation(
+    state: Decomposition, rows: Float[Array, "rows features"], forms: tuple[int, ...]
+) -> Float[Array, " rows"]:
+    """The posterior deviation of r_hat (of T r_hat, where the score is an average). Of `Fit.EVIDENCE`, in float64."""
+    assert state.closed is not None
+    assert isinstance(state.decoder, LinearDecoder)
+    place = int(state.average) if len(forms) > 1 else 0
+    known = jax.tree.map(lambda leaf: leaf[place].astype(float), state.closed.posterior)
+    sums, features = closed_form.whole(state.closed.summed), state.decoder.features(rows)
+    return evidence.deviation(sums, forms[place], state.decoder.basis.group, known, features)
