@@ -64,13 +64,24 @@ def test_episodes_of_a_policy():
 
 
 def test_the_fit_is_of_unseen_episodes():
-    random = np.random.default_rng(0)
+    random, alike = np.random.default_rng(0), np.ones(40)
     means = random.normal(size=(40, 3))
-    assert held_out_fit(means, means @ [1.0, -2.0, 0.0] + 5) > 0.99
+    assert held_out_fit(means, means @ [1.0, -2.0, 0.0] + 5, alike) > 0.99
     # Thirty useless factors would explain forty seen episodes well.
-    assert held_out_fit(random.normal(size=(40, 30)), random.normal(size=40)) < 0.2
-    assert held_out_fit(np.zeros((40, 1)), np.arange(40.0)) == pytest.approx(-0.04, abs=0.2)
-    assert held_out_fit(means, np.zeros(40)) == pytest.approx(1)
+    assert held_out_fit(random.normal(size=(40, 30)), random.normal(size=40), alike) < 0.2
+    assert held_out_fit(np.zeros((40, 1)), np.arange(40.0), alike) == pytest.approx(-0.04, abs=0.2)
+    assert held_out_fit(means, np.zeros(40), alike) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("score", ["sum", "average"])
+def test_the_fit_is_of_the_score_whether_it_is_a_sum_or_an_average(score):
+    """Of episodes of 30 to 90 steps; a factor that knows only the length does not pass for one that knows the score."""
+    random = np.random.default_rng(0)
+    means, length = random.normal(size=(60, 2)), random.uniform(30, 90, size=60)
+    mark = means @ [5.0, -3.0] + 60
+    returns = mark if score == "average" else mark * length
+    assert held_out_fit(means, returns, length) > 0.98
+    assert score == "sum" or held_out_fit(1 / length[:, None], returns, length) < 0.2
 
 
 def test_the_evidence_names_what_each_factor_did(episodes):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-LAST = 64
+LAST = 32
 """Episodes that are looked back on."""
 FEWEST = 8
 """Below so many, nothing is said."""

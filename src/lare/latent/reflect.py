@@ -1,7 +1,8 @@
 """Beyond the paper: how a function's factors go with the return, told to the model; and which function predicts it best.
 
-The judge is the plainest decoder there is: a linear map from an episode's mean factors to its R/T, fitted by ridge
-regression and asked about the episodes that it has not seen.
+The judge is the plainest decoder there is: a linear map from an episode's mean factors to its R/T (for a score that is a sum over
+the steps) or to its R (for an average), whichever does better. It is fitted by ridge regression, and asked about the episodes that
+it has not seen.
 """
 
 from dataclasses import dataclass
@@ -28,8 +29,24 @@ def episode_factors(
     return function.of_steps(before, action, after, task.judges)
 
 
-def held_out_fit(means: Float[np.ndarray, "episodes factors"], targets: Float[np.ndarray, " episodes"]) -> float:
-    """R^2 of R/T as a linear map of mean factors predicts it for episodes that it was not fitted on; 1 is perfect."""
+def held_out_fit(
+    means: Float[np.ndarray, "episodes factors"],
+    returns: Float[np.ndarray, " episodes"],
+    length: Float[np.ndarray, " episodes"],
+) -> float:
+    """R^2 of R, as a linear map of mean factors predicts it for episodes that it was not fitted on; 1 is perfect.
+
+    R^2 of R/T would be fooled where episodes differ in length: a factor that knows only the length predicts 1/T.
+    """
+    spread = max(float(np.sum((returns - returns.mean()) ** 2)), 1e-12)
+    forms = length * held_out(means, returns / length), held_out(means, returns)
+    return max(float(1 - np.sum((returns - predicted) ** 2) / spread) for predicted in forms)
+
+
+def held_out(
+    means: Float[np.ndarray, "episodes factors"], targets: Float[np.ndarray, " episodes"]
+) -> Float[np.ndarray, " episodes"]:
+    """Targets as a linear map of mean factors predicts them for episodes that it was not fitted on."""
     folds = np.arange(len(targets)) % min(FOLDS, len(targets))
     predicted = np.zeros_like(targets)
     for fold in range(int(folds.max()) + 1):
@@ -38,8 +55,7 @@ def held_out_fit(means: Float[np.ndarray, "episodes factors"], targets: Float[np
         x, offset = (means[known] - centre) / scale, targets[known].mean()
         weights = np.linalg.solve(x.T @ x + RIDGE * np.eye(x.shape[1]), x.T @ (targets[known] - offset))
         predicted[asked] = (means[asked] - centre) / scale @ weights + offset
-    spread = np.sum((targets - targets.mean()) ** 2)
-    return float(1 - np.sum((targets - predicted) ** 2) / max(spread, 1e-12))
+    return predicted
 
 
 @dataclass(frozen=True)
@@ -60,8 +76,10 @@ def gather(function: LatentFunction, task: TaskSpec, episodes: list[Episode]) ->
     """
     factors = [episode_factors(function, task, episode) for episode in episodes]
     means = np.stack([rows.mean(axis=0) for rows in factors]).astype(np.float64)
-    targets = np.asarray([episode.total / len(episode.action) for episode in episodes])
-    return Evidence(held_out_fit(means, targets), described(function, np.concatenate(factors), means, targets))
+    returns = np.asarray([episode.total for episode in episodes], np.float64)
+    length = np.asarray([len(episode.action) for episode in episodes], np.float64)
+    said = described(function, np.concatenate(factors), means, returns / length)
+    return Evidence(held_out_fit(means, returns, length), said)
 
 
 def described(function: LatentFunction, factors: Any, means: Any, targets: Any) -> str:
