@@ -352,7 +352,7 @@ def test_a_run_of_other_figures_of_another_algorithm_is_the_same_run(file, in_th
 def test_a_run_of_other_figures_of_another_method_is_the_same_run(file, in_this_process):
     wanted, jobs = read_sweep(file)
     run_sweep(wanted, jobs[:1], lambda _: None)
-    file.write_text(FILE + "credit = { ridge = 2.0 }\n")
+    file.write_text(FILE + 'credit = { score = "average" }\n')
     assert [job.done for job in read_sweep(file)[1]] == [True, False, False]
 
 

@@ -35,7 +35,8 @@ def judging(config: TrainConfig) -> TrainConfig:
     shown = "state" if config.of_state else "observation"
     raw = {shown, "action"} <= set(config.columns)
     if not config.method.latent:
-        return replace(config, method=METHODS["bayes"])
+        method = METHODS["bayes"]
+        return replace(config, method=method if raw else replace(method, encoder=config.method.encoder))
     method = METHODS["lare-bayes"] if raw else replace(METHODS["lare-linear"], decoder=Decoder.ADDITIVE)
     return replace(config, method=method)
 
