@@ -55,6 +55,8 @@ class Exhibit:
     """Those that a laptop tries."""
     contenders: tuple[Contender, ...]
     claims: tuple[Claim, ...]
+    steps: int | None = None
+    """Environment steps of every run, but for a quick look; the budget's, unless given."""
     key: str = RETURN
     """What is shown of a run, of the keys of metrics.jsonl."""
     printed: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -312,6 +314,7 @@ TABLE = (
         HIDDEN,
         (DENSE, EPISODIC, RRDU, LARE_RRDU, BAYES, LARE_BAYES),
         (Claim("LaRe, closed form", ("LaRe-RRDu", "RRD-unbiased"), at_least=True),),
+        steps=60_000,
         differences=(
             "Ours. The bodies are those of the usual tasks, and so are their texts and the recorded replies; what is paid for is "
             "something else (src/lare/tasks/hidden.py). The language model cannot know this reward by heart.",

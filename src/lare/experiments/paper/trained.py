@@ -64,9 +64,16 @@ def tasks_of(exhibit: Exhibit, budget: Budget) -> tuple[str, ...]:
 def jobs_of(exhibit: Exhibit, budget: Budget, root: Path) -> Jobs:
     """Every run that an exhibit needs. Exhibits that need the same one share it."""
     return {
-        name: {one.label: list(jobs_of_contender(one, budget, name, root)) for one in exhibit.contenders}
+        name: {
+            one.label: list(jobs_of_contender(one, with_steps(budget, exhibit), name, root))
+            for one in exhibit.contenders
+        }
         for name in tasks_of(exhibit, budget)
     }
+
+
+def with_steps(budget: Budget, exhibit: Exhibit) -> Budget:
+    return budget if exhibit.steps is None or budget.name == "smoke" else replace(budget, steps=exhibit.steps)
 
 
 def jobs_of_contender(one: Contender, budget: Budget, name: str, root: Path) -> Iterator[Job]:
