@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from lare.tasks.episodic import EpisodicReward as EpisodicReward
     from lare.tasks.spec import TaskSpec as TaskSpec
     from lare.tasks.spec import load_task as load_task
+    from lare.training.reflect import reflect as reflect
     from lare.training.train import resume as resume
     from lare.training.train import train as train
 
@@ -41,6 +42,7 @@ HOMES = {
     "Run": "lare.run.directory",
     "open_run": "lare.run.directory",
     "Settings": "lare.run.settings",
+    "reflect": "lare.training.reflect",
     "resume": "lare.training.train",
     "train": "lare.training.train",
 }

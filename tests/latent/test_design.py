@@ -324,8 +324,3 @@ def test_half_a_character_goes_back_as_an_error(chase, tmp_path):
 def test_too_few_candidates_or_too_many(chase, n):
     with pytest.raises(LareError, match=f"candidates = {n}: from 1 to 100"):
         design(chase, candidates=n)
-
-
-def test_fewer_rounds_than_none(chase):
-    with pytest.raises(LareError, match="reflect = -1"):
-        design(chase, reflect=-1)

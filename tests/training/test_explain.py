@@ -25,6 +25,7 @@ def found(**changes):
     return Explanation(**(values | changes))
 
 
+SHARES = "What goes with each factor: its share of the variation, and what a step pays more for one standard deviation of it:"
 FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
 
 
@@ -38,7 +39,9 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             ENTRIES,
             [
                 "The factors explain 90% of the variation of the returns of 40 episodes, raw features another 7%.",
-                "Most goes with cost (65%), speed (25%).",
+                SHARES,
+                "- cost: 65%, +2 ± 0.1",
+                "- speed: 25%, +1 ± 0.1",
                 "Returns are higher than the factors predict when entry 1 (the foot) is small (correlation -0.80): "
                 "a factor may be missing.",
             ],
@@ -62,7 +65,9 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             [
                 "The score is taken for a sum over the steps of an episode.",
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
-                "Most goes with speed (99%).",
+                SHARES,
+                "- speed: 99%, +1 ± 0.1",
+                "- cost: 0%, +2 ± 0.1",
             ],
         ),
         (found(), None, [], [], ["Raw features explain 97% of the variation of the returns of 40 episodes."]),

@@ -50,7 +50,7 @@ def design(
         draw: which of the shipped recordings answers (0 to 4).
         candidates: first attempts that are combined; with 1, the attempt itself is the function (the paper's ablation
             without self-prompting).
-        reflect: further rounds, in which the model sees how its factors go with the return, and may improve them.
+        reflect: further rounds, in which the model sees what returns of whole episodes say of its factors, and may mend them.
         policy: a run whose policy plays the episodes for --reflect; random actions do, unless given.
         pre_verification: without it (the paper's ablation), the first reply is tried once, in its jail, and kept as it is.
         budget: tokens, in and out together: no request is begun that might pass them.
@@ -70,8 +70,11 @@ def design(
     check_design(live, base_url, draw, budget, requests, price, temperature)
     if policy is not None and not reflect:
         raise LareError("--policy plays episodes for --reflect: say how many rounds")
+    if reflect < 0:
+        raise LareError(f"reflect = {reflect}: there can be no fewer rounds than none")
     check_files(out, record)
     spec, cost = load_task(task), Budget(requests, budget)
+    plays = policy_that_plays(policy, spec)
     if live:
         asked = LiveModel(str(model), base_url, temperature, cost, said=progress)
     else:
@@ -82,12 +85,14 @@ def design(
             kind,
             asked,
             candidates=candidates,
-            reflect=reflect,
             pre_verification=pre_verification,
-            policy=policy_that_plays(policy, spec),
             record=record,
             said=progress,
         )
+        if reflect:
+            from lare.training.reflect import reflect as reflect_on
+
+            function = reflect_on(function, spec, asked, reflect, policy=plays, record=record, said=progress)
     except DesignFailed as error:
         progress(f"lare: {error}")
         keep_attempts(error, free_name(Path(f"{spec.name}.attempts.json")))

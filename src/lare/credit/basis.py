@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 FREQUENCIES = 3
 HALF_PERIOD = 4.0
@@ -71,6 +71,11 @@ class Basis:
     def group(self) -> Int[np.ndarray, " features"]:
         """The number of each feature's group."""
         return np.repeat(np.arange(len(self.sizes)), list(self.sizes.values()))
+
+    @property
+    def of_factors(self) -> Bool[np.ndarray, " features"]:
+        """Which features are made of factors alone."""
+        return np.repeat(["factors" in name for name in self.sizes], list(self.sizes.values()))
 
 
 def shapes(u: Float[Array, "*batch inputs"], frequencies: int) -> Float[Array, "*batch features"]:

@@ -46,10 +46,8 @@ class Explanation(NamedTuple):
 
 def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation:
     """The explanation by sums over features of a basis. In float64."""
-    group, size = basis.group, basis.size
-    names = list(basis.sizes)
-    of_factors = np.isin(group, [names.index(name) for name in names if "factors" in name])
-    whole = evidence.fit(sums, form, group, evidence.unknown(size, len(names)), ROUNDS)
+    group, of_factors = basis.group, basis.of_factors
+    whole = evidence.fit(sums, form, group, evidence.unknown(basis.size, len(basis.sizes)), ROUNDS)
     by_all = explained(sums, form, group, whole)
     none = jnp.zeros(0)
     if not of_factors.any():

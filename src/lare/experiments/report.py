@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Sequence
 from html import escape
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -157,12 +158,21 @@ def details(name: str, run: Run) -> Iterable[str]:
     if run.has_checkpoint():
         if said := explanation_of(run):
             yield "<h3>What the returns say</h3>"
-            yield from (f"<p>{escape(line)}</p>" for line in said)
+            yield from paragraphs(said)
         yield from agents_details(run) if env_spec(run.config.task).agents > 1 else one_agent_details(run)
     else:
         yield note("Its checkpoint is not there any more, and with it what credit and factors would be drawn from.")
     yield "<h3>Settings</h3>"
     yield settings_table(run)
+
+
+def paragraphs(lines: Iterable[str]) -> Iterable[str]:
+    """A paragraph for each line, and a list of those that begin with a dash."""
+    for listed, some in groupby(lines, key=lambda line: line.startswith("- ")):
+        if listed:
+            yield "<ul>" + "".join(f"<li>{escape(line[2:])}</li>" for line in some) + "</ul>"
+        else:
+            yield from (f"<p>{escape(line)}</p>" for line in some)
 
 
 def one_agent_details(run: Run) -> Iterable[str]:

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,12 @@ from lare.errors import LareError
 from lare.latent.checks import Check, Failed, factors_of
 from lare.latent.function import LatentFunction, normal
 from lare.latent.jailed import JailedProgram, WorkerFailed
-from lare.latent.reflect import EPISODES, gather
 from lare.latent.verify import Verdict, random_steps, verify
 from lare.llm import prompts
 from lare.llm.model import Model, recorded_model
 from lare.llm.prompts import Kind, Message, Stage
 from lare.llm.recording import Recorder
 from lare.llm.reply import MalformedReply, parse
-from lare.tasks.play import Policy, episodes_of
 from lare.tasks.spec import TaskSpec, the_role
 
 CANDIDATES = 5
@@ -145,42 +143,15 @@ class Conversation:
             raise self.failed(f"the reply does not run: {error}") from error
         return Attempt(reply, source, Verdict((Check("executed", True, ""),), factors.shape[1]), "")
 
-    def reflect(self, best: Attempt, rounds: int, policy: Policy | None) -> Attempt:
-        """Show the model what its factors did on whole episodes; keep the function that predicts returns best.
-
-        Whatever goes wrong on the way, there is a verified function to go back to; whoever stops it takes that.
-        """
-        try:
-            episodes = episodes_of(self.task, EPISODES, policy)
-            evidence = gather(self.made(best), self.task, episodes)
-        except (LareError, KeyboardInterrupt) as error:
-            self.said(f"no reflection: {str(error) or 'stopped'}")
-            return best
-        self.said(f"reflection: before it, a linear decoder explains {evidence.fit:.3f} of unseen returns")
-        for number in range(1, rounds + 1):
-            try:
-                request = prompts.reflect(self.task, best.reply, evidence.text, self.kind)
-                attempt = self.correct(request, self.ask("reflect", request))
-                found = gather(self.made(attempt), self.task, episodes)
-            except LareError as error:
-                self.said(f"reflection {number}: {error}")
-                continue
-            except KeyboardInterrupt:
-                self.said(f"reflection {number}: stopped")
-                return best
-            better = found.fit > evidence.fit
-            self.said(f"reflection {number}: {found.fit:.3f}, {'kept' if better else 'not better'}")
-            if better:
-                best, evidence = attempt, found
-        return best
-
     def made(self, attempt: Attempt) -> LatentFunction:
         """The artifact of an attempt."""
-        exchanges = tuple(exchange.model_dump() for exchange in self.recorder.exchanges)
         verdict = attempt.verdict
-        return LatentFunction(
-            self.task.name, self.kind, attempt.source, verdict.size, verdict.checks, self.model.name, exchanges
-        )
+        made = LatentFunction(self.task.name, self.kind, attempt.source, verdict.size, verdict.checks, self.model.name)
+        return self.with_exchanges(made)
+
+    def with_exchanges(self, function: LatentFunction) -> LatentFunction:
+        """A function with all that was said up to now."""
+        return replace(function, exchanges=tuple(exchange.model_dump() for exchange in self.recorder.exchanges))
 
     def failed(self, why: str) -> DesignFailed:
         return DesignFailed(f"task {self.task.name!r}: {why}", self.recorder, self.model.name)
@@ -212,9 +183,7 @@ def design(
     model: Model | None = None,
     draw: int = 0,
     candidates: int = CANDIDATES,
-    reflect: int = 0,
     pre_verification: bool = True,
-    policy: Policy | None = None,
     record: Path | None = None,
     said: Callable[[str], None] = lambda _: None,
 ) -> LatentFunction:
@@ -230,10 +199,7 @@ def design(
         draw: which of the shipped recordings answers (0 to 4). Nothing to do with a training seed.
         candidates: n; with 1 (the paper's ablation without self-prompting), the single candidate is the function and
             nothing is combined.
-        reflect: rounds of reflection on whole episodes, after a function has passed. Not in the paper.
         pre_verification: without it (the paper's ablation), the first function is kept if it runs at all, in its jail.
-        policy: from one observation to one action of the environment: plays the episodes for reflection, instead of random
-            actions.
         record: a file that takes every exchange, from the first reply on.
         said: is told how it goes.
 
@@ -244,8 +210,6 @@ def design(
     the_role(task)
     if not 1 <= candidates <= MOST_CANDIDATES:
         raise LareError(f"candidates = {candidates}: from 1 to {MOST_CANDIDATES}")
-    if reflect < 0:
-        raise LareError(f"reflect = {reflect}: there can be no fewer rounds than none")
     model = model or recorded_model(task.name, kind, draw)
     # What cannot be played is found out before a model is paid; and it is played once, before threads want the steps.
     random_steps(task)
@@ -264,4 +228,4 @@ def design(
         if not recorder.exchanges:
             raise
         raise DesignStopped("stopped", recorder, model.name) from None
-    return conversation.made(conversation.reflect(attempt, reflect, policy) if reflect else attempt)
+    return conversation.made(attempt)

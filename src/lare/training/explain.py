@@ -28,6 +28,8 @@ NEXT_TO_NOTHING = 0.1
 """Of the variation of the returns."""
 STRIKING = 0.3
 """A correlation with what the factors leave."""
+FORMS = ("sum", "average")
+"""Of a score, by number."""
 
 
 def judging(config: TrainConfig) -> TrainConfig:
@@ -120,8 +122,13 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
             "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of."
         )
     else:
-        order = [i for i in np.argsort(-found.share)[:3] if found.share[i] >= 0.01]
-        said.append("Most goes with " + ", ".join(f"{factors[i]} ({found.share[i]:.0%})" for i in order) + ".")
+        said.append(
+            "What goes with each factor: its share of the variation, and what a step pays more for one standard deviation of it:"
+        )
+        said += [
+            f"- {factors[i]}: {max(0, found.share[i]):.0%}, {found.weight[i]:+.3g} ± {found.deviation[i]:.1g}"
+            for i in np.argsort(-found.share, kind="stable")
+        ]
     if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:
         place = int(np.argmax(np.abs(found.left)))
         way = "large" if found.left[place] > 0 else "small"

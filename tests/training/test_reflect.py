@@ -1,20 +1,21 @@
 """Reflection: what episodes say of a function, and that the better predictor of returns is kept."""
 
 import json
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 
 from lare.errors import LareError
-from lare.latent import design as module
 from lare.latent.design import design
 from lare.latent.function import verified
-from lare.latent.reflect import EPISODES, gather, held_out_fit
 from lare.latent.verify import random_steps
 from lare.llm import prompts
 from lare.llm.recording import RecordedModel, read_recording
-from lare.tasks.play import episodes_of
+from lare.tasks.play import Episode, episodes_of
+from lare.training import reflect as module
+from lare.training.reflect import EPISODES, evidence_of, reflect
 from toys import Chase, toy_spec
 
 
@@ -41,6 +42,13 @@ class Says:
         return self.lines.pop(0)
 
 
+def designed(model, rounds, **given):
+    """A first function, and the best one after some rounds."""
+    record, said = given.get("record"), given.get("said", lambda _: None)
+    function = design(toy_spec(), model=model, candidates=1, record=record, said=said)
+    return reflect(function, toy_spec(), model, rounds, **given)
+
+
 @pytest.fixture(scope="module")
 def episodes():
     return episodes_of(toy_spec(), EPISODES)
@@ -63,37 +71,20 @@ def test_episodes_of_a_policy():
     assert perfect.total == pytest.approx(0, abs=1e-9)
 
 
-def test_the_fit_is_of_unseen_episodes():
-    random, alike = np.random.default_rng(0), np.ones(40)
-    means = random.normal(size=(40, 3))
-    assert held_out_fit(means, means @ [1.0, -2.0, 0.0] + 5, alike) > 0.99
-    # Thirty useless factors would explain forty seen episodes well.
-    assert held_out_fit(random.normal(size=(40, 30)), random.normal(size=40), alike) < 0.2
-    assert held_out_fit(np.zeros((40, 1)), np.arange(40.0), alike) == pytest.approx(-0.04, abs=0.2)
-    assert held_out_fit(means, np.zeros(40), alike) == pytest.approx(1)
+@pytest.mark.parametrize(("one", "least", "most"), [(RIGHT, 0.99, 1), (WRONG, -1, 0.3)])
+def test_a_function_is_judged_by_returns_that_its_factors_have_not_seen(one, least, most, episodes):
+    assert least < evidence_of(verified(one, toy_spec()), toy_spec(), episodes).r2 <= most
 
 
-@pytest.mark.parametrize("score", ["sum", "average"])
-def test_the_fit_is_of_the_score_whether_it_is_a_sum_or_an_average(score):
-    """Of episodes of 30 to 90 steps; a factor that knows only the length does not pass for one that knows the score."""
-    random = np.random.default_rng(0)
-    means, length = random.normal(size=(60, 2)), random.uniform(30, 90, size=60)
-    mark = means @ [5.0, -3.0] + 60
-    returns = mark if score == "average" else mark * length
-    assert held_out_fit(means, returns, length) > 0.98
-    assert score == "sum" or held_out_fit(1 / length[:, None], returns, length) < 0.2
-
-
-def test_the_evidence_names_what_each_factor_did(episodes):
+def test_the_evidence_says_what_each_factor_did_and_what_returns_say_of_it(episodes):
     task = toy_spec()
-    right, wrong = (gather(verified(one, task), task, episodes) for one in (RIGHT, WRONG))
-    assert right.fit > 0.99
-    assert wrong.fit < 0.3
-    lines = right.text.splitlines()
+    lines = evidence_of(verified(RIGHT, task), task, episodes).text.splitlines()
     assert lines[0].startswith("- f_0: from ")
-    assert "correlates -1.00 with the return per step" in lines[0]
     assert "it correlates most" in lines[0]
-    dead, one, two = gather(verified(CONSTANT, task), task, episodes).text.splitlines()
+    assert lines[2] == "The factors explain 100% of the variation of the returns of 40 episodes."
+    assert lines[4].startswith("- f_0: 100%, -")
+    assert lines[5].startswith("- f_1: 0%, ")
+    dead, one, two, *_ = evidence_of(verified(CONSTANT, task), task, episodes).text.splitlines()
     assert "standard deviation 0;" in dead
     assert "+1.00 with f_2" in one
     assert "+1.00 with f_1" in two
@@ -101,22 +92,47 @@ def test_the_evidence_names_what_each_factor_did(episodes):
 
 def test_both_observations_are_named_apart(episodes):
     task = toy_spec(judges="both")
-    text = gather(verified(WRONG, task), task, episodes).text
-    assert [line.split(":")[0] for line in text.splitlines()] == ["- f_0, before the step", "- f_0, after the step"]
+    text = evidence_of(verified(WRONG, task), task, episodes).text
+    assert [line.split(":")[0] for line in text.splitlines()[:2]] == ["- f_0 (before)", "- f_0 (after)"]
+
+
+def test_of_many_agents_those_that_have_left_do_not_count():
+    task = toy_spec()
+    random = np.random.default_rng(0)
+
+    def episode(steps):
+        alive = np.ones((steps, 3), bool)
+        alive[steps // 2 :, 2] = False
+        seen = random.normal(size=(steps, 3, 2)).astype(np.float32)
+        action = random.uniform(-1, 1, (steps, 3, 1)).astype(np.float32)
+        paid = -np.square(action - seen[..., :1])[..., 0]
+        team = (paid * alive).sum(axis=1) / alive.sum(axis=1)
+        seen[~alive] = 1e6
+        return Episode(seen, action, seen, alive, paid, team)
+
+    played = [episode(steps) for steps in random.integers(10, 30, size=40)]
+    assert evidence_of(verified(RIGHT, task), task, played).r2 > 0.99
+
+
+def test_where_all_returns_are_the_same_nothing_is_better(episodes):
+    alike = [replace(one, team_reward=np.zeros(20)) for one in episodes]
+    function, said = design(toy_spec(), model=Says(WRONG), candidates=1), []
+    assert reflect(function, toy_spec(), Says(RIGHT), episodes=alike, said=said.append).source == WRONG
+    assert said[-1] == "reflection 1: R^2 = nan, not better" or said[-1].endswith("not better")
 
 
 def test_a_better_function_is_kept_and_a_worse_one_is_not():
     task = toy_spec()
     said = []
     model = Says(WRONG, RIGHT, CONSTANT)
-    function = design(task, model=model, candidates=1, reflect=2, said=said.append)
+    function = designed(model, 2, said=said.append)
     assert function.source == RIGHT
     assert [exchange["stage"] for exchange in function.exchanges] == ["candidate", "reflect", "reflect"]
     assert said[-1].endswith("not better")
     # The second round is about the best function so far.
     assert "Functions" in model.asked[2][2]["content"]
     assert json.loads(model.asked[2][2]["content"])["Functions"] == RIGHT
-    evidence = gather(verified(WRONG, task), task, episodes_of(task, EPISODES)).text
+    evidence = evidence_of(verified(WRONG, task), task, episodes_of(task, EPISODES)).text
     assert model.asked[1] == prompts.reflect(
         task, json.dumps({"Understand": "", "Analyze": "", "Functions": WRONG}), evidence
     )
@@ -125,9 +141,9 @@ def test_a_better_function_is_kept_and_a_worse_one_is_not():
 def test_what_was_recorded_answers_again(tmp_path):
     """Two rounds that ask for the same have two replies."""
     lines, path = (WRONG, CONSTANT, RIGHT), tmp_path / "talk.json"
-    first = design(toy_spec(), model=Says(*lines), candidates=1, reflect=2, record=path)
+    first = designed(Says(*lines), 2, record=path)
     model = RecordedModel([read_recording(path.read_text(), "talk.json")], "Chase")
-    again = design(toy_spec(), model=model, candidates=1, reflect=2)
+    again = designed(model, 2)
     assert first.source == again.source == RIGHT
 
 
@@ -139,7 +155,7 @@ def test_what_was_verified_is_kept_where_nothing_can_be_shown(monkeypatch, error
     monkeypatch.setattr(module, "episodes_of", gone)
     said = []
     model = Says(RIGHT)
-    assert design(toy_spec(), model=model, candidates=1, reflect=3, said=said.append).source == RIGHT
+    assert designed(model, 3, said=said.append).source == RIGHT
     assert said[-1] == f"no reflection: {str(error) or 'stopped'}"
 
 
@@ -151,7 +167,7 @@ def test_whoever_stops_a_reflection_takes_what_there_is():
             return super().reply(messages, sample)
 
     said = []
-    assert design(toy_spec(), model=Stops(RIGHT), candidates=1, reflect=3, said=said.append).source == RIGHT
+    assert designed(Stops(RIGHT), 3, said=said.append).source == RIGHT
     assert said[-1] == "reflection 1: stopped"
 
 
@@ -184,7 +200,7 @@ def test_observations_are_copied(episodes):
 
 def test_a_round_that_fails_changes_nothing():
     model = Says(RIGHT, *["def f(): ..."] * 5)
-    assert design(toy_spec(), model=model, candidates=1, reflect=1).source == RIGHT
+    assert designed(model, 1).source == RIGHT
     assert model.lines == []
 
 
@@ -196,7 +212,7 @@ def test_what_was_verified_is_kept_when_the_model_leaves():
             return super().reply(messages, sample)
 
     said = []
-    function = design(toy_spec(), model=Leaves(RIGHT), candidates=1, reflect=1, said=said.append)
+    function = designed(Leaves(RIGHT), 1, said=said.append)
     assert function.source == RIGHT
     assert said[-1] == "reflection 1: nobody there"
 
@@ -207,7 +223,7 @@ def test_episodes_of_a_given_policy():
     best = episodes_of(task, 2, lambda observation: observation[:1])
     assert [episode.total for episode in best] == pytest.approx([0, 0], abs=1e-9)
     model = Says(RIGHT, WRONG)
-    design(task, model=model, candidates=1, reflect=1, policy=lambda observation: observation[:1] + 0.5)
+    designed(model, 1, policy=lambda observation: observation[:1] + 0.5)
     played = episodes_of(task, EPISODES, lambda observation: observation[:1] + 0.5)
-    shown = gather(verified(RIGHT, task), task, played).text
+    shown = evidence_of(verified(RIGHT, task), task, played).text
     assert shown in model.asked[1][-1]["content"]

@@ -1,0 +1,142 @@
+"""How well factors would have told the returns of some episodes, each before it was seen; and what all of them say of the factors.
+
+    R^2 = 1 - sum_k (R_k - R_hat_k)^2 / sum_k (R_k - mean R)^2
+
+R_hat_k is by the fit in closed form, on the factors alone, to the episodes before k (the prequential principle: Dawid, Journal of
+the Royal Statistical Society A 147, 1984). So two functions can be compared on the same episodes, however many factors each has.
+"""
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from itertools import pairwise
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from lare.credit import evidence
+from lare.credit.basis import Basis
+from lare.credit.closed_form import GROWTH_OF_FIT, ROUNDS, LinearDecoder
+from lare.credit.decomposition import AVERAGE, SUM
+from lare.credit.evidence import Posterior, Sums
+from lare.credit.explanation import Explanation, explain
+from lare.credit.returns import BETTER
+
+FIRST = 10
+"""Episodes before the first that is predicted."""
+
+
+class Judgement(NamedTuple):
+    """Of factors, by one team's score."""
+
+    r2: float
+    """NaN where all episodes returned the same, or are too few."""
+    average: bool | None
+    """Whether the score is taken for an average over steps; None where it makes no difference."""
+    explanation: Explanation
+
+
+def judge(
+    rows: Sequence[Float[np.ndarray, "_ agents inputs"]],
+    alive: Sequence[Bool[np.ndarray, "_ agents"]],
+    returns: Float[np.ndarray, " episodes"],
+    basis: Basis,
+) -> Judgement:
+    """Judge the factors of some episodes, in the order in which these were played.
+
+    Args:
+        rows: [z, s', a] of each step and agent, by episode.
+        alive: which agents acted.
+        returns: R.
+        basis: what is made of the rows.
+    """
+    length = np.array([len(steps) for steps in rows])
+    with jax.enable_x64(True):
+        means = mean_features(rows, alive, basis)
+        forms = (SUM, AVERAGE) if len(set(length)) > 1 else (SUM,)
+        told = [predictions(means[:, basis.of_factors], returns, length, basis, form) for form in forms]
+        errors = [float(np.sum((returns[FIRST:] - one) ** 2)) for one in told]
+        form = AVERAGE if len(errors) > 1 and errors[AVERAGE] < BETTER * errors[SUM] else SUM
+        sums = evidence.add_episodes(evidence.no_sums(basis.size), *map(jnp.asarray, (means, returns, length)))
+        explanation = jax.tree.map(np.asarray, explained(sums, form, basis=basis))
+    spread = float(np.sum((returns[FIRST:] - returns[FIRST:].mean()) ** 2)) if len(returns) > FIRST else 0.0
+    r2 = 1 - errors[form] / spread if spread > 0 else np.nan
+    differs = len(forms) > 1 and min(errors) < BETTER * max(errors)
+    return Judgement(r2, form == AVERAGE if differs else None, explanation)
+
+
+def mean_features(
+    rows: Sequence[Float[np.ndarray, "_ agents inputs"]], alive: Sequence[Bool[np.ndarray, "_ agents"]], basis: Basis
+) -> Float[np.ndarray, "episodes features"]:
+    """M of each episode, with inputs standardised over all steps."""
+    every = np.concatenate([steps[there] for steps, there in zip(rows, alive, strict=True)]).astype(np.float64)
+    mean, spread = every.mean(axis=0), every.std(axis=0)
+    spread = np.where(spread > 1e-6 * np.abs(mean), spread, 0)  # float32 makes so much of a constant
+    known = (jnp.asarray(one, jnp.float32) for one in (mean, spread, np.zeros(basis.size), 0))
+    decoder, longest = LinearDecoder(basis, *known), max(map(len, rows))
+    found = []
+    for steps, there in zip(rows, alive, strict=True):
+        share = there / np.maximum(there.sum(axis=1, keepdims=True), 1) / len(steps)
+        padding = (0, longest - len(steps)), (0, 0)  # to one length, so that it is compiled once
+        found.append(of_one(decoder, np.pad(steps, (*padding, (0, 0))).astype(np.float32), np.pad(share, padding)))
+    return np.stack(found)
+
+
+@jax.jit
+def of_one(
+    decoder: LinearDecoder, steps: Float[Array, "steps agents inputs"], share: Float[Array, "steps agents"]
+) -> Float[Array, " features"]:
+    """The weighted sum of the features of some steps."""
+    return jnp.einsum("taf,ta->f", decoder.features(steps).astype(float), share)
+
+
+def predictions(
+    means: Float[np.ndarray, "episodes features"],
+    returns: Float[np.ndarray, " episodes"],
+    length: Int[np.ndarray, " episodes"],
+    basis: Basis,
+    form: int,
+) -> Float[np.ndarray, " later_episodes"]:
+    """R_hat of all episodes but the first `FIRST`, each by a fit to episodes before it."""
+    group = basis.group[basis.of_factors]
+    sums, known = evidence.no_sums(len(group)), evidence.unknown(len(group), int(group.max()) + 1)
+    sums, known = jax.tree.map(lambda zero: zero.astype(float), (sums, known))
+    blocks = list(growing(len(returns)))
+    places = max((end - start for start, end in blocks), default=1)
+    told = [np.zeros(0)]
+    for (start, end), (after, until) in pairwise(blocks):
+        new = (means[start:end], returns[start:end], length[start:end])
+        padded = (np.pad(part, ((0, places - len(part)), *[(0, 0)] * (part.ndim - 1))) for part in new)
+        sums, known = learn(sums, known, *padded, form=form, basis=basis)
+        later = slice(after, until)
+        parts = 1 if form == AVERAGE else length[later]
+        told.append(parts * (means[later] @ np.asarray(known.weight) + float(known.bias)))
+    return np.concatenate(told)
+
+
+@partial(jax.jit, static_argnames="basis")
+def learn(
+    sums: Sums,
+    known: Posterior,
+    means: Float[Array, "episodes features"],
+    returns: Float[Array, " episodes"],
+    length: Int[Array, " episodes"],
+    form: Int[Array, ""] | int,
+    basis: Basis,
+) -> tuple[Sums, Posterior]:
+    """Add episodes to the sums, and fit to all of them."""
+    sums = evidence.add_episodes(sums, means, returns, length)
+    return sums, evidence.fit(sums, form, basis.group[basis.of_factors], known, ROUNDS)
+
+
+explained = jax.jit(explain, static_argnames="basis")
+
+
+def growing(count: int) -> Iterator[tuple[int, int]]:
+    """Episodes that are learned from together: the first ones, then always a few more."""
+    start, end = 0, min(FIRST, count)
+    while start < count:
+        yield start, end
+        start, end = end, min(count, max(end + 1, int(GROWTH_OF_FIT * end)))

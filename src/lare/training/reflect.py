@@ -1,0 +1,125 @@
+"""What the returns of some episodes say of a function, for the model that wrote it; and the model's next try.
+
+The episodes are played for it before training, or are those that a run has stored.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from lare.credit.basis import Basis
+from lare.credit.judging import Judgement
+from lare.credit.judging import judge as judge_rows
+from lare.errors import LareError
+from lare.latent.function import LatentFunction
+from lare.latent.improve import Evidence, Model, improve
+from lare.tasks.play import Episode, Policy, episodes_of
+from lare.tasks.spec import TaskSpec, the_role
+from lare.training.explain import FORMS, entry_names, words
+
+EPISODES = 40
+"""That are played, where none are given."""
+
+
+def reflect(
+    function: LatentFunction,
+    task: TaskSpec,
+    model: Model,
+    rounds: int = 1,
+    *,
+    episodes: Sequence[Episode] | None = None,
+    policy: Policy | None = None,
+    record: Path | None = None,
+    said: Callable[[str], None] = lambda _: None,
+) -> LatentFunction:
+    """Show a model what returns say of its function; keep the function whose factors tell them best. Not in the paper.
+
+    A function is judged by R^2 of the returns of the same episodes, each predicted before it was seen (`credit/judging.py`).
+    Whatever goes wrong on the way, the best function so far is returned.
+
+    Args:
+        function: from `lare.design`, or by hand.
+        task: that it is for.
+        model: whom to ask.
+        rounds: how often.
+        episodes: whole episodes; 40 are played, unless given.
+        policy: from one observation of a single agent to one action: plays them, instead of random actions.
+        record: a file that takes every exchange; the one that the design had, if it had one.
+        said: is told how it goes.
+
+    Raises:
+        LareError: rounds are less than 1, or each team of the task has a function of its own.
+    """
+    role = the_role(task)
+    if rounds < 1:
+        raise LareError(f"rounds = {rounds}: at least one")
+
+    @cache
+    def played() -> Sequence[Episode]:
+        return episodes_of(role, EPISODES, policy) if episodes is None else episodes
+
+    def judge(one: LatentFunction) -> Evidence:
+        return evidence_of(one, role, played())
+
+    return improve(function, role, model, judge, rounds, record, said)
+
+
+def evidence_of(function: LatentFunction, role: TaskSpec, episodes: Sequence[Episode]) -> Evidence:
+    """What the returns of some episodes say of a function.
+
+    Raises:
+        LatentRewardError: it failed on one of them.
+    """
+    factors = [factors_of(function, role, episode) for episode in episodes]
+    rows = [
+        np.concatenate([z, episode.after, episode.action], axis=-1)
+        for z, episode in zip(factors, episodes, strict=True)
+    ]
+    size = factors[0].shape[-1]
+    basis = Basis(size, rows[0].shape[-1] - size, extended=True)
+    alive, returns = [one.alive for one in episodes], np.array([one.total for one in episodes])
+    found = judge_rows(rows, alive, returns, basis)
+    names, every = (
+        function.columns_by(role.judges),
+        np.concatenate([z[there] for z, there in zip(factors, alive, strict=True)]),
+    )
+    return Evidence(found.r2, "\n".join([*ranges(names, every), *said_of(found, names, role, basis)]))
+
+
+def factors_of(function: LatentFunction, role: TaskSpec, episode: Episode) -> Float[np.ndarray, "steps rows factors"]:
+    """The factors of an episode's steps, by the observations that the task says are judged; 0 for agents that have left."""
+    there = episode.alive
+    z = function.of_steps(episode.before[there], episode.action[there], episode.after[there], role.judges)
+    found = np.zeros((*there.shape, z.shape[1]), np.float32)
+    found[there] = z
+    return found
+
+
+def said_of(found: Judgement, names: list[str], role: TaskSpec, basis: Basis) -> list[str]:
+    """The sentences that a user reads too."""
+    form = None if found.average is None else FORMS[int(found.average)]
+    return words(found.explanation, form, names, entry_names(role, basis.entries))
+
+
+def ranges(names: Sequence[str], factors: Float[np.ndarray, "rows factors"]) -> list[str]:
+    """Which values each factor took, and which other ones it goes with."""
+    among = correlations(factors)
+    lines = []
+    for place, name in enumerate(names):
+        column = factors[:, place]
+        others = [f"{among[place, other]:+.2f} with {names[other]}" for other in range(len(names)) if other != place]
+        strongest = sorted(others, key=lambda said: -abs(float(said.split()[0])))[:3]
+        lines.append(
+            f"- {name}: from {column.min():.4g} to {column.max():.4g}, mean {column.mean():.4g}, standard deviation "
+            f"{column.std():.4g}; among the factors it correlates most {', '.join(strongest) or 'with none'}"
+        )
+    return lines
+
+
+def correlations(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
+    """Pearson's, 0 where something does not vary."""
+    with np.errstate(all="ignore"):
+        return np.atleast_2d(np.nan_to_num(np.corrcoef(columns, rowvar=False)))
