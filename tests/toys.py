@@ -1,11 +1,13 @@
 """Small toys that train in a second (`from toys import ...`)."""
 
+import json
 import textwrap
 
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
+from lare.errors import LareError
 from lare.tasks.spec import TaskSpec
 
 
@@ -142,6 +144,37 @@ class At:
     def stepped(self, step):
         if step == self.step:
             self.action()
+
+
+class Ear:
+    """Keeps what is said of a run."""
+
+    def __init__(self):
+        self.heard = []
+
+    def started(self, name, step, steps): ...
+    def stepped(self, step): ...
+    def evaluated(self, metrics): ...
+    def stopped(self): ...
+
+    def said(self, message):
+        self.heard.append(message)
+
+
+class Says:
+    """A language model that answers with one function after the other, and then is gone."""
+
+    name = "says"
+
+    def __init__(self, *sources):
+        self.lines = [json.dumps({"Understand": "", "Analyze": "", "Functions": one}) for one in sources]
+        self.asked = []
+
+    def reply(self, messages, sample):
+        self.asked.append(messages)
+        if not self.lines:
+            raise LareError("nobody there")
+        return self.lines.pop(0)
 
 
 def figures(run):

@@ -8,8 +8,9 @@ import lare
 from lare.credit.explanation import Explanation
 from lare.latent.function import verified
 from lare.tasks.spec import read_task
-from lare.training.explain import entry_names, explanation_of, words
-from toys import toy_spec
+from lare.training.explain import explanation_of
+from lare.training.words import entry_names, words
+from toys import Ear, toy_spec
 
 
 def found(**changes):
@@ -92,21 +93,11 @@ def test_a_run_is_explained(method, small, tmp_path):
     source = "def evaluation_func(o, a):\n    return [o[:, 0:1] * a[:, 0:1], o[:, 1:2]]\n"
     function = verified(source, toy_spec()) if method != "rrdu" else None
     settings = small(method=method, algorithm="td3", seeds=1, steps=600)
-    heard = []
-
-    class Ear:
-        def said(self, message):
-            heard.append(message)
-
-        def started(self, *_): ...
-        def stepped(self, *_): ...
-        def evaluated(self, *_): ...
-        def stopped(self): ...
-
-    run = lare.train(toy_spec(), settings, function=function, out=tmp_path / "run", listeners=[Ear()])
+    ear = Ear()
+    run = lare.train(toy_spec(), settings, function=function, out=tmp_path / "run", listeners=[ear])
     lines = explanation_of(run)
     assert any("of the variation of the returns of" in line for line in lines)
-    assert heard[-len(lines) :] == lines
+    assert ear.heard[-len(lines) :] == lines
     assert ("The factors explain" in " ".join(lines)) == (method != "rrdu")
     assert "What the returns say" in lare.write_report([run.directory]).read_text()
 

@@ -16,7 +16,7 @@ from lare.llm.recording import RecordedModel, read_recording
 from lare.tasks.play import Episode, episodes_of
 from lare.training import reflect as module
 from lare.training.reflect import EPISODES, evidence_of, reflect
-from toys import Chase, toy_spec
+from toys import Chase, Says, toy_spec
 
 
 def source(*factors: str) -> str:
@@ -28,18 +28,6 @@ def source(*factors: str) -> str:
 RIGHT = source("np.square(action - observation[:, 0:1])", "action")
 WRONG = source("observation[:, 1:2]")
 CONSTANT = source("0 * action + 1", "observation[:, 1:2]", "2 * observation[:, 1:2]")
-
-
-class Says:
-    name = "says"
-
-    def __init__(self, *sources: str):
-        self.lines = [json.dumps({"Understand": "", "Analyze": "", "Functions": one}) for one in sources]
-        self.asked = []
-
-    def reply(self, messages, sample):
-        self.asked.append(messages)
-        return self.lines.pop(0)
 
 
 def designed(model, rounds, **given):
@@ -205,14 +193,8 @@ def test_a_round_that_fails_changes_nothing():
 
 
 def test_what_was_verified_is_kept_when_the_model_leaves():
-    class Leaves(Says):
-        def reply(self, messages, sample):
-            if not self.lines:
-                raise LareError("nobody there")
-            return super().reply(messages, sample)
-
     said = []
-    function = designed(Leaves(RIGHT), 1, said=said.append)
+    function = designed(Says(RIGHT), 1, said=said.append)
     assert function.source == RIGHT
     assert said[-1] == "reflection 1: nobody there"
 

@@ -8,8 +8,10 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from lare.cli.design import BUDGET, REQUESTS
 from lare.cli.terminal import RunDirectories, RunDirectory, progress, say, show
 from lare.errors import LareError
+from lare.llm.model import Model
 from lare.run.settings import Settings, set_in_vain
 
 DEFAULTS = Settings()
@@ -19,6 +21,8 @@ def train(
     task: Annotated[Positional[str | None], tyro.conf.arg(metavar="[TASK]")] = None,
     settings: Annotated[Settings, tyro.conf.arg(name="")] = DEFAULTS,
     function: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = (),
+    model: str | None = None,
+    base_url: str | None = None,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     tensorboard: bool = False,
@@ -29,6 +33,9 @@ def train(
         task: a shipped name (see `lare tasks`), or the path of a task file. Not given with --resume.
         function: a latent function (.py) to use instead of a recorded one, verified before it is run. Where several teams learn,
             one --function for each, in the order of the task.
+        model: with --reflect-every, whom to ask: the path of a recording (.json), or the name of a model behind an
+            OpenAI-compatible endpoint.
+        base_url: the endpoint (OpenAI's, or that of OPENAI_BASE_URL, unless given).
         out: the run directory, which must not exist; runs/TASK-METHOD-ALGORITHM-sSEED unless given.
         resume: a run directory to go on with, from its last checkpoint and with its own settings.
         tensorboard: write TensorBoard events into the run directory too (needs the extra lare-rl[tensorboard]).
@@ -36,12 +43,14 @@ def train(
     import lare
     from lare.latent.function import CHANGED, load, per_role
     from lare.run.decide import decide
+    from lare.run.directory import open_run
     from lare.training.train import check_given
 
     if resume is not None:
         if (task, function, out, settings) != (None, (), None, DEFAULTS):
             raise LareError("--resume goes on with the run's own settings: give it no task and no other settings")
-        run = lare.resume(resume, tensorboard=tensorboard)
+        asked = model_of(model, base_url, open_run(resume).config.task.name)
+        run = lare.resume(resume, model=asked, tensorboard=tensorboard)
     elif task is None:
         raise LareError("say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR")
     else:
@@ -57,8 +66,24 @@ def train(
                 progress(
                     f"the function by {one.model.removesuffix(CHANGED)} is not the one that was saved: its hash is another"
                 )
-        run = lare.train(spec, settings, function=functions, out=out, tensorboard=tensorboard)
+        asked = model_of(model, base_url, spec.name)
+        run = lare.train(spec, settings, function=functions, model=asked, out=out, tensorboard=tensorboard)
     say(f"finished {run.directory}; to see it: lare report {run.directory}")
+
+
+def model_of(model: str | None, base_url: str | None, task: str) -> Model | None:
+    """Whom a run asks for better functions, if anybody."""
+    from lare.llm.budget import Budget
+    from lare.llm.live import LiveModel
+    from lare.llm.model import recorded_model
+
+    if base_url is not None and (model is None or model.endswith(".json")):
+        raise LareError("--base-url is for a live model: say which one with --model NAME")
+    if model is None:
+        return None
+    if model.endswith(".json"):
+        return recorded_model(task, "factors", 0, Path(model))
+    return LiveModel(model, base_url, None, Budget(REQUESTS, BUDGET), said=progress)
 
 
 def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -> None:

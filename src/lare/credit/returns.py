@@ -15,11 +15,13 @@ from lare.credit import closed_form, evidence
 from lare.credit.closed_form import LinearDecoder
 from lare.credit.decomposition import CreditSettings, Decomposition, Episodes, over_agents, proxy_rewards
 from lare.credit.methods import Fit, Method
-from lare.credit.prediction import remember, squared_errors
+from lare.credit.prediction import Predictions, remember, squared_errors
 
 BETTER = 0.95
 """Times the squared error of a sum's predictions must be that of an average's, before it is taken for one. Where all episodes are
 equally long, both are the same but for rounding."""
+ROUNDING = 1e-6
+"""Of the squared returns: errors are not told apart that are smaller."""
 
 
 def is_fitted(state: Decomposition) -> Bool[Array, ""]:
@@ -88,10 +90,15 @@ def form_found(state: Decomposition) -> Literal["sum", "average"] | None:
     """The form that has predicted returns clearly better; None where it was not looked for, or makes no difference."""
     if state.rivals is None:
         return None
-    of_sum, of_average = np.asarray(squared_errors(state.rivals))
+    of_sum, of_average = np.asarray(errors_told_apart(state.rivals))
     if of_average < BETTER * of_sum:
         return "average"
     return "sum" if of_sum < BETTER * of_average else None
+
+
+def errors_told_apart(rivals: Predictions) -> Float[Array, " forms"]:
+    """The squared errors of each form's predictions, and what rounding may add to any."""
+    return squared_errors(rivals) + ROUNDING * jnp.sum(rivals.returns**2)
 
 
 def fit_in_closed_form(state: Decomposition, method: Method, forms: tuple[int, ...]) -> Decomposition:
@@ -101,7 +108,7 @@ def fit_in_closed_form(state: Decomposition, method: Method, forms: tuple[int, .
     closed = closed_form.fit_signs(state.closed) if signs else closed_form.fit(state.closed, forms)
     average = state.average
     if state.rivals is not None:
-        of_sum, of_average = squared_errors(state.rivals)
+        of_sum, of_average = errors_told_apart(state.rivals)
         average = of_average < BETTER * of_sum
     decoder = state.decoder
     if not method.descends:

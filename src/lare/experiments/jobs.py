@@ -9,7 +9,7 @@ import lare
 from lare.credit.methods import find_method
 from lare.errors import LareError
 from lare.latent.design import CANDIDATES, check_recorded
-from lare.run.checkpoint import saved_step
+from lare.run.checkpoint import saved_host
 from lare.run.decide import decide
 from lare.run.directory import CHECKPOINT, CONFIG, read_config, read_metrics
 from lare.run.settings import ResolvedSettings, Settings
@@ -44,8 +44,8 @@ class Job:
         if not self.begun:
             return False
         ended = {line["seed"] for line in read_metrics(self.directory) if line["step"] == self.resolved.steps}
-        saved = saved_step(self.directory / CHECKPOINT)
-        return ended == set(self.resolved.all_seeds) and saved in (None, self.resolved.steps)
+        saved = saved_host(self.directory / CHECKPOINT)
+        return ended == set(self.resolved.all_seeds) and (saved is None or saved["step"] == self.resolved.steps)
 
     @property
     def begun(self) -> bool:

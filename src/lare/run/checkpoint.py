@@ -73,22 +73,27 @@ def save(
     learner: WithReplay,
     host: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
+    anew: bool = False,
 ) -> None:
     """Write a checkpoint.
 
     Args:
         host: what else is to be remembered, as JSON.
         arrays: the same, as arrays.
+        anew: whether rows that were saved before have changed: all of them are saved again.
     """
     directory.mkdir(exist_ok=True)
     for left in directory.glob("*.new"):  # by a process that was killed while it wrote
         left.unlink(missing_ok=True)
     buffer, rows = learner.replay, capacity(learner)
     end = np.asarray(buffer.next_row)
-    start, segments = np.zeros_like(end), []
+    start, segments, old = np.zeros_like(end), [], []
     if (directory / STATE).exists():
         with opened(directory / STATE) as saved:
             start, segments = saved[".replay.next_row"], json.loads(str(saved["segments"]))
+    number = segments[-1]["number"] + 1 if segments else 0
+    if anew:
+        start, segments, old = np.maximum(end - rows + 1, 0), [], segments
     # The frontier row is saved again: it held only the newest observation when it was saved before. And where an
     # episode has just been dropped, the end has come back.
     start = np.minimum(start, end)
@@ -96,14 +101,13 @@ def save(
     width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations
     index = jnp.asarray((start[..., None] + np.arange(width)) % rows)
     segment = {name: np.asarray(take(column, index))[:, :, : count.max()] for name, column in buffer.columns.items()}
-    number = segments[-1]["number"] + 1 if segments else 0
     write_atomically(directory / f"rows-{number}.npz", lambda file: np.savez(file, allow_pickle=False, **segment))
     segments.append({"number": number, "start": start.tolist(), "count": count.tolist()})
     alive = [one for one in segments if np.any(np.add(one["start"], one["count"]) > end - rows)]
     state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner).items()} | dict(arrays)
     state |= {"host": np.array(json.dumps(host)), "segments": np.array(json.dumps(alive))}
     write_atomically(directory / STATE, lambda file: np.savez(file, allow_pickle=False, **state))
-    for one in segments:
+    for one in old + segments:
         if one not in alive:  # which are not always the newest: a segment from before a drop may reach further
             (directory / f"rows-{one['number']}.npz").unlink(missing_ok=True)
 
@@ -134,11 +138,11 @@ def load(directory: Path, template: Some) -> tuple[Some, dict[str, Any], dict[st
     return learner, host, {name: array for name, array in state.items() if not name.startswith(".")}
 
 
-def saved_step(directory: Path) -> int | None:
-    """The step of the last checkpoint; None where there is none that can be read."""
+def saved_host(directory: Path) -> dict[str, Any] | None:
+    """The `host` of the last checkpoint; None where there is none that can be read."""
     try:
         with opened(directory / STATE) as saved:
-            return json.loads(str(saved["host"]))["step"]
+            return json.loads(str(saved["host"]))
     except DAMAGED:
         return None
 

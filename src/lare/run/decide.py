@@ -1,7 +1,7 @@
 """Which settings, method, algorithm and task go together."""
 
 from lare.algorithms.table import ALGORITHMS, Consumes
-from lare.credit.methods import Decoder, Method, Reward, find_method
+from lare.credit.methods import Decoder, Encoder, Method, Reward, find_method
 from lare.data.replay import room
 from lare.errors import LareError
 from lare.run.settings import ResolvedSettings, Settings
@@ -70,6 +70,10 @@ def check_method(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> No
             "be a multiple of it"
         )
     check_credit(resolved, method, env)
+    if resolved.reflect_every is not None and method.encoder is not Encoder.LATENT_AND_NEXT:
+        raise LareError(
+            f"reflect_every is for lare-bayes, whose decoder is right at once when phi changes; the method is {method.name}"
+        )
 
 
 def check_credit(resolved: ResolvedSettings, method: Method, env: EnvSpec) -> None:

@@ -1,7 +1,8 @@
 """The run directory: what a run leaves on the disk, and reading it again.
 
 config.json          every setting, versions and commit, the spec's and the function's hash
-latent_function.py   the phi in use, and .json: replies, checks; where teams learn, latent_function_TEAM.py
+latent_function.py   phi, and .json: replies, checks; where teams learn, latent_function_TEAM.py; latent_function-STEP.py is one
+                     that took its place at that step
 metrics.jsonl        one JSON object a line, for each seed and evaluation
 checkpoint/          see checkpoint.py
 failed_batch.npz     what the latent function was given, if it failed
@@ -27,7 +28,7 @@ from lare.errors import Checked, LareError
 from lare.files import write_atomically
 from lare.latent.evaluator import LatentRewardError
 from lare.latent.function import LatentFunction, load, per_role
-from lare.run.checkpoint import STATE
+from lare.run.checkpoint import STATE, saved_host
 from lare.run.settings import ResolvedSettings
 from lare.source import source
 from lare.tasks.spec import Judges, TaskSpec
@@ -84,9 +85,10 @@ def isolation(task: TaskSpec, function: LatentFunction) -> str:
     return function.evaluator(task.observation_size, task.action_size).isolation
 
 
-def function_file(task: TaskSpec, role: TaskSpec) -> str:
-    """Where the latent function of a role is kept."""
-    return FUNCTION if role is task else f"latent_function_{role.team}.py"
+def function_file(task: TaskSpec, role: TaskSpec, since: int = 0) -> str:
+    """Where the latent function of a role is kept that is in use since some step."""
+    of_role = "" if role is task else f"_{role.team}"
+    return f"latent_function{of_role}-{since}.py" if since else f"latent_function{of_role}.py"
 
 
 class Busy(LareError):
@@ -101,6 +103,8 @@ class Run:
     config: Config
     functions: tuple[LatentFunction, ...]
     """One for each role of the task; none for a method that needs none."""
+    since: int = 0
+    """The step from which they have been in use."""
 
     @property
     def function(self) -> LatentFunction | None:
@@ -155,6 +159,11 @@ class Run:
         except LatentRewardError as error:
             place = self.keep_batch(error.observation, error.action)
             raise LareError(f"{error}; it was given the batch in {place}; the last checkpoint is whole") from error
+
+    def keep_functions(self) -> None:
+        """Write the functions that are in use, each to its file. Raises `LareError` where they cannot be written."""
+        for function, role in per_role(self.functions, self.config.task):
+            function.save(self.directory / function_file(self.config.task, role, self.since))
 
     def keep_batch(self, observation: np.ndarray, action: np.ndarray) -> Path:
         """Put the batch that a latent function failed with beside the run, to be looked at."""
@@ -258,15 +267,16 @@ def open_run(directory: str | Path) -> Run:
     """
     directory = Path(directory)
     config = read_config(directory)
-    functions = []
-    wanted = zip(config.task.roles, config.function_sha256, strict=True) if config.function_sha256 else ()
-    for role, digest in wanted:
-        place = directory / function_file(config.task, role)
+    functions, since, digests = [], 0, config.function_sha256
+    if config.settings.reflect_every is not None and (host := saved_host(directory / CHECKPOINT)) is not None:
+        since, digests = host["functions_since"], tuple(host["function_sha256"])
+    for role, digest in zip(config.task.roles, digests, strict=True) if digests else ():
+        place = directory / function_file(config.task, role, since)
         function = load(place, role)
         if function.digest != digest:
             raise LareError(f"{place} is not the function that this run was trained with: its hash changed")
         functions.append(function)
-    return Run(directory, config, tuple(functions))
+    return Run(directory, config, tuple(functions), since)
 
 
 @contextlib.contextmanager

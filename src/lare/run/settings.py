@@ -74,6 +74,9 @@ class Settings(Checked):
     qmix, 10 iterations for ippo, 5 for ppo."""
     evaluation_episodes: Count | None = None
     """Episodes in one evaluation: 10; 50 for ippo and 32 for qmix in JAX."""
+    reflect_every: Count | None = None
+    """lare-bayes: environment steps between two reflections, in which a language model sees what the stored returns say of its
+    function; one that tells them better takes its place. Never, unless given."""
     capacity: Annotated[int, Field(ge=4)] | None = None
     """Rows that the replay of a seed holds; an episode of T steps takes T + 1: 1,000,000; 15,000 of the longest episodes for ippo,
     5000 for qmix."""
@@ -125,6 +128,7 @@ class ResolvedSettings(Checked):
     evaluation_episodes: Count
     capacity: Annotated[int, Field(ge=4)]
     scale_rewards: bool
+    reflect_every: Count | None = None
     hyperparameters: AlgorithmSettings
     """Of the algorithm."""
     credit: CreditSettings
@@ -141,8 +145,9 @@ class ResolvedSettings(Checked):
 
     @model_validator(mode="after")
     def whole_iterations(self) -> "ResolvedSettings":
-        for name, steps in (("steps", self.steps), ("evaluate_every", self.evaluate_every)):
-            if steps % self.iteration_steps:
+        asked = {"steps": self.steps, "evaluate_every": self.evaluate_every, "reflect_every": self.reflect_every}
+        for name, steps in asked.items():
+            if steps is not None and steps % self.iteration_steps:
                 near = max(1, round(steps / self.iteration_steps)) * self.iteration_steps
                 raise ValueError(f"{name} = {steps} is not a multiple of {self.described_iteration}: take {near}")
         return self
@@ -201,6 +206,8 @@ class ResolvedSettings(Checked):
             found += ["fit_every", "fit_updates"]
         if not method.latent:
             found += ["judges", "draw", "candidates"]
+        if self.reflect_every is None:
+            found.append("reflect_every")
         if not self.rereads:
             found.append("capacity")
         if consumes is Consumes.ROLLOUTS:

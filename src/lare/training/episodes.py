@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from lare.credit import closed_form, prediction, returns
+from lare.credit import closed_form, decomposition, prediction, returns
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Fit
 from lare.data import replay
@@ -102,6 +102,21 @@ def sum_again(credit: Credit, buffer: Replay, again: Bool[Array, ""], config: Tr
     since = jnp.where(again, buffer.oldest, buffer.episodes)
     summed = pieces(empty, buffer, since, returns.add_episodes, config)
     return jax.tree.map(lambda new, old: jnp.where(again, new, old), summed, credit)
+
+
+def from_stored(credit: Credit, buffer: Replay, config: TrainConfig) -> Credit:
+    """One seed: untrained decoders that have met all finished episodes of a replay, in statistics and sums, but are not fitted."""
+
+    def observe(one: Decomposition, episodes: Episodes, there: Bool[Array, " episodes"]) -> Decomposition:
+        count = len(episodes.length)
+        known = (episodes.episode < count) & there[jnp.minimum(episodes.episode, count - 1)]
+        mask = known[:, None] & (
+            jnp.ones(episodes.features.shape[:2], bool) if episodes.share is None else episodes.share > 0
+        )
+        return decomposition.observe_steps(one, episodes.features, mask)
+
+    credit = pieces(credit, buffer, buffer.oldest, observe, config)
+    return sum_again(credit, buffer, jnp.array(True), config)
 
 
 def fit_those_due(credit: Decomposition, due: Bool[Array, " seeds"], config: TrainConfig) -> Decomposition:

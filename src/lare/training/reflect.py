@@ -18,7 +18,7 @@ from lare.latent.function import LatentFunction
 from lare.latent.improve import Evidence, Model, improve
 from lare.tasks.play import Episode, Policy, episodes_of
 from lare.tasks.spec import TaskSpec, the_role
-from lare.training.explain import FORMS, entry_names, words
+from lare.training.words import FEWEST, FORMS, entry_names, words
 
 EPISODES = 40
 """That are played, where none are given."""
@@ -71,8 +71,10 @@ def evidence_of(function: LatentFunction, role: TaskSpec, episodes: Sequence[Epi
     """What the returns of some episodes say of a function.
 
     Raises:
-        LatentRewardError: it failed on one of them.
+        LareError: they are too few, or the function failed on one of them.
     """
+    if len(episodes) < FEWEST:
+        raise LareError(f"{len(episodes)} episodes say too little of a function: {FEWEST} are needed")
     factors = [factors_of(function, role, episode) for episode in episodes]
     rows = [
         np.concatenate([z, episode.after, episode.action], axis=-1)

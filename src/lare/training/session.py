@@ -15,11 +15,13 @@ from jaxtyping import Array, Float
 from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import find_method
 from lare.data.trajectory import Trajectory
+from lare.latent.improve import Model
 from lare.run import checkpoint
 from lare.run.directory import Run
 from lare.run.settings import ResolvedSettings
 from lare.tasks.env import JaxEnv, Timestep
 from lare.tasks.table import env_spec, make_env
+from lare.training import renew
 from lare.training.annotate import annotate
 from lare.training.collect_device import DeviceCollector
 from lare.training.collect_host import HostCollector, host_collector
@@ -103,12 +105,25 @@ class Session:
         measured = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest
         return lines(self.run.seeds, self.step, measured, rate)
 
-    def save(self) -> None:
-        """Write a checkpoint."""
+    def save(self, anew: bool = False) -> None:
+        """Write a checkpoint; `anew` where stored rows have changed."""
+        digests = [function.digest for function in self.run.functions]
         host = {"step": self.step, "metrics_length": self.metrics_length}
+        host |= {"functions_since": self.run.since, "function_sha256": digests}
         arrays = {f"latest/{name}": np.asarray(values) for name, values in self.latest.items()}
         arrays |= {f"collector/{name}": values for name, values in self.collector.saved().items()}
-        checkpoint.save(self.run.checkpoint, self.learner, host, arrays)
+        checkpoint.save(self.run.checkpoint, self.learner, host, arrays, anew)
+
+    def reflect(self, model: Model, said: Callable[[str], None]) -> None:
+        """Ask for a better phi, and go on with it from here where it tells the stored returns better."""
+        found = renew.reflected(self.run, self.config, self.learner, model, said)
+        if [one.source for one in found] == [one.source for one in self.run.functions]:
+            return
+        self.run = renew.in_place_of(self.run, found, self.step)
+        self.config = config_for(self.run)
+        self.learner = renew.with_functions(self.run, self.config, self.learner)
+        self.functions = compile_ahead(self.run, self.config, compiled(self.config))
+        self.save(anew=True)
 
     def return_to(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[str]:
         """Put everything around the learner back to a checkpoint; returns what is to be said about it."""

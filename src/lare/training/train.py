@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from functools import partial
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from lare.credit.methods import Fit, Method, Reward, find_method
 from lare.errors import LareError
 from lare.latent.design import CANDIDATES, design
 from lare.latent.function import LatentFunction, load, per_role
+from lare.latent.improve import Model
 from lare.run.decide import decide
 from lare.run.directory import Run, create, default_directory, isolation, locked, open_run
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain
@@ -38,6 +38,7 @@ def train(
     settings: Settings | None = None,
     *,
     function: Given | Sequence[Given] | None = None,
+    model: Model | None = None,
     out: str | Path | None = None,
     tensorboard: bool = False,
     listeners: Sequence[Listener] | None = None,
@@ -49,6 +50,7 @@ def train(
         settings: method, algorithm, steps, seeds and all the rest.
         function: `phi`, or the path of its file, for the methods that need one; one for each team where several learn. Without
             it, it is designed from the shipped recordings.
+        model: whom `reflect_every` asks.
         out: the run directory, which must not exist; `runs/...` unless given.
         tensorboard: also write every number of metrics.jsonl as TensorBoard events, with the extra `lare-rl[tensorboard]`.
         listeners: who is told of the progress; the terminal, unless given.
@@ -62,12 +64,13 @@ def train(
     task = task if isinstance(task, TaskSpec) else load_task(task)
     given = settings or Settings()
     resolved = decide(given, task)
+    check_model(resolved, model)
     functions = chosen_functions(task, resolved, function)
     run = create(Path(out) if out is not None else default_directory(task, resolved), task, resolved, functions)
     in_vain = list(set_in_vain(given, resolved, task).values())
     said = in_vain[:1] if len(in_vain) < 2 else [f"{in_vain[0]} (and {len(in_vain) - 1} more)"]
     with locked(run), enough_memory(run):
-        return begin(run, tensorboard, listeners, *said)
+        return begin(run, model, tensorboard, listeners, *said)
 
 
 def chosen_functions(
@@ -91,6 +94,14 @@ def chosen_functions(
     return tuple(functions)
 
 
+def check_model(settings: ResolvedSettings, model: Model | None) -> None:
+    """Raise `LareError` where a model is needed and not given, or given and not needed."""
+    if settings.reflect_every is not None and model is None:
+        raise LareError("reflect_every asks a language model: say which one with --model NAME (model=... in Python)")
+    if settings.reflect_every is None and model is not None:
+        raise LareError("a model is given, and nothing asks it: say how often with --reflect-every STEPS")
+
+
 def check_given(settings: ResolvedSettings) -> None:
     """Raise `LareError` where a recorded function is chosen although another one is given."""
     if (settings.draw, settings.candidates) != (0, CANDIDATES):
@@ -108,7 +119,13 @@ def check_size(method: Method, factors: int) -> None:
         raise LareError(f"{method.name} tries all signs of at most {LARGEST_CHOICE} factors, and there are {factors}")
 
 
-def resume(directory: str | Path, *, tensorboard: bool = False, listeners: Sequence[Listener] | None = None) -> Run:
+def resume(
+    directory: str | Path,
+    *,
+    model: Model | None = None,
+    tensorboard: bool = False,
+    listeners: Sequence[Listener] | None = None,
+) -> Run:
     """Go on with a run that was stopped or killed, from its last checkpoint to its end.
 
     On the CPU the metrics are then, bit for bit, those of a run that never stopped (but for the times).
@@ -119,25 +136,29 @@ def resume(directory: str | Path, *, tensorboard: bool = False, listeners: Seque
     if tensorboard:
         summary_writer()
     run = open_run(directory)
+    check_model(run.config.settings, model)
     with locked(run), enough_memory(run):
         if not run.has_checkpoint():
             if run.metrics():  # what has been measured is never taken back
                 raise LareError(f"{run.directory} has no checkpoint any more: there is nothing to go on from")
-            return begin(run, tensorboard, listeners)
+            return begin(run, model, tensorboard, listeners)
         restored, messages = sessions.restore(run)
         run.truncate(restored.metrics_length)
-        return finish(restored, tensorboard, listeners, *messages)
+        return finish(restored, model, tensorboard, listeners, *messages)
 
 
-def begin(run: Run, tensorboard: bool, listeners: Sequence[Listener] | None, *messages: str) -> Run:
+def begin(
+    run: Run, model: Model | None, tensorboard: bool, listeners: Sequence[Listener] | None, *messages: str
+) -> Run:
     """From the first step on. The untrained learner is saved, so that there is a checkpoint whatever happens."""
     started = sessions.start(run)
     started.save()
-    return finish(started, tensorboard, listeners, *messages)
+    return finish(started, model, tensorboard, listeners, *messages)
 
 
 def finish(
     session: Session,
+    model: Model | None,
     tensorboard: bool,
     listeners: Sequence[Listener] | None,
     *messages: str,
@@ -146,6 +167,11 @@ def finish(
     run, settings = session.run, session.settings
     told: list[Listener] = [Terminal()] if listeners is None else list(listeners)
     clock, explained = Clock(session.step), False
+
+    def say(line: str) -> None:
+        for listener in told:
+            listener.said(line)
+
     try:
         if tensorboard:
             told.append(TensorBoard(run.directory / "tensorboard", session.step, run.seeds))
@@ -165,9 +191,11 @@ def finish(
                         listener.evaluated(lines)
                     if session.step == settings.steps or not explained:
                         sentences = explanation(session)
-                        for listener, line in product(told, sentences):
-                            listener.said(line)
+                        for line in sentences:
+                            say(line)
                         explained = explained or bool(sentences)
+                if model is not None and due(session.step, settings.reflect_every, settings.steps):
+                    session.reflect(model, say)
                 if stop.is_set() and session.step < settings.steps:
                     check_losses(session)
                     session.save()
@@ -178,7 +206,12 @@ def finish(
         for listener in told:
             listener.stopped()
         session.close()
-    return run
+    return session.run
+
+
+def due(step: int, every: int | None, last: int) -> bool:
+    """Whether it is the turn of what comes again and again, but not at the end."""
+    return every is not None and step % every == 0 and step < last
 
 
 def explanation(session: Session) -> list[str]:

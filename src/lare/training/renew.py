@@ -1,0 +1,174 @@
+"""Reflection in the middle of a run: phi is judged by the stored episodes, and one that tells their returns better takes its place.
+
+The factors of all stored steps are then computed again from the stored observations, and the decoder is fitted in closed form to
+all stored episodes, so that it is right at once. What the algorithm has learned stays as it is.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from lare.data.replay import Replay, StoredSteps, oldest_transition, read
+from lare.data.sampling import episodes_since, in_order
+from lare.latent.function import LatentFunction
+from lare.latent.improve import Model, improve
+from lare.run.directory import Run
+from lare.tasks.env import Team, Timestep, in_units, team_mean
+from lare.tasks.play import Episode, rows_of
+from lare.tasks.spec import TaskSpec
+from lare.training.config import TrainConfig
+from lare.training.episodes import Credit, fit_those_due, from_stored
+from lare.training.learner import Learner, init_credit
+from lare.training.reflect import evidence_of
+from lare.training.seeds import of_seed
+from lare.training.streams import seed_keys
+
+EPISODES = 200
+"""The newest of all seeds together, by which functions are judged."""
+ROWS = 10_000
+"""Steps whose factors are computed at a time."""
+
+
+def reflected(
+    run: Run, config: TrainConfig, learner: Learner, model: Model, said: Callable[[str], None]
+) -> tuple[LatentFunction, ...]:
+    """The functions of a run after a round of reflection each, by the run's stored episodes."""
+    found = []
+    for place, (function, role) in enumerate(zip(run.functions, run.config.task.roles, strict=True)):
+        role = role.model_copy(update={"judges": run.judges})
+        episodes = stored_episodes(learner, config, role, place)
+
+        def judge(one: LatentFunction, role: TaskSpec = role, episodes: list[Episode] = episodes):
+            return evidence_of(one, role, episodes)
+
+        team = f"{role.team}: " if len(run.functions) > 1 else ""
+        found.append(improve(function, role, model, judge, said=lambda line, team=team: said(team + line)))
+    return tuple(found)
+
+
+def stored_episodes(learner: Learner, config: TrainConfig, role: TaskSpec, place: int) -> list[Episode]:
+    """The newest finished episodes of all seeds, in the order in which they were played, as one role is judged."""
+    seeds = len(learner.counted)
+    each = max(1, EPISODES // (seeds * config.environments))
+    read_one, found = jax.jit(partial(stored_episode, longest=config.env.max_steps)), []
+    for seed in range(seeds):
+        buffer = of_seed(learner.replay, seed)
+        since = jnp.maximum(buffer.episodes - each, buffer.oldest)
+        ends = np.cumsum(np.asarray(episodes_since(buffer, since)))
+        for env, end in enumerate(ends):
+            start = ends[env - 1] if env else 0
+            for number in range(start, end):
+                steps, length = read_one(buffer, since, number)
+                # The newest of each environment were played at about the same time.
+                found.append((number - end, as_judged(steps, int(length), config, role, config.env.teams[place])))
+    return [episode for _, episode in sorted(found, key=lambda one: one[0])]
+
+
+def stored_episode(
+    buffer: Replay, since: Int[Array, " envs"], number: Int[Array, ""], longest: int
+) -> tuple[StoredSteps, Int[Array, ""]]:
+    """The steps of one finished episode and, behind them, padding; and how many there are."""
+    sample = in_order(buffer, since, number, 1, longest)
+    return read(buffer, sample.steps), sample.episodes.length[0]
+
+
+def as_judged(steps: StoredSteps, length: int, config: TrainConfig, role: TaskSpec, team: Team) -> Episode:
+    """Stored steps as a role is judged."""
+    env = config.env
+    before, after = (
+        {name: np.asarray(part)[:length] for name, part in one.items()} for one in (steps.before, steps.after)
+    )
+    shown, led_to = timestep(before), timestep(after)
+    taken = in_units(before["action"], env)
+    alive = before.get("alive", np.ones((length, env.agents), bool))
+    paid = np.asarray(team_mean(before["reward"], alive, team))
+    rows, action = rows_of(role, team, shown, taken)
+    there, reward = alive[:, team.agents], before["reward"][:, team.agents]
+    if config.of_state:
+        there, reward = np.ones((length, 1), bool), paid[:, None]
+    return Episode(rows, action, rows_of(role, team, led_to, taken)[0], there, reward, paid)
+
+
+def timestep(columns: dict[str, np.ndarray]) -> Timestep:
+    """As far as functions look at one."""
+    none = np.zeros(0, np.float32)
+    return Timestep(
+        observation=columns.get("observation", none),
+        state=columns.get("state", none),
+        available=none,
+        alive=none,
+        reward=none,
+        terminated=none,
+        truncated=none,
+        measures={},
+    )
+
+
+def with_functions(run: Run, config: TrainConfig, learner: Learner) -> Learner:
+    """A learner whose stored factors, and whose decoders, are of a run's new functions.
+
+    Args:
+        run: with the new functions.
+        config: of that run.
+        learner: with the factors of the old ones.
+    """
+    columns = dict(learner.replay.columns)
+    buffers = [of_seed(learner.replay, seed) for seed in range(len(run.seeds))]
+    columns["factors"] = jnp.stack([factors_again(run, config, buffer) for buffer in buffers])
+    buffer = learner.replay._replace(columns=columns)
+    credit = jax.vmap(partial(untrained, config=config))(learner.credit, seed_keys(jnp.asarray(run.seeds), 0))
+    with jax.enable_x64(True):
+        credit = jax.jit(partial(fitted_to_all, config=config))(credit, buffer)
+    return learner._replace(credit=credit, replay=buffer, counted=jnp.copy(buffer.episodes))
+
+
+def factors_again(run: Run, config: TrainConfig, buffer: Replay) -> Float[Array, "envs rows judged factors"]:
+    """The factors of all steps that are stored, in their rows."""
+    envs, capacity = buffer.row.shape
+    found = np.zeros((envs, capacity, config.judged_rows, max(config.factors)), np.float32)
+    first, last = np.asarray(oldest_transition(buffer)), np.asarray(buffer.transitions)
+    columns = {name: np.asarray(column) for name, column in buffer.columns.items()}
+    for env in range(envs):
+        rows = np.asarray(buffer.row)[env, np.arange(first[env], last[env]) % capacity]
+        for some in np.split(rows, range(ROWS, len(rows), ROWS)):
+            shown, led_to = (
+                timestep({name: column[env, at] for name, column in columns.items()})
+                for at in (some, (some + 1) % capacity)
+            )
+            taken = in_units(columns["action"][env, some], config.env)
+            for place, (function, team) in enumerate(zip(run.functions, config.env.teams, strict=True)):
+                before, action = rows_of(run.config.task, team, shown, taken)
+                after, _ = rows_of(run.config.task, team, led_to, taken)
+                z = run.factors(function, *(part.reshape(-1, part.shape[-1]) for part in (before, action, after)))
+                found[env, some, config.judged(place), : z.shape[1]] = z.reshape(*action.shape[:-1], -1)
+    return jnp.asarray(found)
+
+
+def untrained(known: Credit, key: Array, config: TrainConfig) -> Credit:
+    """New decoders of one seed. What was learned of returns alone is kept."""
+    return tuple(
+        new._replace(scale=old.scale, return_scale=old.return_scale, average=old.average, rivals=old.rivals)
+        for new, old in zip(init_credit([key] * len(known), config), known, strict=True)
+    )
+
+
+def fitted_to_all(credit: Credit, buffer: Replay, config: TrainConfig) -> Credit:
+    """Untrained decoders of all seeds, fitted to all stored episodes. In float64, where that is enabled."""
+    credit = jax.vmap(lambda one, stored: from_stored(one, stored, config))(credit, buffer)
+    every = jnp.ones(len(buffer.episodes), bool)
+    return tuple(fit_those_due(one, every, config) for one in credit)
+
+
+def in_place_of(run: Run, functions: tuple[LatentFunction, ...], step: int) -> Run:
+    """A run that goes on with other functions from some step on; they are kept in its directory."""
+    renewed = replace(run, functions=functions, since=step)
+    renewed.keep_functions()
+    for function in run.functions:
+        if function not in functions:
+            function.close()
+    return renewed

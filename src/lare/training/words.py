@@ -1,0 +1,80 @@
+"""In words: how well returns can be told from the factors, which factors matter, and what may be missing."""
+
+import re
+
+import numpy as np
+
+from lare.credit.explanation import Explanation
+from lare.tasks.spec import TaskSpec
+
+FEWEST = 20
+"""Episodes, below which nothing is said."""
+NEXT_TO_NOTHING = 0.1
+"""Of the variation of the returns."""
+STRIKING = 0.3
+"""A correlation with what the factors leave."""
+FORMS = ("sum", "average")
+"""Of a score, by number."""
+
+
+def entry_names(spec: TaskSpec, entries: int) -> list[str]:
+    """What the task's text calls the entries of [s', a]: `7: angle of the foot` names entry 7."""
+
+    def named(text: str, count: int, kind: str) -> list[str]:
+        lines = dict(re.findall(r"^[\s\-*\[]*(\d+)\]?\s*[:.)]\s*(.+)$", text, flags=re.MULTILINE))
+        return [
+            f"entry {i} of the {kind}" + (f" ({lines[str(i)].strip()})" if str(i) in lines else "")
+            for i in range(count)
+        ]
+
+    shown = max(0, entries - spec.action_size)
+    return named(spec.observation, shown, "observation") + named(spec.action, entries - shown, "action")
+
+
+def words(found: Explanation, form: str | None, factors: list[str], entries: list[str]) -> list[str]:
+    """What is to be said, a sentence each.
+
+    Args:
+        found: of one team's score.
+        form: `sum` or `average`, where it was found out; None where it makes no difference.
+        factors: names of the factors; empty for a method without.
+        entries: names of the raw entries.
+    """
+    count = int(found.episodes)
+    if count < FEWEST or not np.isfinite(found.by_all):
+        return []
+    said = []
+    if form is not None:
+        said.append(
+            {
+                "sum": "The score is taken for a sum over the steps of an episode.",
+                "average": "The score is taken for an average over the steps of an episode: longer episodes do not score more.",
+            }[form]
+        )
+    if not factors:
+        return [*said, f"Raw features explain {found.by_all:.0%} of the variation of the returns of {count} episodes."]
+    more = float(found.by_all - found.by_factors)
+    said.append(
+        f"The factors explain {found.by_factors:.0%} of the variation of the returns of {count} episodes"
+        + (f", raw features another {more:.0%}." if entries and more >= 0.01 else ".")
+    )
+    if found.by_factors < NEXT_TO_NOTHING:
+        said.append(
+            "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of."
+        )
+    else:
+        said.append(
+            "What goes with each factor: its share of the variation, and what a step pays more for one standard deviation of it:"
+        )
+        said += [
+            f"- {factors[i]}: {max(0, found.share[i]):.0%}, {found.weight[i]:+.3g} ± {found.deviation[i]:.1g}"
+            for i in np.argsort(-found.share, kind="stable")
+        ]
+    if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:
+        place = int(np.argmax(np.abs(found.left)))
+        way = "large" if found.left[place] > 0 else "small"
+        said.append(
+            f"Returns are higher than the factors predict when {entries[place]} is {way} "
+            f"(correlation {found.left[place]:+.2f}): a factor may be missing."
+        )
+    return said

@@ -1,0 +1,149 @@
+"""Reflection in the middle of a run: a better phi takes its place, exactly, and nothing that goes wrong hurts the run."""
+
+import json
+import signal
+
+import jax
+import numpy as np
+import pytest
+
+import lare
+from lare.data.replay import oldest_transition
+from lare.errors import LareError
+from lare.latent.function import verified
+from lare.llm.recording import RecordedModel, read_recording
+from lare.run.directory import open_run
+from lare.tasks.spec import read_task
+from lare.training.explain import explanation_of
+from lare.training.seeds import of_seed
+from lare.training.session import load_learner
+from lare.training.train import Interrupted
+from toys import At, Ear, Says, figures, toy_spec
+
+WRONG = "def evaluation_func(observation, action):\n    return [observation[:, 1:2]]"
+RIGHT = "def evaluation_func(observation, action):\n    return [np.square(action - observation[:, 0:1]), action]"
+
+
+@pytest.fixture
+def settings(small):
+    changes = {"steps": 1800, "seeds": 2, "evaluate_every": 300, "reflect_every": 600}
+    return small(method="lare-bayes", algorithm="td3", **changes)
+
+
+def trained(settings, model, out, listeners=()):
+    task = toy_spec(judges="before")
+    return lare.train(task, settings, function=verified(WRONG, task), model=model, out=out, listeners=listeners)
+
+
+def test_a_better_function_takes_its_place(settings, tmp_path):
+    ear, model = Ear(), Says(RIGHT, WRONG)
+    run = trained(settings, model, tmp_path / "run", [ear])
+    assert (run.function.source, run.since) == (RIGHT, 600)
+    said = [line for line in ear.heard if line.startswith("reflection")]
+    assert [line.endswith(("kept", "not better")) for line in said] == [False, True, False, True]
+    assert "What goes with each factor" in model.asked[1][-1]["content"]
+    before, after = (
+        [line["credit/correlation"] for line in run.metrics() if line["step"] == step] for step in (600, 900)
+    )
+    assert max(before) < 0.95
+    assert min(after) > 0.999
+    again = open_run(tmp_path / "run")
+    assert (again.function.source, again.since) == (RIGHT, 600)
+    assert "def evaluation_func" in (tmp_path / "run" / "latent_function-600.py").read_text()
+    assert explanation_of(again)[0].startswith("The factors explain 100%")
+    assert len(again.function.exchanges) == 1
+
+
+def test_the_factors_of_all_stored_steps_are_computed_again(settings, tmp_path):
+    run = trained(settings, Says(RIGHT, WRONG), tmp_path / "run")
+    _, learner, _, _ = load_learner(run)
+    for seed in range(2):
+        buffer = of_seed(learner.replay, seed)
+        rows = np.asarray(buffer.row)[0, int(oldest_transition(buffer)[0]) : int(buffer.transitions[0])]
+        observation, action, z = (
+            np.asarray(buffer.columns[name])[0, rows] for name in ("observation", "action", "factors")
+        )
+        taken = np.clip(action, -1, 1) * 2
+        assert len(rows) == 1800
+        np.testing.assert_allclose(
+            z[:, 0], np.concatenate([(taken - observation[..., :1])[:, 0] ** 2, taken[:, 0]], 1), atol=1e-5
+        )
+
+
+def test_a_run_that_is_stopped_after_a_reflection_goes_on_bit_for_bit(settings, tmp_path):
+    whole = trained(settings, Says(RIGHT, WRONG), tmp_path / "whole")
+    with pytest.raises(Interrupted):
+        trained(settings, Says(RIGHT), tmp_path / "run", [At(708, lambda: signal.raise_signal(signal.SIGINT))])
+    assert figures(lare.resume(tmp_path / "run", model=Says(WRONG), listeners=[])) == figures(whole)
+
+
+def test_what_was_recorded_answers_again(settings, tmp_path):
+    """A recording of the exchanges of one run is the model of another, which is the same."""
+    first = trained(settings, Says(RIGHT, WRONG), tmp_path / "first")
+    talk = {
+        "task": "Chase",
+        "kind": "factors",
+        "draw": 0,
+        "model": "says",
+        "recorded": "2026-01-01",
+        "temperature": None,
+    }
+    text = json.dumps(talk | {"exchanges": list(first.function.exchanges)})
+    second = trained(settings, RecordedModel([read_recording(text, "talk.json")], "Chase"), tmp_path / "second")
+    assert figures(second) == figures(first)
+
+
+def test_a_model_that_has_left_does_not_end_the_run(settings, tmp_path):
+    ear = Ear()
+    run = trained(settings, Says(), tmp_path / "run", [ear])
+    assert (run.function.source, run.since) == (WRONG, 0)
+    assert "reflection 1: nobody there" in ear.heard
+    assert run.metrics()[-1]["step"] == 1800
+
+
+def test_where_few_episodes_have_finished_nothing_is_asked(settings, tmp_path):
+    ear, model = Ear(), Says(RIGHT)
+    asked = settings.model_copy(update={"steps": 240, "evaluate_every": 60, "reflect_every": 120})
+    trained(asked, model, tmp_path / "run", [ear])
+    assert "no reflection: 12 episodes say too little of a function: 20 are needed" in ear.heard
+    assert model.asked == []
+
+
+def test_many_agents(small_many, tmp_path):
+    task = read_task("CN-6")
+    first = "def evaluation_func(o, a):\n    return [o[:, 0:1] * a[:, 0:1]]"
+    better = "def evaluation_func(o, a):\n    return [np.sum(np.square(o[:, 4:8]), axis=1, keepdims=True), o[:, 0:1], o[:, 1:2]]"
+    asked = small_many(method="lare-bayes", seeds=1, steps=400, evaluate_every=200, reflect_every=200, capacity=2000)
+    ear = Ear()
+    run = lare.train(
+        task, asked, function=verified(first, task), model=Says(better), out=tmp_path / "run", listeners=[ear]
+    )
+    _, learner, _, _ = load_learner(run)
+    assert learner.replay.columns["factors"].shape[-1] == (3 if run.since else 1)
+    assert np.all(np.isfinite(jax.tree.leaves(learner.credit)[0]))
+    assert run.metrics()[-1]["step"] == 400
+
+
+@pytest.mark.parametrize(
+    ("changes", "model", "message"),
+    [
+        (
+            {"method": "lare-linear"},
+            Says(),
+            "reflect_every is for lare-bayes, whose decoder is right at once when phi changes; the ",
+        ),
+        ({"reflect_every": 100}, Says(), "reflect_every = 100 is not a multiple of rollout_steps = 12: take 96"),
+        ({}, None, "reflect_every asks a language model: say which one with --model NAME (model=... in Python)"),
+        (
+            {"reflect_every": None},
+            Says(),
+            "a model is given, and nothing asks it: say how often with --reflect-every STEPS",
+        ),
+    ],
+)
+def test_what_does_not_go_together(settings, changes, model, message, tmp_path):
+    with pytest.raises(
+        LareError, match="^" + message.replace("(", r"\(").replace(")", r"\)").replace("...", r"\.\.\.")
+    ):
+        trained(settings.model_copy(update=changes), model, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
