@@ -143,6 +143,7 @@ def small_many():
             "evaluation_episodes": 4,
             "fit_every": 1,
             "fit_updates": 2,
+            "first_fit": "published",
             "capacity": 400,
             "ippo": PPOSettings(hidden=(8,), minibatch_size=100, epochs=1),
             **{name: ALGORITHMS[name].settings.model_copy(update=quick) for name in ("qmix", "vdn")},

@@ -1,7 +1,7 @@
 """Every setting of a run: what a user gives, and with everything decided."""
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, create_model, field_validator, model_validator
 from pydantic.fields import FieldInfo
@@ -69,6 +69,9 @@ class Settings(Checked):
     """ppo and ippo, and every algorithm with diaster: iterations for each time that the decoder is fitted; 10 for ippo, else 1."""
     fit_updates: Count | None = None
     """The same: gradient steps of the decoder then; 500 for ppo, 50 for ippo, one for 50 environment steps with diaster."""
+    first_fit: Literal["held-out", "published"] | None = None
+    """ippo: how long the decoder's first fit goes on. held-out: until the error on held-out episodes stops falling. published:
+    fit_updates, as every later one. held-out, unless given."""
     evaluate_every: Count | None = None
     """Environment steps between two evaluations; a checkpoint is written at each: 5000 for td3, ddpg and sac, about 10,000 for
     qmix, 10 iterations for ippo, 5 for ppo."""
@@ -129,6 +132,7 @@ class ResolvedSettings(Checked):
     capacity: Annotated[int, Field(ge=4)]
     scale_rewards: bool
     reflect_every: Count | None = None
+    first_fit: Literal["held-out", "published"] = "published"
     hyperparameters: AlgorithmSettings
     """Of the algorithm."""
     credit: CreditSettings
@@ -204,6 +208,8 @@ class ResolvedSettings(Checked):
         apart = method.fit is not None and method.fit.apart
         if not method.descends or (consumes is not Consumes.ROLLOUTS and not apart):
             found += ["fit_every", "fit_updates"]
+        if not (method.descends and consumes is Consumes.ROLLOUTS and ALGORITHMS[self.algorithm].many_agents):
+            found.append("first_fit")
         if not method.latent:
             found += ["judges", "draw", "candidates"]
         if self.reflect_every is None:

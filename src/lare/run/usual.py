@@ -50,6 +50,7 @@ def ippo(env: EnvSpec, copies: int) -> dict[str, Any]:
         "rollout_steps": env.max_steps if env.fixed_length else max(1, (2050 if env.in_jax else 2000) // copies),
         "fit_every": 10,
         "fit_updates": 50,
+        "first_fit": "held-out",
         "steps_iterations": 1000,
         "evaluate_iterations": 10,
         "evaluation_episodes": 50 if env.in_jax else 10,

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import find_method
@@ -21,7 +21,7 @@ from lare.run.directory import Run
 from lare.run.settings import ResolvedSettings
 from lare.tasks.env import JaxEnv, Timestep
 from lare.tasks.table import env_spec, make_env
-from lare.training import renew
+from lare.training import first_fit, renew
 from lare.training.annotate import annotate
 from lare.training.collect_device import DeviceCollector
 from lare.training.collect_host import HostCollector, host_collector
@@ -65,6 +65,8 @@ class Session:
     """Environment steps done, of each seed."""
     metrics_length: int = 0
     """Bytes of metrics.jsonl that belong to the state."""
+    fitted: bool = False
+    """Whether the decoders' first fit has been made."""
     latest: dict[str, Float[Array, " seeds"]] = field(default_factory=dict)
     """What the last updates measured."""
 
@@ -92,12 +94,22 @@ class Session:
         number = self.step // self.settings.iteration_steps
         fits = self.config.method.descends and not self.config.interleaved
         if fits and number % self.settings.fit_every == 0:
-            self.learner, fitted = self.functions.fit(self.learner, stream_keys(self.run.seeds, Stream.FIT, self.step))
-            self.latest |= fitted
+            self.fit(stream_keys(self.run.seeds, Stream.FIT, self.step))
         keys = seed_keys(jnp.asarray(self.run.seeds), self.step + 1)
         self.learner, learned = self.functions.improve(self.learner, steps, keys, self.step)
         if np.any(np.asarray(learned.get("algorithm/updates", 1)) > 0):
             self.latest |= learned
+
+    def fit(self, keys: Key[Array, " seeds"]) -> None:
+        """The decoder's own updates, the first time until they stop helping."""
+        if self.settings.first_fit == "held-out" and not self.fitted and first_fit.has_enough(self.learner):
+            self.learner, measured = first_fit.fit_until_it_stops_helping(
+                self.learner, self.functions.fit, keys, self.config
+            )
+            self.fitted = True
+        else:
+            self.learner, measured = self.functions.fit(self.learner, keys)
+        self.latest |= measured
 
     def report(self, rate: float) -> list[dict[str, Any]]:
         """Evaluate, always from the same starts; one line of metrics.jsonl for each seed."""
@@ -108,7 +120,7 @@ class Session:
     def save(self, anew: bool = False) -> None:
         """Write a checkpoint; `anew` where stored rows have changed."""
         digests = [function.digest for function in self.run.functions]
-        host = {"step": self.step, "metrics_length": self.metrics_length}
+        host = {"step": self.step, "metrics_length": self.metrics_length, "fitted": self.fitted}
         host |= {"functions_since": self.run.since, "function_sha256": digests}
         arrays = {f"latest/{name}": np.asarray(values) for name, values in self.latest.items()}
         arrays |= {f"collector/{name}": values for name, values in self.collector.saved().items()}
@@ -127,7 +139,7 @@ class Session:
 
     def return_to(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[str]:
         """Put everything around the learner back to a checkpoint; returns what is to be said about it."""
-        self.step, self.metrics_length = host["step"], host["metrics_length"]
+        self.step, self.metrics_length, self.fitted = host["step"], host["metrics_length"], host.get("fitted", False)
         self.latest = {name: jnp.asarray(values) for name, values in part(arrays, "latest/").items()}
         dropped, messages = self.collector.restore(part(arrays, "collector/"))
         if dropped.any():

@@ -57,6 +57,7 @@ SHORT: Mapping[str, Mapping[str, Any]] = {
     "qmix": {"environments": 2, "steps": 1200, "qmix": FEW},
 }
 LAPTOP: Mapping[str, Mapping[str, Any]] = {
+    "ippo": {"first_fit": "published"},
     "qmix": {
         "steps": 200_000,
         "evaluate_every": 20_000,
@@ -64,7 +65,7 @@ LAPTOP: Mapping[str, Mapping[str, Any]] = {
     },
 }
 """Twice as many updates as PyMARL2 makes, each on a quarter of the episodes: within 200,000 steps updates are what is scarce."""
-PAPER: Mapping[str, Mapping[str, Any]] = {"qmix": {"steps": 10_050_000}}
+PAPER: Mapping[str, Mapping[str, Any]] = {"ippo": {"first_fit": "published"}, "qmix": {"steps": 10_050_000}}
 
 BUDGETS: Mapping[str, Budget] = {
     budget.name: budget

@@ -1,0 +1,93 @@
+"""The first fit of many agents' decoders that descend a gradient: it goes on until the error on held-out episodes stops falling.
+
+As published, a decoder is fitted in 50 updates to the first episodes and, after every tenth iteration, in 50 more. Of 15 agents
+that is too few: the policy commits itself before the decoder is right (docs/results/agents.md).
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from lare.credit import returns
+from lare.credit.decomposition import Decomposition, Episodes
+from lare.credit.prediction import LAST, no_predictions, squared_errors
+from lare.data.replay import Replay, finished
+from lare.normalise import magnitude
+from lare.training.config import TrainConfig
+from lare.training.episodes import Credit, pieces
+from lare.training.learner import Learner
+
+FEWEST = 10
+"""Finished episodes of each seed, below which none are held out."""
+PATIENCE = 2
+"""Fits in a row that may bring nothing."""
+MOST = 40
+"""Fits at most."""
+
+Fit = Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, dict[str, Float[Array, " seeds"]]]]
+
+
+def has_enough(learner: Learner) -> bool:
+    """Whether every seed has episodes to hold out."""
+    return int(jnp.min(jnp.sum(jax.vmap(finished)(learner.replay), axis=1))) >= FEWEST
+
+
+def fit_until_it_stops_helping(
+    learner: Learner, fit: Fit, keys: Key[Array, " seeds"], config: TrainConfig
+) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
+    """Fit again and again; of each seed, the decoders with the least error on held-out episodes are kept.
+
+    Args:
+        learner: of all seeds, with enough episodes.
+        fit: one fit, which consumes the learner that it is given.
+        keys: of the first fit; those of the others follow from them.
+        config: of the run.
+    """
+    episodes, running = jnp.copy(learner.replay.episodes), jnp.copy(learner.replay.running)
+    held = jax.vmap(held_out)(learner.replay)
+    assess = jax.jit(jax.vmap(partial(error_of, config=config)))
+    best, least, waited = jax.tree.map(jnp.copy, learner.credit), np.full(len(episodes), np.inf), 0
+    measured: dict[str, Float[Array, " seeds"]] = {}
+    for number in range(MOST):
+        hidden = learner.replay._replace(episodes=episodes - held, running=jnp.ones_like(running))
+        again = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
+        learner, measured = fit(learner._replace(replay=hidden), again)
+        whole = learner.replay._replace(episodes=jnp.copy(episodes), running=jnp.copy(running))
+        learner = learner._replace(replay=whole)
+        error = np.asarray(assess(learner.credit, whole, held))
+        better = error < least
+        best = jax.tree.map(partial(of_those, jnp.asarray(better)), learner.credit, best)
+        least, waited = np.where(better, error, least), 0 if better.any() else waited + 1
+        if waited == PATIENCE:
+            break
+    return learner._replace(credit=best), measured
+
+
+def of_those(better: Bool[Array, " seeds"], new: Array, old: Array) -> Array:
+    """The new values of those seeds that are better."""
+    return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+
+def held_out(buffer: Replay) -> Int[Array, " envs"]:
+    """How many of the newest episodes of each environment are held out: a fifth of all, those of the last environments."""
+    there = finished(buffer)
+    wanted = jnp.minimum(jnp.sum(there) // 5, LAST)
+    behind = jnp.cumsum(there[::-1])[::-1] - there
+    return jnp.clip(wanted - behind, 0, there)
+
+
+def error_of(credit: Credit, buffer: Replay, held: Int[Array, " envs"], config: TrainConfig) -> Float[Array, ""]:
+    """Squared error of the returns of held-out episodes, of one seed; summed over the teams, each in units of its returns."""
+
+    def take(one: Decomposition, new: Episodes, there: Bool[Array, " episodes"]) -> Decomposition:
+        return returns.predict(one, new, there, config.credit)
+
+    asked = tuple(one._replace(predictions=no_predictions(1)) for one in credit)
+    told = pieces(asked, buffer, buffer.episodes - held, take, config)
+    return sum(
+        (squared_errors(one.predictions)[0] / magnitude(one.return_scale) ** 2 for one in told), start=jnp.zeros(())
+    )
