@@ -43,7 +43,7 @@ def test_groups_that_are_not_there(factors, entries, extended):
 
 
 @pytest.mark.parametrize(
-    ("entries", "frequencies"), [(23, 3), (73, 3), (74, 2), (100, 2), (200, 0), (393, 0), (2000, 0)]
+    ("entries", "frequencies"), [(23, 3), (73, 3), (74, 2), (100, 2), (200, 0), (393, 0), (900, 0)]
 )
 def test_many_entries_get_fewer_shapes(entries, frequencies):
     basis = Basis(0, entries, extended=True)
@@ -54,3 +54,11 @@ def test_many_entries_get_fewer_shapes(entries, frequencies):
 
 def test_no_frequencies_are_no_features():
     assert shapes(jnp.ones((3, 2)), 0).shape == (3, 0)
+
+
+def test_entries_of_a_picture_are_left_out():
+    basis = Basis(2, 5000, extended=True)
+    assert "entries" not in basis.sizes
+    assert basis.inputs == 5002
+    assert expand(basis, jnp.zeros((3, 5002))).shape == (3, basis.size) == (3, 15)
+    assert Basis(0, 5000, extended=False).size == 0

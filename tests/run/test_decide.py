@@ -1,11 +1,15 @@
 """What does not go together."""
 
+from dataclasses import replace
+
 import pytest
 
+from lare.credit.methods import find_method
 from lare.errors import LareError
-from lare.run.decide import decide
+from lare.run.decide import check_credit, decide
 from lare.run.settings import Settings
 from lare.tasks.spec import read_task
+from lare.tasks.table import env_spec
 from toys import pick_spec, toy_spec
 
 
@@ -122,3 +126,16 @@ def test_the_form_of_the_score_is_the_users_else_the_tasks(said_by_task, set_by_
     task = toy_spec(score=said_by_task)
     settings = Settings(method="lare-linear", algorithm="td3", credit={"score": set_by_user})
     assert decide(settings, task).credit.score == taken
+
+
+@pytest.mark.parametrize("method", ["bayes", "rd-linear"])
+def test_no_weight_for_each_entry_of_a_picture(method):
+    task = toy_spec()
+    settings, env = decide(Settings(method=method), task), replace(env_spec(task), observation_size=84 * 84)
+    with pytest.raises(LareError) as error:
+        check_credit(settings, find_method(method), task, env)
+    assert str(error.value) == (
+        f"{method} fits a weight to each of at most 1024 entries, and Chase shows 7056: "
+        "lare-bayes fits weights to the factors of phi, rrdu trains a network"
+    )
+    check_credit(settings, find_method("lare-bayes"), task, env)

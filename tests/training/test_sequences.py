@@ -157,7 +157,8 @@ def test_seeds_in_lockstep_are_seeds_alone():
     factors = [factors_for(config, steps) for steps in of_each]
     both, all_factors = (jax.tree.map(lambda *leaves: np.stack(leaves), *part) for part in (of_each, factors))
     alone = [jax.tree.map(lambda leaf, seed=seed: leaf[seed], start) for seed in (0, 1)]
-    together, measured = functions.improve(functions.store(start, both, all_factors), both, keys, 0)
+    started = functions.learn_returns(functions.store(start, both, all_factors))
+    together, measured = functions.improve(started, both, keys, 0)
     assert measured["algorithm/updates"].tolist() == [5, 3]
     for seed in (0, 1):
         learner = one_seed(with_steps(alone[seed], config, of_each[seed], factors[seed]))

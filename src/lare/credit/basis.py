@@ -27,6 +27,8 @@ HALF_PERIOD = 4.0
 """Deviations from the mean within which shapes tell values apart."""
 LARGEST = 512
 """Features. Where entries are so many that their shapes would exceed it, they get fewer frequencies, or none."""
+MOST_ENTRIES = 1024
+"""More raw entries (of pictures, say) are left out beside factors: a fit takes the cube of the number of features."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,15 @@ class Basis:
         sizes = {"factors": self.factors}
         if self.extended:
             sizes |= {"shapes of factors": 2 * FREQUENCIES * self.factors, "pairs of factors": pairs}
-        sizes["entries"] = self.entries
+        sizes["entries"] = self.used_entries
         if self.extended:
-            sizes["shapes of entries"] = 2 * self.frequencies_of_entries * self.entries
+            sizes["shapes of entries"] = 2 * self.frequencies_of_entries * self.used_entries
         return {name: size for name, size in sizes.items() if size}
+
+    @property
+    def used_entries(self) -> int:
+        """How many of the entries are features: all or none."""
+        return self.entries if self.entries <= MOST_ENTRIES else 0
 
     @property
     def frequencies_of_entries(self) -> int:
@@ -88,9 +95,9 @@ def shapes(u: Float[Array, "*batch inputs"], frequencies: int) -> Float[Array, "
 
 def expand(basis: Basis, u: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
     """The features of standardised inputs."""
+    factors, entries = u[..., : basis.factors], u[..., basis.factors : basis.factors + basis.used_entries]
     if not basis.extended:
-        return u
-    factors, entries = u[..., : basis.factors], u[..., basis.factors :]
+        return jnp.concatenate([factors, entries], axis=-1)
     one, other = np.triu_indices(basis.factors, 1)
     within = jnp.clip(factors, -HALF_PERIOD, HALF_PERIOD)
     return jnp.concatenate(

@@ -51,7 +51,7 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     by_all = explained(sums, form, group, whole)
     none = jnp.zeros(0)
     if not of_factors.any():
-        left = jnp.zeros(basis.entries)
+        left = jnp.zeros(basis.used_entries)
         return Explanation(sums.episodes, jnp.zeros(()), by_all, none, none, none, left)
     alone, numbers = restricted(sums, np.flatnonzero(of_factors)), group[of_factors]
     fitted = evidence.fit(alone, form, numbers, evidence.unknown(len(numbers), int(numbers.max()) + 1), ROUNDS)
@@ -108,6 +108,6 @@ def residual(
     after = given.p - given.s @ weight
     left = given.q - 2 * weight @ given.p + weight @ given.s @ weight
     first = int(np.sum(of_factors))
-    entries = slice(first, first + basis.entries)
+    entries = slice(first, first + basis.used_entries)
     size = jnp.sqrt(jnp.maximum(jnp.diagonal(given.s)[entries] * left, 0))
     return jnp.where(size > 0, after[entries] / jnp.where(size > 0, size, 1), 0)

@@ -1,7 +1,8 @@
 """Which settings, method, algorithm and task go together."""
 
 from lare.algorithms.table import ALGORITHMS, Consumes
-from lare.credit.methods import Decoder, Encoder, Method, Reward, find_method
+from lare.credit.basis import MOST_ENTRIES
+from lare.credit.methods import Decoder, Encoder, Fit, Method, Reward, find_method
 from lare.data.replay import room
 from lare.errors import LareError
 from lare.run.settings import ResolvedSettings, Settings
@@ -69,19 +70,25 @@ def check_method(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> No
             f"{method.name} looks at whole episodes of one length: those of {task.name} must have a fixed one, and rollout_steps "
             "be a multiple of it"
         )
-    check_credit(resolved, method, env)
+    check_credit(resolved, method, task, env)
     if resolved.reflect_every is not None and method.encoder is not Encoder.LATENT_AND_NEXT:
         raise LareError(
             f"reflect_every is for lare-bayes, whose decoder is right at once when phi changes; the method is {method.name}"
         )
 
 
-def check_credit(resolved: ResolvedSettings, method: Method, env: EnvSpec) -> None:
+def check_credit(resolved: ResolvedSettings, method: Method, task: TaskSpec, env: EnvSpec) -> None:
     """Raise `LareError` where a decoder cannot be what is asked for."""
     credit = resolved.credit
     if "drawn_steps" in method.settings and not env.fixed_length and credit.steps < credit.drawn_steps:
         raise LareError(
             f"credit.steps = {credit.steps} is less than credit.drawn_steps = {credit.drawn_steps}, of one episode"
+        )
+    shown = env.state_size if task.judged_from == "state" else env.observation_size
+    if method.fit is Fit.EVIDENCE and not method.latent and shown > MOST_ENTRIES:
+        raise LareError(
+            f"{method.name} fits a weight to each of at most {MOST_ENTRIES} entries, and {task.name} shows {shown}: "
+            "lare-bayes fits weights to the factors of phi, rrdu trains a network"
         )
     if method.decoder is Decoder.DIASTER and not credit.hidden:
         raise LareError(f"credit.hidden is empty, and {method.name} needs a hidden layer")

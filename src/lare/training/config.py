@@ -104,7 +104,8 @@ class TrainConfig:
     @property
     def forms(self) -> tuple[int, ...]:
         """Which forms of the score are fitted."""
-        return forms_of(self.credit, self.env.fixed_length) if "score" in self.method.settings else (SUM,)
+        looked_for = "score" in self.method.settings and all(basis.size for basis in self.bases)
+        return forms_of(self.credit, self.env.fixed_length) if looked_for else (SUM,)
 
     @property
     def raw_differences(self) -> bool:

@@ -34,11 +34,12 @@ def judging(config: TrainConfig) -> TrainConfig:
 
 def explanations(learner: Learner, config: TrainConfig) -> list[Explanation]:
     """Of the first seed's stored episodes, for each team. Empty for a method that fits nothing to returns, and for few episodes."""
-    one = of_seed(learner)
-    if not learner.credit or int(jnp.sum(one.replay.episodes - one.replay.oldest)) < FEWEST:
+    one, chosen = of_seed(learner), judging(config)
+    known = learner.credit and all(basis.size for basis in chosen.bases)
+    if not known or int(jnp.sum(one.replay.episodes - one.replay.oldest)) < FEWEST:
         return []
     with jax.enable_x64(True):
-        found = jax.jit(partial(explain_stored, config=judging(config)))(
+        found = jax.jit(partial(explain_stored, config=chosen))(
             one.replay, tuple(credit.average for credit in one.credit)
         )
         return [jax.tree.map(np.asarray, each) for each in found]
@@ -62,7 +63,7 @@ def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
         function = run.functions[place] if run.functions else None
         factors = [] if function is None else function.columns_by(run.judges)
         form = returns.form_found(of_seed(learner.credit[place]))
-        entries = entry_names(roles[place], basis[place].entries) if len(found.left) and not config.of_state else []
+        entries = entry_names(roles[place], len(found.left)) if not config.of_state else []
         team = f"{config.env.teams[place].name}: " if len(roles) > 1 else ""
         lines += [team + line for line in words(found, form, factors, entries)]
     return lines

@@ -103,7 +103,7 @@ def factors_of(function: LatentFunction, role: TaskSpec, episode: Episode) -> Fl
 def said_of(found: Judgement, names: list[str], role: TaskSpec, basis: Basis) -> list[str]:
     """The sentences that a user reads too."""
     form = None if found.average is None else FORMS[int(found.average)]
-    return words(found.explanation, form, names, entry_names(role, basis.entries))
+    return words(found.explanation, form, names, entry_names(role, basis.used_entries))
 
 
 def ranges(names: Sequence[str], factors: Float[np.ndarray, "rows factors"]) -> list[str]:
