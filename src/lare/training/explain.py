@@ -57,7 +57,7 @@ def explain_stored(buffer: Replay, average: tuple[Bool[Array, ""], ...], config:
 
 def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
     """What is to be said of a run's returns, of its first seed."""
-    lines, basis = [], judging(config).bases
+    lines: list[str] = []
     roles = run.config.task.roles
     for place, found in enumerate(explanations(learner, config)):
         function = run.functions[place] if run.functions else None
