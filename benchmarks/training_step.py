@@ -158,7 +158,7 @@ def repeat(work: Callable[[], object], times: int) -> None:
 
 
 def side_by_side(directory: Path, steps: int) -> Iterator[tuple[str, Callable[[], object]]]:
-    for method in ("lare-rrdu", "rrdu", "dense"):
+    for method in ("lare-bayes", "lare-rrdu", "rrdu", "dense"):
         session = ours(directory, method)
         yield method, partial(advance, session, steps)
         if method == "lare-rrdu":

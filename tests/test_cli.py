@@ -16,7 +16,7 @@ from toys import PHI
 
 TINY = (
     "--steps 200 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1 "
-    "--td3.warmup 100 --td3.hidden 8 8 --credit.hidden 8 8"
+    "--td3.warmup 100 --td3.hidden 8 8"
 ).split()
 
 
@@ -75,7 +75,7 @@ def test_an_unknown_choice_lists_those_there_are(command):
         ("Reacher-v4 --method dense --judges both", "judges makes no difference to dense"),
         ("CN-6 --scale-rewards", "scale_rewards makes no difference to ippo on CN-6"),
         ("CN-6 --method dense --capacity 1000", "capacity makes no difference to dense"),
-        ("HalfCheetah-v4 --fit-every 2", "fit_every makes no difference to lare-rrdu"),
+        ("HalfCheetah-v4 --fit-every 2", "fit_every makes no difference to lare-bayes"),
         (
             "Reacher-v4 --sac.learning-rate 1",
             "sac.learning_rate makes no difference to td3 on Reacher-v4; it has td3.learning_rate",
@@ -332,7 +332,7 @@ def test_help_breaks_no_line_where_the_source_does(command):
 
 
 def test_from_training_to_report(command, spec_file, phi):
-    run = Path("runs/Chase-lare-rrdu-td3-s0")
+    run = Path("runs/Chase-lare-bayes-td3-s0")
     status, out, _ = command("train", spec_file(), *TINY, "--function", phi)
     assert status == 0
     assert out.endswith(f"finished {run}; to see it: lare report {run}\n")

@@ -2,7 +2,7 @@
 
 task = lare.load_task("HalfCheetah-v4")
 phi = lare.design(task)
-run = lare.train(task, lare.Settings(method="lare-rrdu", steps=100_000), function=phi)
+run = lare.train(task, lare.Settings(steps=100_000), function=phi)
 """
 
 from importlib import import_module

@@ -60,7 +60,7 @@ def test_what_is_decided_is_read_back_as_it_was():
     ("task", "settings", "names"),
     [
         ("CN-6", {"td3": {"hidden": (8,)}, "method": "rd"}, ["td3.hidden"]),
-        ("CN-6", {"credit": {"steps": 800}}, []),
+        ("CN-6", {"method": "lare-rd", "credit": {"steps": 800}}, []),
         ("CN-6", {"fit_every": 3, "method": "rd"}, []),
         ("Reacher-v4", {"method": "dense", "judges": "after", "draw": 1}, ["judges", "draw"]),
         ("Reacher-v4", {"method": "rd", "credit": {"drawn_steps": 10}}, ["credit.drawn_steps"]),

@@ -18,20 +18,20 @@ def decided(settings, task):
 
 def test_a_single_agent_gets_td3():
     found = decide(Settings(), toy_spec())
-    assert (found.algorithm, found.method, found.steps, found.evaluate_every) == ("td3", "lare-rrdu", 1_000_000, 5000)
+    assert (found.algorithm, found.method, found.steps, found.evaluate_every) == ("td3", "lare-bayes", 1_000_000, 5000)
     assert (found.environments, found.rollout_steps, found.capacity) == (1, 50, 1_000_000)
     assert found.credit == CreditSettings()
 
 
 def test_a_single_agent_that_chooses_gets_ppo():
     found = decide(Settings(), pick_spec())
-    assert (found.algorithm, found.method, found.steps, found.evaluate_every) == ("ppo", "lare-rrdu", 1_000_000, 10_000)
+    assert (found.algorithm, found.method, found.steps, found.evaluate_every) == ("ppo", "lare-bayes", 1_000_000, 10_000)
     assert (found.environments, found.rollout_steps, found.fit_every, found.fit_updates) == (1, 2000, 1, 500)
 
 
 def test_many_agents_get_ippo():
     found = decided({}, "CN-6")
-    assert (found.algorithm, found.method, found.steps) == ("ippo", "lare-rd", 2_050_000)
+    assert (found.algorithm, found.method, found.steps) == ("ippo", "lare-bayes", 2_050_000)
     assert (found.environments, found.rollout_steps, found.iteration_steps) == (82, 25, 2050)
     assert (found.evaluate_every, found.evaluation_episodes) == (20_500, 50)
     assert (found.fit_every, found.fit_updates, found.credit) == (10, 50, MANY_AGENTS)
@@ -39,7 +39,7 @@ def test_many_agents_get_ippo():
 
 def test_many_agents_with_a_global_state_and_masks_get_qmix(echo):
     found = decide(Settings(), echo)
-    assert (found.algorithm, found.method, found.environments, found.rollout_steps) == ("qmix", "lare-rd", 8, 50)
+    assert (found.algorithm, found.method, found.environments, found.rollout_steps) == ("qmix", "lare-bayes", 8, 50)
     assert (found.evaluation_episodes, found.capacity) == (32, 5000 * 7)
     assert found.steps % found.iteration_steps == found.evaluate_every % found.iteration_steps == 0
     assert abs(found.steps - 2_000_000) < 400

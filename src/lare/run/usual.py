@@ -94,7 +94,7 @@ def usual_algorithm(env: EnvSpec) -> Name:
 def resolve(settings: Settings, env: EnvSpec) -> ResolvedSettings:
     """Fill in what was left open. Raises `LareError` where the steps are no whole number of iterations."""
     algorithm = settings.algorithm or usual_algorithm(env)
-    method = settings.method or ("lare-rrdu" if env.agents == 1 else "lare-rd")
+    method = settings.method or "lare-bayes"
     given = {name: value for name, value in settings if value is not None and name not in (*ALGORITHMS, "credit")}
     values = {
         "steps": 1_000_000,
