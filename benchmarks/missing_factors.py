@@ -1,0 +1,119 @@
+"""What a decoder makes of a `phi` that leaves a factor out, and of one that has nothing to do with the score.
+
+    python benchmarks/missing_factors.py run RUNS [TASK/METHOD/FUNCTION ...]   train what is missing, go on with the rest
+    python benchmarks/missing_factors.py keep RUNS                             copy what is finished to results/missing
+    python benchmarks/missing_factors.py table                                 from there
+
+FUNCTION is `all` (draw 0 of the recorded functions), `without-f_NAME` (the same, one factor left out of what it returns) or
+`irrelevant`. Every run is a run directory RUNS/TASK/METHOD/FUNCTION.
+"""
+
+import re
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from learning import mean_and_spread, read
+
+import lare
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "HalfCheetah-v4": {"steps": 60_000, "seeds": 3},
+    "PP-6": {"steps": 410_000, "seeds": 3, "first_fit": "published"},
+}
+FACTORS = {
+    "HalfCheetah-v4": ("f_forward", "f_control", "f_posture", "f_pitch_rate", "f_bounce"),
+    "PP-6": (
+        *("f_distance", "f_catch", "f_closing", "f_pursuit"),
+        *("f_surround", "f_team", "f_obstacle", "f_spacing"),
+    ),
+}
+METHODS = {"HalfCheetah-v4": ("lare-bayes", "lare-rrdu"), "PP-6": ("lare-bayes", "lare-rd")}
+NEEDED = {"HalfCheetah-v4": "f_forward", "PP-6": "f_catch"}
+"""The factor that is most of the score: the gradient decoders train without this one only."""
+IRRELEVANT = {
+    "HalfCheetah-v4": "[np.sin(3 * observation[:, 2:3]), np.square(observation[:, 3:4])]",
+    "PP-6": "[np.sin(5 * observation[:, 4:5]), np.square(observation[:, 5:6])]",
+}
+"""An angle of the hind leg; where the nearest obstacle is."""
+KEPT = Path(__file__).parent / "results" / "missing"
+
+
+def experiments() -> list[str]:
+    found = []
+    for task, methods in METHODS.items():
+        for method in methods:
+            left_out = FACTORS[task] if method == "lare-bayes" else (NEEDED[task],)
+            functions = ("all", *(f"without-{name}" for name in left_out), "irrelevant")
+            found += [f"{task}/{method}/{function}" for function in functions]
+    return found
+
+
+def source(task: str, function: str) -> str:
+    """The recorded function without a factor, or one that says nothing."""
+    if function == "irrelevant":
+        return f"import numpy as np\n\n\ndef evaluation_func(observation, action):\n    return {IRRELEVANT[task]}\n"
+    recorded = lare.design(lare.load_task(task)).source
+    if function == "all":
+        return recorded
+    left = [name for name in FACTORS[task] if name != function.removeprefix("without-")]
+    assert len(left) == len(FACTORS[task]) - 1
+    changed, times = re.subn(r"return \[.*\]", f"return [{', '.join(left)}]", recorded)
+    assert times == 1
+    return changed
+
+
+def run(directory: Path, wanted: list[str]) -> None:
+    for name in wanted or experiments():
+        task, method, function = name.split("/")
+        out = directory / name
+        if out.exists():
+            lare.resume(out)
+            continue
+        phi = directory / f"{task}-{function}.py"
+        phi.parent.mkdir(parents=True, exist_ok=True)
+        phi.write_text(source(task, function))
+        settings = dict(SETTINGS[task])
+        if method == "lare-bayes":
+            settings.pop("first_fit", None)
+        lare.train(task, lare.Settings(method=method, **settings), function=phi, out=out)
+
+
+def keep(directory: Path) -> None:
+    """Settings and metrics of every run that has come to its end."""
+    for name in experiments():
+        if not (directory / name / "metrics.jsonl").exists():
+            continue
+        config, lines = read(directory / name)
+        if lines[-1]["step"] == config["settings"]["steps"]:
+            (KEPT / name).mkdir(parents=True, exist_ok=True)
+            for file in ("config.json", "metrics.jsonl"):
+                shutil.copyfile(directory / name / file, KEPT / name / file)
+
+
+def table() -> None:
+    for name in experiments():
+        if not (KEPT / name).exists():
+            continue
+        config, lines = read(KEPT / name)
+        end = [line for line in lines if line["step"] == config["settings"]["steps"]]
+        key = "evaluation/return" if name.startswith("Half") else "evaluation/summed_return"
+        columns = []
+        for each in (key, "credit/correlation", "credit/return_r2"):
+            mean, spread = mean_and_spread([line[each] for line in end if line.get(each) is not None] or [np.nan])
+            columns.append(f"{each} {mean:.3g} ± {spread:.2g}")
+        print(f"{name:44s} {', '.join(columns)}")
+
+
+if __name__ == "__main__":
+    match sys.argv[1:]:
+        case ["run", runs, *wanted]:
+            run(Path(runs), wanted)
+        case ["keep", runs]:
+            keep(Path(runs))
+        case ["table"]:
+            table()
+        case _:
+            sys.exit(__doc__)
