@@ -6,6 +6,7 @@
 
 Every experiment is a run directory RUNS/TASK/LABEL; its settings and metrics are kept as they are. The curve of SBX's TD3
 (`sbx_learning.py RUNS/TASK/sbx-dense`) is one of them. Two processes on one core each train 1.1 times as much as one on two.
+The pictures take the newer runs of `sweeps/closed-form.toml` where there are some: the same settings, trained again.
 """
 
 import json
@@ -50,7 +51,8 @@ EXPERIMENTS: dict[str, dict[str, dict[str, Any]]] = {
 """For each task the runs, and the settings of each."""
 COMMON: dict[str, Any] = {"steps": 100_000, "seeds": 3}
 KEPT = Path(__file__).parent / "results" / "learning"
-PICTURED = ("lare-rrdu", "rrdu", "dense", "episodic", "lare-rrdu-published", "rrdu-published")
+SWEPT = KEPT.parent / "sweeps" / "closed-form"
+PICTURED = ("lare-bayes", "lare-rrdu", "rrdu", "dense", "episodic", "lare-rrdu-published")
 """Those of all tasks first, so that a method has one colour."""
 
 
@@ -119,17 +121,21 @@ def curve(directory: Path) -> figures.Curve:
     return np.asarray(steps, float), np.asarray([[returns[seed, step] for step in steps] for seed in seeds], float)
 
 
+def pictured(task: str, label: str) -> Path | None:
+    """The newer of the kept runs of a method, if there is one."""
+    places = [*(SWEPT / task / f"{label}-td3{ending}" for ending in ("", "-draw0")), KEPT / task / label]
+    return next((place for place in places if place.exists()), None)
+
+
 def table() -> None:
     found = {f"{directory.parent.name}/{directory.name}": row(directory) for directory in sorted(KEPT.glob("*/*"))}
     (KEPT.parent / "learning.json").write_text(json.dumps(found, indent=1) + "\n")
     for task in EXPERIMENTS:
-        labels = [label for label in PICTURED if f"{task}/{label}" in found]
-        if labels:
+        curves = {label: curve(place) for label in PICTURED if (place := pictured(task, label))}
+        if curves:
             picture = Path(__file__).parents[1] / "docs" / "pictures" / f"{task}.svg"
             picture.parent.mkdir(exist_ok=True)
-            picture.write_text(
-                figures.curves({label: curve(KEPT / task / label) for label in labels}, "true return") + "\n"
-            )
+            picture.write_text(figures.curves(curves, "true return") + "\n")
     for name, of_run in found.items():
         parts = [
             f"{key.split('/')[-1]} {value[0]:.3g} ± {value[1]:.2g}"
