@@ -110,6 +110,7 @@ def small():
 
     def build(**changes) -> Settings:
         values = {
+            "method": "lare-rrdu",
             "steps": 240,
             "seeds": 2,
             "rollout_steps": 12,
@@ -135,6 +136,7 @@ def small_many():
     def build(**changes) -> Settings:
         quick = {"hidden": 8, "embed": 4, "hypernet": 4, "batch_size": 4, "update_every": 4, "epsilon_steps": 100}
         values = {
+            "method": "lare-rd",
             "steps": 200,
             "seeds": 2,
             "environments": 4,
