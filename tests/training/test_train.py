@@ -450,7 +450,7 @@ def test_config_says_what_the_run_depends_on(small, phi, tmp_path):
 @pytest.mark.parametrize(
     ("algorithm", "method"),
     [
-        *(("td3", method) for method in ("dense", "lare-rrdu", "lare-rd", "rrdu")),
+        *(("td3", method) for method in ("dense", "lare-bayes", "lare-rrdu", "lare-rd", "rrdu")),
         ("ddpg", "lare-linear"),
         ("sac", "dense"),
     ],
@@ -471,7 +471,7 @@ def test_must_learn_the_toy(algorithm, method, phi, tmp_path):
     assert run.metrics()[-1]["evaluation/return"] > -3
 
 
-@pytest.mark.parametrize("method", ["dense", "lare-rrdu", "rd"])
+@pytest.mark.parametrize("method", ["dense", "lare-bayes", "rd"])
 def test_ppo_must_learn_the_toy(method, phi, tmp_path):
     settings = lare.Settings(
         algorithm="ppo",
