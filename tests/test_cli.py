@@ -15,8 +15,7 @@ from lare.tasks.spec import read_task, shipped_tasks
 from toys import PHI
 
 TINY = (
-    "--steps 200 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1 "
-    "--td3.warmup 100 --td3.hidden 8 8"
+    "--steps 200 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1 --td3.warmup 100 --td3.hidden 8 8"
 ).split()
 
 

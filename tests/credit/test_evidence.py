@@ -158,7 +158,7 @@ def test_the_deviation_is_as_large_as_the_error(seed):
         sums = summed(means, returns, length)
         found = fit(sums)
         rows = np.random.default_rng(9).normal(size=(2000, len(GROUP)))
-        known = np.asarray(evidence.deviation(sums, 0, GROUP, found, jnp.asarray(rows)))
+        known = np.asarray(evidence.deviation(evidence.spread(sums, 0, GROUP, found), jnp.asarray(rows)))
         away = np.abs(rows @ (np.asarray(found.weight) - weight) + float(found.bias) - 0.7)
         assert (away <= 2 * known).mean() > 0.8
         assert away.mean() > 0.2 * known.mean()

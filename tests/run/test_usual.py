@@ -25,7 +25,12 @@ def test_a_single_agent_gets_td3():
 
 def test_a_single_agent_that_chooses_gets_ppo():
     found = decide(Settings(), pick_spec())
-    assert (found.algorithm, found.method, found.steps, found.evaluate_every) == ("ppo", "lare-bayes", 1_000_000, 10_000)
+    assert (found.algorithm, found.method, found.steps, found.evaluate_every) == (
+        "ppo",
+        "lare-bayes",
+        1_000_000,
+        10_000,
+    )
     assert (found.environments, found.rollout_steps, found.fit_every, found.fit_updates) == (1, 2000, 1, 500)
 
 

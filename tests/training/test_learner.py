@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit import closed_form
+from lare.credit import closed_form, returns
 from lare.credit.basis import Basis
 from lare.credit.closed_form import LinearDecoder
 from lare.credit.decomposition import CreditSettings
@@ -19,6 +19,7 @@ from lare.normalise import magnitude
 from lare.tasks.env import EnvSpec, Team
 from lare.training import learner as common
 from recipes import (
+    ALONE,
     LENGTHS,
     RIVALS,
     TOGETHER,
@@ -519,3 +520,34 @@ def test_credit_of_the_state_is_measured_against_what_the_team_earned():
     found = common.assess(says_its_factor(learner, [1.0]), config)
     assert float(found["credit/error"]) == pytest.approx(0.5, rel=1e-4)
     assert float(found["credit/correlation"]) == pytest.approx(1, rel=1e-4)
+
+
+@pytest.mark.parametrize(("env", "score"), [(ALONE, "sum"), (ALONE, "average"), (TOGETHER, "auto")])
+def test_optimism_adds_deviations_to_what_is_paid_and_to_nothing_else(env, score):
+    algorithm = "td3" if env is ALONE else "ippo"
+    plain, hopeful = (
+        config_of("lare-bayes", algorithm, env, credit=CreditSettings(score=score, optimism=optimism))
+        for optimism in (0.0, 2.0)
+    )
+    one, other = stored(plain), stored(hopeful)
+    steps, paid = every_step(one), paid_by(other)
+    before = np.asarray(common.rewards(steps, paid_by(one), plain))
+    after = np.asarray(common.rewards(steps, paid, hopeful))
+    features = common.features(steps, hopeful, 0)
+    with jax.enable_x64(True):
+        rows = features.reshape(-1, features.shape[-1])
+        deviation = np.asarray(returns.deviation(other.credit[0], rows, hopeful.forms)).reshape(before.shape)
+    parts = np.where(other.credit[0].average, np.asarray(steps.length), 1).reshape(-1, 1)
+    alive = np.asarray(common.alive(steps, hopeful))
+    np.testing.assert_allclose(after, np.where(alive, before + 2 * deviation / parts, 0), rtol=1e-3, atol=1e-5)
+    assert (after[alive] > before[alive]).all()
+    np.testing.assert_array_equal(np.where(alive, common.proxy_rewards(steps, paid, hopeful, 0), 0), before)
+    for name, value in common.assess(one, plain).items():
+        np.testing.assert_array_equal(common.assess(other, hopeful)[name], value)
+
+
+def test_optimism_waits_for_two_returns():
+    config = config_of("bayes", credit=CreditSettings(optimism=2.0))
+    learner = untrained(config)
+    paid = common.rewards(every_step(stored(config)), paid_by(learner), config)
+    np.testing.assert_array_equal(paid, 0)

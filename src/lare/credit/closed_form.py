@@ -17,6 +17,7 @@ sum of two of float32; functions that take or return `Sums` are to be called wit
 """
 
 import itertools
+from operator import itemgetter
 from typing import NamedTuple
 
 import equinox as eqx
@@ -28,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lare.credit import evidence
 from lare.credit.basis import Basis, expand
 from lare.credit.decoders import Decoded
-from lare.credit.evidence import Posterior, Sums
+from lare.credit.evidence import Posterior, Spread, Sums
 from lare.normalise import RunningMeanStd, deviation
 
 LARGEST_CHOICE = 16
@@ -74,16 +75,20 @@ class ClosedForm(NamedTuple):
     """Episodes that the decoder is fitted to."""
     posterior: Posterior
     """Of each form."""
+    spread: Spread | None
+    """Of each form, where optimism asks for it at every step."""
 
 
-def init(basis: Basis, forms: int) -> ClosedForm:
+def init(basis: Basis, forms: int, *, with_spread: bool = False) -> ClosedForm:
     """Of no episodes."""
     zeros, ones = jnp.zeros(basis.inputs), jnp.ones(basis.inputs)
     decoder = LinearDecoder(basis, zeros, ones, jnp.zeros((forms, basis.size)), jnp.zeros(forms))
     posterior = evidence.unknown(basis.size, len(basis.sizes))
     posterior = jax.tree.map(lambda leaf: jnp.tile(leaf, (forms, *[1] * leaf.ndim)), posterior)
-    zero = jnp.zeros(())
-    return ClosedForm(decoder, kept(evidence.no_sums(basis.size)), zero, jnp.copy(zero), posterior)
+    zero, spread = jnp.zeros(()), None
+    if with_spread:
+        spread = Spread(jnp.zeros((forms, basis.size, basis.size)), jnp.zeros((forms, basis.size)), jnp.zeros(forms))
+    return ClosedForm(decoder, kept(evidence.no_sums(basis.size)), zero, jnp.copy(zero), posterior, spread)
 
 
 def kept(sums: Sums) -> Sums:
@@ -132,7 +137,14 @@ def fit(state: ClosedForm, forms: tuple[int, ...], rounds: int = ROUNDS) -> Clos
 
     found = jax.lax.map(one, (jnp.asarray(forms), state.posterior))
     posterior = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), found)
-    return with_weights(state, posterior.weight, posterior.bias)._replace(posterior=posterior)
+    state = with_weights(state, posterior.weight, posterior.bias)._replace(posterior=posterior)
+    if state.spread is None:
+        return state
+    of_each = [
+        evidence.spread(sums, form, basis.group, jax.tree.map(itemgetter(place), found))
+        for place, form in enumerate(forms)
+    ]
+    return state._replace(spread=jax.tree.map(lambda *leaves: jnp.stack(leaves).astype(jnp.float32), *of_each))
 
 
 def fit_signs(state: ClosedForm) -> ClosedForm:

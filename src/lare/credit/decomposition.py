@@ -20,13 +20,14 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from pydantic import Field
 
-from lare.credit import closed_form
+from lare.credit import closed_form, evidence
 from lare.credit.arel import AREL
 from lare.credit.basis import Basis
 from lare.credit.closed_form import ClosedForm, LinearDecoder
@@ -78,6 +79,9 @@ class CreditSettings(Checked):
     score: Literal["auto", "sum", "average"] = "auto"
     """Whether the score of an episode is a sum over its steps, or an average or a mark, which does not grow with them. `auto`: as
     the task says or, where it says nothing, the form that has predicted returns better so far."""
+    optimism: Annotated[float, Field(ge=0)] = 0.0
+    """lare-bayes and others in closed form: so many posterior deviations of a proxy reward are added to what the algorithm is paid.
+    Steps that little is known of look better."""
     encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of VIB's encoder."""
     bottleneck: Annotated[int, Field(ge=1)] = 8
@@ -210,9 +214,16 @@ def init(
         new_scale(),
         jnp.asarray(forms == (AVERAGE,)),
         no_predictions(1),
-        closed_form.init(basis, len(forms)) if both or not method.descends else None,
+        closed_form.init(basis, len(forms), with_spread=optimistic(method, settings))
+        if both or not method.descends
+        else None,
         no_predictions(len(forms)) if both else None,
     )
+
+
+def optimistic(method: Method, settings: CreditSettings) -> bool:
+    """Whether what little is known of is paid better."""
+    return settings.optimism > 0 and "optimism" in method.settings
 
 
 def observe_steps(
@@ -284,11 +295,38 @@ def proxy_rewards(
         settings: as everywhere.
         length: T, the steps of each row's episode. Without it, the score is taken for a sum.
     """
-    r_hat = unit(state, settings) * decode(state.decoder, state, features, settings).r_hat
+    return of_a_step(unit(state, settings) * decode(state.decoder, state, features, settings).r_hat, state, length)
+
+
+def of_a_step(
+    said: Float[Array, "rows *agents"], state: Decomposition, length: Float[Array, " rows"] | Int[Array, " rows"] | None
+) -> Float[Array, "rows *agents"]:
+    """What a decoder says of steps, as a part of R: of an average, each of T steps has a T-th."""
     if length is None:
-        return r_hat
+        return said
     parts = jnp.where(state.average, length, 1).astype(jnp.float32)
-    return r_hat / parts.reshape(-1, *[1] * (r_hat.ndim - 1))
+    return said / parts.reshape(-1, *[1] * (said.ndim - 1))
+
+
+def optimistic_rewards(
+    state: Decomposition,
+    features: Float[Array, "rows *agents features"],
+    settings: CreditSettings,
+    length: Float[Array, " rows"] | Int[Array, " rows"] | None = None,
+) -> Float[Array, "rows *agents"]:
+    """r_hat + c sigma: optimism in the face of uncertainty (OFUL: Abbasi-Yadkori, Pal and Szepesvari, NeurIPS 2011).
+
+    sigma is the posterior deviation of r_hat, c is `settings.optimism`. They do not add up to the return any more: where
+    little is known they are too high, on purpose. For a decoder in closed form whose `init` was told of the optimism.
+    """
+    r_hat = proxy_rewards(state, features, settings, length)
+    assert state.closed is not None
+    assert state.closed.spread is not None
+    assert isinstance(state.decoder, LinearDecoder)
+    place = state.average.astype(int) if len(state.closed.spread.of_mean) > 1 else 0
+    spread = jax.tree.map(lambda leaf: leaf[place], state.closed.spread)
+    deviation = evidence.deviation(spread, state.decoder.features(features))
+    return r_hat + settings.optimism * of_a_step(deviation, state, length)
 
 
 def over_agents(

@@ -32,7 +32,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_solve, solve_triangular
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
 ROUNDS = 8
@@ -205,25 +205,36 @@ def one_round(given: Problem, alpha: Float[Array, " groups"], beta: Float[Array,
     return Posterior(weight, jnp.zeros(()), alpha, beta, determined, log_evidence)
 
 
+class Spread(NamedTuple):
+    """How far off b + w . f may be: its posterior variance is |root (f - centre)|^2 + of_mean, in squared units of y."""
+
+    root: Float[Array, "*forms features features"]
+    """root^T root = Sigma."""
+    centre: Float[Array, "*forms features"]
+    """m'."""
+    of_mean: Float[Array, "*forms"]
+    """The variance of y', the mean reward at the centre."""
+
+
+def spread(sums: Sums, form: Int[Array, ""] | int, group: Int[np.ndarray, " features"], known: Posterior) -> Spread:
+    """Of a posterior. Prior deviations where nothing is known of a feature; 0 where no two returns differ yet."""
+    given = problem(sums, form, group)
+    alpha, beta = within(given, known.alpha, known.beta)
+    factor, scale = precision(given, alpha, beta)
+    root = given.unit * solve_triangular(factor, jnp.diag(1 / scale), lower=True)
+    found = Spread(root, sums.mean[: len(group)], given.unit**2 / (beta * jnp.maximum(sums.steps, 1)))
+    return jax.tree.map(lambda leaf: jnp.where(given.unit > 0, leaf, 0), found)
+
+
 def covariance(
     sums: Sums, form: Int[Array, ""] | int, group: Int[np.ndarray, " features"], known: Posterior
 ) -> Float[Array, "features features"]:
     """Sigma, in squared units of y over those of the features."""
-    given = problem(sums, form, group)
-    factor, scale = precision(given, *within(given, known.alpha, known.beta))
-    return cho_solve((factor, True), jnp.diag(1 / scale)) / scale[:, None] * given.unit**2
+    root = spread(sums, form, group, known).root
+    return root.T @ root
 
 
-def deviation(
-    sums: Sums,
-    form: Int[Array, ""] | int,
-    group: Int[np.ndarray, " features"],
-    known: Posterior,
-    features: Float[Array, "rows features"],
-) -> Float[Array, " rows"]:
-    """The posterior deviation of b + w . f: how far off it may be, in the unit of y. Prior deviation where nothing is known."""
-    sigma = covariance(sums, form, group, known)
-    away = features - sums.mean[: len(group)]
-    given = problem(sums, form, group)
-    of_mean = given.unit**2 / (known.beta * jnp.maximum(sums.steps, 1))
-    return jnp.sqrt(jnp.maximum(jnp.sum((away @ sigma) * away, axis=1), 0) + of_mean)
+def deviation(known: Spread, features: Float[Array, "*batch features"]) -> Float[Array, "*batch"]:
+    """The posterior deviation of b + w . f, in the unit of y."""
+    away = (features - known.centre) @ known.root.T
+    return jnp.sqrt(jnp.sum(away**2, axis=-1) + known.of_mean)

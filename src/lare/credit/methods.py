@@ -153,7 +153,7 @@ OF_FIT: dict[Fit, frozenset[str]] = {
     Fit.DRAWN_STEPS: frozenset({"score", "sum_form", "steps", "drawn_steps"}),
     Fit.DRAWN_STEPS_UNBIASED: frozenset({"score", "sum_form", "steps", "drawn_steps"}),
     Fit.SUBTRAJECTORIES: frozenset({"episodes"}),
-    Fit.EVIDENCE: frozenset({"score"}),
+    Fit.EVIDENCE: frozenset({"score", "optimism"}),
     Fit.SIGNS: frozenset(),
 }
 OF_DECODER: dict[Decoder, frozenset[str]] = {

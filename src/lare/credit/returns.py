@@ -125,4 +125,4 @@ def deviation(
     place = int(state.average) if len(forms) > 1 else 0
     known = jax.tree.map(lambda leaf: leaf[place].astype(float), state.closed.posterior)
     sums, features = closed_form.whole(state.closed.summed), state.decoder.features(rows)
-    return evidence.deviation(sums, forms[place], state.decoder.basis.group, known, features)
+    return evidence.deviation(evidence.spread(sums, forms[place], state.decoder.basis.group, known), features)

@@ -278,7 +278,7 @@ def rewards(steps: StoredSteps, paid: Paid, config: TrainConfig) -> Float[Array,
             case Reward.EPISODIC:
                 part = steps.episodic_reward[..., place, None]
             case _:
-                part = proxy_rewards(steps, paid, config, place)
+                part = proxy_rewards(steps, paid, config, place, as_paid=True)
         part = jnp.broadcast_to(part, shape)
         if config.method.shared:
             part = jnp.broadcast_to(alive_mean(part, acting[..., team.agents])[..., None], shape)
@@ -288,8 +288,10 @@ def rewards(steps: StoredSteps, paid: Paid, config: TrainConfig) -> Float[Array,
     return jnp.concatenate(parts, axis=-1)
 
 
-def proxy_rewards(steps: StoredSteps, paid: Paid, config: TrainConfig, place: int) -> Float[Array, "*batch rows"]:
-    """r_hat of a team, for a method that has one: of each of its agents, or one for all."""
+def proxy_rewards(
+    steps: StoredSteps, paid: Paid, config: TrainConfig, place: int, *, as_paid: bool = False
+) -> Float[Array, "*batch rows"]:
+    """r_hat of a team, for a method that has one: of each of its agents, or one for all. `as_paid`: with optimism, if it is set."""
     if config.method.reward is Reward.DESIGNED:
         return steps.before["factors"][..., config.judged(place), 0]
     if config.method.reward is Reward.UNIFORM:
@@ -298,7 +300,9 @@ def proxy_rewards(steps: StoredSteps, paid: Paid, config: TrainConfig, place: in
         return jnp.where(steps.finished, share, 0.5)[..., None]
     rows = features(steps, config, place)
     flat = rows.reshape(-1, *rows.shape[-2:])
-    r_hat = decomposition.proxy_rewards(paid.credit[place], flat, config.credit, steps.length.ravel())
+    optimistic = as_paid and decomposition.optimistic(config.method, config.credit)
+    found = decomposition.optimistic_rewards if optimistic else decomposition.proxy_rewards
+    r_hat = found(paid.credit[place], flat, config.credit, steps.length.ravel())
     return r_hat.reshape(rows.shape[:-1])
 
 
