@@ -15,7 +15,8 @@ from lare.tasks.spec import read_task, shipped_tasks
 from toys import PHI
 
 TINY = (
-    "--steps 200 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1 --td3.warmup 100 --td3.hidden 8 8"
+    "--steps 200 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1 "
+    "--method lare-linear --td3.warmup 100 --td3.hidden 8 8"
 ).split()
 
 
@@ -331,7 +332,7 @@ def test_help_breaks_no_line_where_the_source_does(command):
 
 
 def test_from_training_to_report(command, spec_file, phi):
-    run = Path("runs/Chase-lare-bayes-td3-s0")
+    run = Path("runs/Chase-lare-linear-td3-s0")
     status, out, _ = command("train", spec_file(), *TINY, "--function", phi)
     assert status == 0
     assert out.endswith(f"finished {run}; to see it: lare report {run}\n")

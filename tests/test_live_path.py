@@ -74,7 +74,7 @@ def test_from_a_live_model_to_a_trained_policy(serve, command, tmp_path):
     assert len(server.requests) == 6
 
     length = "--steps 100 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1".split()
-    size = "--td3.warmup 50 --td3.hidden 8 8".split()
+    size = "--method lare-linear --td3.warmup 50 --td3.hidden 8 8".split()
     status, _, err = command("train", "Reacher-v4", "--function", "phi.py", "--out", "run", *length, *size)
     assert status == 0
     assert "the latent function runs in a process of its own" in err

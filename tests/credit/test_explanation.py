@@ -7,7 +7,9 @@ import pytest
 
 from lare.credit import evidence
 from lare.credit.basis import Basis, expand
-from lare.credit.explanation import explain
+from lare.credit.explanation import explain as explain_sums
+
+explain = jax.jit(explain_sums, static_argnames="basis")
 
 
 @pytest.fixture(autouse=True)
@@ -21,13 +23,11 @@ def summed(basis, weight, count=120, seed=0, noise=0.1, form=0):
     random = np.random.default_rng(seed)
     mood = random.normal(size=(count, basis.inputs))
     length = random.integers(10, 30, size=count)
-    means, returns = [], []
-    for one, steps in zip(mood, length, strict=True):
-        u = one + random.normal(size=(steps, basis.inputs))
-        means.append(np.asarray(expand(basis, jnp.asarray(u))).mean(axis=0))
-        paid = (u @ weight + noise * random.normal(size=steps)).sum()
-        returns.append(paid / steps if form else paid)
-    given = (jnp.asarray(part) for part in (np.array(means), np.array(returns), length))
+    u = np.repeat(mood, length, axis=0) + random.normal(size=(length.sum(), basis.inputs))
+    paid, begins = u @ weight + noise * random.normal(size=len(u)), np.append(0, np.cumsum(length)[:-1])
+    means = np.add.reduceat(np.asarray(expand(basis, jnp.asarray(u))), begins) / length[:, None]
+    returns = np.add.reduceat(paid, begins) / (length if form else 1)
+    given = (jnp.asarray(part) for part in (means, returns, length))
     return evidence.add_episodes(evidence.no_sums(basis.size), *given)
 
 
@@ -36,13 +36,16 @@ def summed(basis, weight, count=120, seed=0, noise=0.1, form=0):
 def test_factors_that_tell_all(extended, form):
     """Two factors that vary alike: shares go as the squares of their weights."""
     basis = Basis(3, 2, extended)
-    found = explain(summed(basis, np.array([2.0, -1.0, 0, 0, 0]), form=form), form, basis)
+    sums = summed(basis, np.array([2.0, -1.0, 0, 0, 0]), form=form)
+    found = explain(sums, form, basis)
+    steps = float(sums.steps / sums.episodes) if form else 1  # a step of an average has a T-th of it
     assert float(found.episodes) == 120
     assert float(found.by_factors) > 0.98
     np.testing.assert_allclose(found.share, [0.8, 0.2, 0], atol=0.1)
-    np.testing.assert_allclose(found.weight, [2, -1, 0], atol=0.15)
-    assert (np.asarray(found.deviation) > 0).all()
-    assert (np.abs(np.asarray(found.weight) - [2, -1, 0]) < 4 * np.asarray(found.deviation) + 0.02).all()
+    weight, deviation = np.asarray(found.weight) * steps, np.asarray(found.deviation) * steps
+    np.testing.assert_allclose(weight, [2, -1, 0], atol=0.15)
+    assert (deviation > 0).all()
+    assert (np.abs(weight - [2, -1, 0]) < 4 * deviation + 0.02).all()
 
 
 def test_what_the_factors_leave_goes_with_the_entry_that_is_missing():
@@ -80,3 +83,11 @@ def test_of_few_episodes_nothing_is_said(count):
     basis = Basis(1, 1, extended=False)
     found = explain(summed(basis, np.ones(2), count=max(count, 1)) if count else evidence.no_sums(2), 0, basis)
     assert np.isnan(found.by_all)
+
+
+@pytest.mark.parametrize("noise", [0.1, 3.0])
+def test_the_shares_of_the_factors_add_up_to_what_they_explain(noise):
+    basis = Basis(3, 2, extended=True)
+    found = explain(summed(basis, np.array([2.0, -1.0, 0.5, 1.0, 0]), count=30, noise=noise), 0, basis)
+    assert 0 < float(found.by_factors) < 1
+    assert float(found.share.sum()) == pytest.approx(float(found.by_factors))

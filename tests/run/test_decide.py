@@ -135,7 +135,7 @@ def test_no_weight_for_each_entry_of_a_picture(method):
     with pytest.raises(LareError) as error:
         check_credit(settings, find_method(method), task, env)
     assert str(error.value) == (
-        f"{method} fits a weight to each of at most 1024 entries, and Chase shows 7056: "
+        f"{method} fits a weight to each of at most 1024 entries, and Chase has 7057: "
         "lare-bayes fits weights to the factors of phi, rrdu trains a network"
     )
     check_credit(settings, find_method("lare-bayes"), task, env)

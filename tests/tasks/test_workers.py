@@ -166,12 +166,13 @@ def test_what_cannot_be_sent():
 
 
 PROGRAM = """
-import os, sys, time
+import os, signal, sys, time
 from functools import partial
 import numpy as np
 from hosts import Host
 from lare.tasks.workers import WorkerEnvs
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 far = WorkerEnvs([partial(Host, seconds=0.05)] * 2, processes=2)
 print(*[worker.process.pid for worker in far.workers], flush=True)
 far.reset(np.ones(2, bool), np.arange(2))
@@ -193,11 +194,14 @@ def test_workers_end_with_their_parent_and_say_nothing(how):
         text=True,
         start_new_session=True,
     )
-    pids = list(map(int, parent.stdout.readline().split()))
-    assert all(map(runs, pids))
-    time.sleep(0.2)
-    os.killpg(parent.pid, how)  # as a terminal does
-    _, said = parent.communicate(timeout=30)
+    try:
+        pids = list(map(int, parent.stdout.readline().split()))
+        assert all(map(runs, pids))
+        time.sleep(0.2)
+        os.killpg(parent.pid, how)  # as a terminal does
+        _, said = parent.communicate(timeout=30)
+    finally:
+        parent.kill()
     assert said.count("Traceback") == (how == signal.SIGINT)  # the parent's own
     until = time.monotonic() + 10
     while any(map(runs, pids)) and time.monotonic() < until:

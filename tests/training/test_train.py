@@ -60,13 +60,13 @@ def test_a_run_says_what_is_random_and_what_is_done_already(small, tmp_path):
     heard = At(-1, None)
     lare.train(toy_spec(), small(steps=180, method="dense"), out=tmp_path / "run", listeners=[heard])
     warmup = small().td3.warmup
-    assert heard.messages == [f"the first {warmup:,} steps are random (td3.warmup): nothing is learned from them yet"]
+    assert heard.messages == [f"the first {warmup:,} steps are random (td3.warmup): the policy is not trained yet"]
     heard = At(-1, None)
     lare.resume(tmp_path / "run", listeners=[heard])
     assert heard.messages == ["nothing is left to do: it had come to its end"]
     heard = At(-1, None)
     lare.train(toy_spec(), small(steps=24, evaluate_every=24, method="dense"), out=tmp_path / "few", listeners=[heard])
-    assert heard.messages == ["all 24 steps are random (td3.warmup): nothing is learned from them yet"]
+    assert heard.messages == ["all 24 steps are random (td3.warmup): the policy is not trained yet"]
 
 
 def test_a_run_says_what_was_set_in_vain(small, tmp_path):

@@ -111,10 +111,11 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
         record_video(opened, video)
         say(f"wrote {video}")
     returns = evaluate_run(opened, episodes)
+    counted = f"{episodes} episodes" if episodes != 1 else "1 episode"
     for team, of_team in returns.items():
         for seed, of_seed in zip(opened.seeds, of_team, strict=True):
             named = f"{team}, " if len(returns) > 1 else ""
-            say(f"{named}seed {seed}: return {plus_minus(*mean_and_deviation(of_seed))} over {episodes} episodes")
+            say(f"{named}seed {seed}: return {plus_minus(*mean_and_deviation(of_seed))} over {counted}")
     for line in explanation_of(opened):
         say(line)
 

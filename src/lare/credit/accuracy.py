@@ -41,4 +41,4 @@ def correlation(
         return (x - jnp.sum(x * mask) / total) * mask
 
     a, b = centred(r_hat), centred(reward)
-    return jnp.sum(a * b) / jnp.sqrt(jnp.sum(a**2) * jnp.sum(b**2))
+    return jnp.clip(jnp.sum(a * b) / jnp.sqrt(jnp.sum(a**2) * jnp.sum(b**2)), -1, 1)  # rounding goes beyond

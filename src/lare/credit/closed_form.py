@@ -9,8 +9,8 @@ LaRe without the reward model has signs for w instead:
 
 By which mean and deviation u is standardised decides what the features are. Both move while steps come in, and sums of features
 that were standardised by old ones would be stale. So they stay as they are for a while, and each time that the steps have
-grown by a quarter, all stored episodes are summed again with new ones: a step is summed five times or less, however many
-there are.
+grown by a quarter, all stored episodes are summed again with new ones: a step is summed at most six times on average, however
+many there are.
 
 The sums need float64: features that nearly repeat each other leave nothing of float32. Where they are kept, each number is the
 sum of two of float32; functions that take or return `Sums` are to be called within `jax.enable_x64(True)`.

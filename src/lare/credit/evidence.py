@@ -35,8 +35,6 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
-ROUNDS = 8
-"""Of the fixed point, in a fit that begins where an earlier one has ended."""
 RANGE = 1e6
 """A group may explain so many times more, or less, of the returns than its equal share. Beyond, it is off; but not so far off
 that it could not come back."""

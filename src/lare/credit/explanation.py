@@ -5,8 +5,8 @@ step's noise has precision beta explains the share
 
     1 - (1 / beta) / (q / (N - 1))
 
-of the variation: as an R^2, but for the freedom that the fit has used up. A feature's part of what is explained is its
-covariance with the prediction, mu_i (S mu)_i / q; the parts of all features add up to the whole. What a fit on the factors alone
+of the variation: as an R^2, but for the freedom that the fit has used up. A feature's part of that is in proportion to its
+covariance with the prediction, mu_i (S mu)_i: the parts of all features add up to the whole. What a fit on the factors alone
 leaves correlates with the mean of raw entry j over an episode by
 
     (p - S mu)_j / sqrt(S_jj (q - 2 mu . p + mu . S mu))
@@ -35,7 +35,8 @@ class Explanation(NamedTuple):
     by_all: Float[Array, ""]
     """The same, with raw entries too."""
     weight: Float[Array, " factors"]
-    """What a step pays more, where a factor is larger by one of its deviations, by the linear part of the fit on factors."""
+    """What a step pays more, where a factor is larger by one of its deviations, by the linear part of the fit on factors. Where the
+    score is an average: what a step of an episode of average length adds to it."""
     deviation: Float[Array, " factors"]
     """Posterior deviation of that."""
     share: Float[Array, " factors"]
@@ -58,14 +59,17 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     sigma = evidence.covariance(alone, form, numbers, fitted)
     given = evidence.problem(alone, form, numbers)
     unit = jnp.where(given.unit > 0, given.unit, 1)
-    part = fitted.weight / unit * (given.s @ (fitted.weight / unit)) / given.q
+    part = fitted.weight / unit * (given.s @ (fitted.weight / unit))
     by_factors = explained(alone, form, numbers, fitted)
+    total = jnp.sum(part)
+    part = by_factors * part / jnp.where(total > 0, total, 1)
+    steps = jnp.where(form == 1, sums.steps / jnp.maximum(sums.episodes, 1), 1)  # r_hat of an average is a T-th
     return Explanation(
         sums.episodes,
         by_factors,
         jnp.maximum(by_all, by_factors),
-        fitted.weight[: basis.factors],
-        jnp.sqrt(jnp.diagonal(sigma)[: basis.factors]),
+        fitted.weight[: basis.factors] / steps,
+        jnp.sqrt(jnp.diagonal(sigma)[: basis.factors]) / steps,
         of_each(part, basis),
         residual(sums, form, basis, fitted, of_factors),
     )

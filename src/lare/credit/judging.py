@@ -2,8 +2,9 @@
 
     R^2 = 1 - sum_k (R_k - R_hat_k)^2 / sum_k (R_k - mean R)^2
 
-R_hat_k is by the fit in closed form, on the factors alone, to the episodes before k (the prequential principle: Dawid, Journal of
-the Royal Statistical Society A 147, 1984). So two functions can be compared on the same episodes, however many factors each has.
+R_hat_k is by a fit in closed form, on the factors alone, to episodes before k (the prequential principle: Dawid, Journal of
+the Royal Statistical Society A 147, 1984), made anew whenever these have grown by a twentieth. No return is seen before it is
+predicted; the factors are standardised over all episodes. So two functions can be compared, however many factors each has.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,6 +44,7 @@ def judge(
     alive: Sequence[Bool[np.ndarray, "_ agents"]],
     returns: Float[np.ndarray, " episodes"],
     basis: Basis,
+    score: str | None = None,
 ) -> Judgement:
     """Judge the factors of some episodes, in the order in which these were played.
 
@@ -51,19 +53,21 @@ def judge(
         alive: which agents acted.
         returns: R.
         basis: what is made of the rows.
+        score: `sum` or `average`, where that is known.
     """
     length = np.array([len(steps) for steps in rows])
     with jax.enable_x64(True):
         means = mean_features(rows, alive, basis)
         forms = (SUM, AVERAGE) if len(set(length)) > 1 else (SUM,)
-        told = [predictions(means[:, basis.of_factors], returns, length, basis, form) for form in forms]
-        errors = [float(np.sum((returns[FIRST:] - one) ** 2)) for one in told]
-        form = AVERAGE if len(errors) > 1 and errors[AVERAGE] < BETTER * errors[SUM] else SUM
+        forms = {"sum": (SUM,), "average": (AVERAGE,)}.get(score or "", forms)
+        told = {form: predictions(means[:, basis.of_factors], returns, length, basis, form) for form in forms}
+        errors = {form: float(np.sum((returns[FIRST:] - one) ** 2)) for form, one in told.items()}
+        form = AVERAGE if errors.get(AVERAGE, np.inf) < BETTER * errors.get(SUM, np.inf) else SUM
         sums = evidence.add_episodes(evidence.no_sums(basis.size), *map(jnp.asarray, (means, returns, length)))
         explanation = jax.tree.map(np.asarray, explained(sums, form, basis=basis))
     spread = float(np.sum((returns[FIRST:] - returns[FIRST:].mean()) ** 2)) if len(returns) > FIRST else 0.0
     r2 = 1 - errors[form] / spread if spread > 0 else np.nan
-    differs = len(forms) > 1 and min(errors) < BETTER * max(errors)
+    differs = len(forms) > 1 and min(errors.values()) < BETTER * max(errors.values())
     return Judgement(r2, form == AVERAGE if differs else None, explanation)
 
 

@@ -84,10 +84,11 @@ def check_credit(resolved: ResolvedSettings, method: Method, task: TaskSpec, env
         raise LareError(
             f"credit.steps = {credit.steps} is less than credit.drawn_steps = {credit.drawn_steps}, of one episode"
         )
-    shown = env.state_size if task.judged_from == "state" else env.observation_size
-    if method.fit is Fit.EVIDENCE and not method.latent and shown > MOST_ENTRIES:
+    of_state = task.judged_from == "state"
+    entries = (env.state_size + env.agents * env.action_size) if of_state else env.observation_size + env.action_size
+    if method.fit is Fit.EVIDENCE and not method.latent and entries > MOST_ENTRIES:
         raise LareError(
-            f"{method.name} fits a weight to each of at most {MOST_ENTRIES} entries, and {task.name} shows {shown}: "
+            f"{method.name} fits a weight to each of at most {MOST_ENTRIES} entries, and {task.name} has {entries}: "
             "lare-bayes fits weights to the factors of phi, rrdu trains a network"
         )
     if method.decoder is Decoder.DIASTER and not credit.hidden:

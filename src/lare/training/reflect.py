@@ -83,7 +83,7 @@ def evidence_of(function: LatentFunction, role: TaskSpec, episodes: Sequence[Epi
     size = factors[0].shape[-1]
     basis = Basis(size, rows[0].shape[-1] - size, extended=True)
     alive, returns = [one.alive for one in episodes], np.array([one.total for one in episodes])
-    found = judge_rows(rows, alive, returns, basis)
+    found = judge_rows(rows, alive, returns, basis, role.score)
     names, every = (
         function.columns_by(role.judges),
         np.concatenate([z[there] for z, there in zip(factors, alive, strict=True)]),

@@ -40,7 +40,8 @@ def reflected(
     """The functions of a run after a round of reflection each, by the run's stored episodes."""
     found = []
     for place, (function, role) in enumerate(zip(run.functions, run.config.task.roles, strict=True)):
-        role = role.model_copy(update={"judges": run.judges})
+        known = None if config.credit.score == "auto" else config.credit.score
+        role = role.model_copy(update={"judges": run.judges, "score": known})
         episodes = stored_episodes(learner, config, role, place)
 
         def judge(one: LatentFunction, role: TaskSpec = role, episodes: list[Episode] = episodes):

@@ -230,7 +230,7 @@ def introduce(session: Session, listener: Listener, messages: Sequence[str]) -> 
         listener.said(f"the latent function runs in {isolation(run.config.task, run.function)}")
     if session.step < settings.warmup:
         which = f"the first {settings.warmup:,}" if settings.warmup < settings.steps else f"all {settings.steps:,}"
-        listener.said(f"{which} steps are random ({settings.algorithm}.warmup): nothing is learned from them yet")
+        listener.said(f"{which} steps are random ({settings.algorithm}.warmup): the policy is not trained yet")
     if session.step >= settings.steps:
         listener.said("nothing is left to do: it had come to its end")
     listener.started(f"{run.config.task.name} {settings.method}", session.step, settings.steps)

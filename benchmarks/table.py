@@ -1,0 +1,56 @@
+"""Kept runs as the rows of a table: mean and standard deviation over seeds.
+
+    python benchmarks/table.py [--at STEPS] DIRECTORY ...
+
+A DIRECTORY is a run, or has runs somewhere below it (`benchmarks/results/sweeps/closed-form`).
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from learning import mean_and_spread, read
+
+COLUMNS = ("credit/correlation", "credit/error", "credit/return_r2")
+
+
+def cell(values: list[float]) -> str:
+    """Three figures of the mean, two of the spread."""
+    if not values:
+        return "-"
+    mean, spread = mean_and_spread(values)
+    return f"{mean:.4g} ± {spread:.2g}" if len(values) > 1 else f"{mean:.4g}"
+
+
+def row(directory: Path, at: int | None) -> str:
+    config, lines = read(directory)
+    key = "evaluation/summed_return" if "evaluation/summed_return" in lines[-1] else "evaluation/return"
+    last = lines[-1]["step"] if at is None else at
+    end = [line for line in lines if line["step"] == last]
+    late: dict[int, list[Any]] = {}
+    for line in lines:
+        if 0.75 * last < line["step"] <= last:
+            late.setdefault(line["seed"], []).append(line[key])
+    quarter = [sum(values) / len(values) for values in late.values()]
+    cells = [cell([line[key] for line in end]), cell(quarter)]
+    cells += [cell([line[name] for line in end if line.get(name) is not None]) for name in COLUMNS]
+    method = config["settings"]["method"]
+    return f"| {directory.parent.name} | `{method}` | {last:,} | {' | '.join(cells)} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--at", type=int)
+    parser.add_argument("directories", type=Path, nargs="+")
+    given = parser.parse_args()
+    print(
+        "| task | method | steps | return at the end | over the last quarter | correlation | mean error | R² of returns |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    for directory in given.directories:
+        for metrics in sorted(directory.rglob("metrics.jsonl")):
+            print(row(metrics.parent, given.at))
+
+
+if __name__ == "__main__":
+    main()
