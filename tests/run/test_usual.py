@@ -44,7 +44,7 @@ def test_many_agents_get_ippo():
 
 def test_many_agents_with_a_global_state_and_masks_get_qmix(echo):
     found = decide(Settings(), echo)
-    assert (found.algorithm, found.method, found.environments, found.rollout_steps) == ("qmix", "lare-bayes", 8, 50)
+    assert (found.algorithm, found.method, found.environments, found.rollout_steps) == ("qmix", "lare-rd", 8, 50)
     assert (found.evaluation_episodes, found.capacity) == (32, 5000 * 7)
     assert found.steps % found.iteration_steps == found.evaluate_every % found.iteration_steps == 0
     assert abs(found.steps - 2_000_000) < 400

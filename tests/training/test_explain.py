@@ -71,6 +71,18 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
                 "- cost: 0%, +2 ± 0.1",
             ],
         ),
+        (
+            found(by_factors=0.99, by_all=0.99, weight=np.array([0.15, 0.02]), share=np.array([0.95, 0.04])),
+            None,
+            FACTORS,
+            [],
+            [
+                "The factors explain 99% of the variation of the returns of 40 episodes.",
+                SHARES,
+                "- speed: 95%, +0.15 ± 0.1 (not in a straight line)",
+                "- cost: 4%, +0.02 ± 0.1",
+            ],
+        ),
         (found(), None, [], [], ["Raw features explain 97% of the variation of the returns of 40 episodes."]),
         (found(episodes=19), None, FACTORS, ENTRIES, []),
         (found(by_all=np.nan), None, FACTORS, ENTRIES, []),

@@ -5,9 +5,9 @@ step's noise has precision beta explains the share
 
     1 - (1 / beta) / (q / (N - 1))
 
-of the variation: as an R^2, but for the freedom that the fit has used up. A feature's part of that is in proportion to its
-covariance with the prediction, mu_i (S mu)_i: the parts of all features add up to the whole. What a fit on the factors alone
-leaves correlates with the mean of raw entry j over an episode by
+of the variation: as an R^2, but for the freedom that the fit has used up. A factor's share of that is in proportion to the
+covariance of its features with the prediction, the sum of their mu_i (S mu)_i, or 0 where that is negative: the shares of all
+factors add up to the whole. What a fit on the factors alone leaves correlates with the mean of raw entry j over an episode by
 
     (p - S mu)_j / sqrt(S_jj (q - 2 mu . p + mu . S mu))
 """
@@ -61,8 +61,8 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     unit = jnp.where(given.unit > 0, given.unit, 1)
     part = fitted.weight / unit * (given.s @ (fitted.weight / unit))
     by_factors = explained(alone, form, numbers, fitted)
-    total = jnp.sum(part)
-    part = by_factors * part / jnp.where(total > 0, total, 1)
+    share = jnp.maximum(of_each(part, basis), 0)
+    share = by_factors * share / jnp.where(jnp.any(share > 0), jnp.sum(share), 1)
     steps = jnp.where(form == 1, sums.steps / jnp.maximum(sums.episodes, 1), 1)  # r_hat of an average is a T-th
     return Explanation(
         sums.episodes,
@@ -70,7 +70,7 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
         jnp.maximum(by_all, by_factors),
         fitted.weight[: basis.factors] / steps,
         jnp.sqrt(jnp.diagonal(sigma)[: basis.factors]) / steps,
-        of_each(part, basis),
+        share,
         residual(sums, form, basis, fitted, of_factors),
     )
 

@@ -43,7 +43,7 @@ class Settings(Checked):
     """What `lare train` and `lare.train` are given. What is None is decided by the task and the algorithm."""
 
     method: str | None = None
-    """How credit is assigned (see `lare methods`); lare-bayes unless given."""
+    """How credit is assigned (see `lare methods`); lare-bayes unless given, with qmix and vdn lare-rd."""
     algorithm: Name | None = None
     """The reinforcement learning algorithm: for a single agent ppo where actions are a choice, else td3; for many qmix where there
     are a global state and action masks, else ippo."""

@@ -11,6 +11,8 @@ FEWEST = 20
 """Episodes, below which nothing is said."""
 NEXT_TO_NOTHING = 0.1
 """Of the variation of the returns."""
+NOTICEABLE = 0.05
+"""Of the variation: a share that is worth a word."""
 STRIKING = 0.3
 """A correlation with what the factors leave."""
 FORMS = ("sum", "average")
@@ -29,6 +31,11 @@ def entry_names(spec: TaskSpec, entries: int) -> list[str]:
 
     shown = max(0, entries - spec.action_size)
     return named(spec.observation, shown, "observation") + named(spec.action, entries - shown, "action")
+
+
+def is_bent(found: Explanation, factor: int) -> bool:
+    """Whether the score goes with a factor, but is not higher wherever the factor is larger: a target value, say."""
+    return bool(found.share[factor] > NOTICEABLE and abs(found.weight[factor]) < 2 * found.deviation[factor])
 
 
 def words(found: Explanation, form: str | None, factors: list[str], entries: list[str]) -> list[str]:
@@ -67,8 +74,9 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
             "What goes with each factor: its share of the variation, and what a step pays more for one standard deviation of it:"
         )
         said += [
-            f"- {factors[i]}: {max(0, found.share[i]):.0%}, {found.weight[i]:+.3g} ± {found.deviation[i]:.1g}"
-            for i in np.argsort(-found.share, kind="stable")
+            f"- {factors[i]}: {found.share[i]:.0%}, {found.weight[i]:+.3g} ± {found.deviation[i]:.1g}"
+            + (" (not in a straight line)" if is_bent(found, i) else "")
+            for i in np.argsort(-found.share, kind="stable").tolist()
         ]
     if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:
         place = int(np.argmax(np.abs(found.left)))
