@@ -2,7 +2,7 @@
 
     python benchmarks/missing_factors.py run RUNS [TASK/METHOD/FUNCTION ...]   train what is missing, go on with the rest
     python benchmarks/missing_factors.py keep RUNS                             copy what is finished to results/missing
-    python benchmarks/missing_factors.py table                                 from there
+    python benchmarks/table.py benchmarks/results/missing
 
 FUNCTION is `all` (draw 0 of the recorded functions), `without-f_NAME` (the same, one factor left out of what it returns) or
 `irrelevant`. Every run is a run directory RUNS/TASK/METHOD/FUNCTION.
@@ -14,8 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from learning import mean_and_spread, read
+from learning import read
 
 import lare
 
@@ -93,27 +92,11 @@ def keep(directory: Path) -> None:
                 shutil.copyfile(directory / name / file, KEPT / name / file)
 
 
-def table() -> None:
-    for name in experiments():
-        if not (KEPT / name).exists():
-            continue
-        config, lines = read(KEPT / name)
-        end = [line for line in lines if line["step"] == config["settings"]["steps"]]
-        key = "evaluation/return" if name.startswith("Half") else "evaluation/summed_return"
-        columns = []
-        for each in (key, "credit/correlation", "credit/return_r2"):
-            mean, spread = mean_and_spread([line[each] for line in end if line.get(each) is not None] or [np.nan])
-            columns.append(f"{each} {mean:.3g} ± {spread:.2g}")
-        print(f"{name:44s} {', '.join(columns)}")
-
-
 if __name__ == "__main__":
     match sys.argv[1:]:
         case ["run", runs, *wanted]:
             run(Path(runs), wanted)
         case ["keep", runs]:
             keep(Path(runs))
-        case ["table"]:
-            table()
         case _:
             sys.exit(__doc__)

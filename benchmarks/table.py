@@ -34,8 +34,9 @@ def row(directory: Path, at: int | None) -> str:
     quarter = [sum(values) / len(values) for values in late.values()]
     cells = [cell([line[key] for line in end]), cell(quarter)]
     cells += [cell([line[name] for line in end if line.get(name) is not None]) for name in COLUMNS]
-    method = config["settings"]["method"]
-    return f"| {directory.parent.name} | `{method}` | {last:,} | {' | '.join(cells)} |"
+    method, name = config["settings"]["method"], directory.name
+    label = f"`{method}`" if name.startswith(method) else f"`{method}`, {name}"
+    return f"| {config['task']['name']} | {label} | {last:,} | {' | '.join(cells)} |"
 
 
 def main() -> None:
