@@ -118,6 +118,12 @@ def fitted(means: Array, returns: Array, length: Array, group: tuple[int, ...]) 
     return found.weight, found.bias
 
 
+def standardised(rows: np.ndarray, known: int, until: int) -> Array:
+    """By the steps that are known."""
+    deviation = rows[:known].std(axis=0)
+    return jnp.asarray((rows[:until] - rows[:known].mean(axis=0)) / np.where(deviation > 0, deviation, 1))
+
+
 def main(directory: str) -> None:
     run = open_run(directory)
     learner = load_learner(run)[1]
@@ -135,12 +141,7 @@ def main(directory: str) -> None:
         truths = scores(after, action, np.asarray(steps.before["reward"])[0, :, 0], SPEED[run.config.task.name])
         for count in (n for n in EPISODES if n + ASKED <= len(ends)):
             known, until = ends[count - 1], ends[count + ASKED - 1]
-            standard = []
-            for rows in (z, np.concatenate([after, action], axis=1)):
-                deviation = rows[:known].std(axis=0)
-                standard.append(
-                    jnp.asarray((rows[:until] - rows[:known].mean(axis=0)) / np.where(deviation > 0, deviation, 1))
-                )
+            standard = [standardised(rows, known, until) for rows in (z, np.concatenate([after, action], axis=1))]
             begins, length = np.append(0, ends[: count - 1]), np.diff(np.append(0, ends[:count]))
             for name, groups in bases(*standard):
                 features = np.asarray(jnp.concatenate(groups, axis=1), np.float64)

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import jax
 import jax.numpy as jnp
 import numpy as np
-from basis import ASKED, CHOSEN, fitted, pairs, scores
+from basis import ASKED, CHOSEN, fitted, pairs, scores, standardised
 from jax import Array
 from measure import write
 from missing_factors import FACTORS, source
@@ -40,12 +40,6 @@ def functions() -> Iterator[tuple[str, lare.LatentFunction]]:
             path = Path(place) / f"{name}.py"
             path.write_text(source(TASK, name))
             yield name, lare.load_function(path, task)
-
-
-def standardised(rows: np.ndarray, known: int, until: int) -> Array:
-    """By the steps that are known."""
-    deviation = rows[:known].std(axis=0)
-    return jnp.asarray((rows[:until] - rows[:known].mean(axis=0)) / np.where(deviation > 0, deviation, 1))
 
 
 def groups_of(z: Array | None, x: Array) -> Iterator[tuple[str, list[Array]]]:

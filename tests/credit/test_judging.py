@@ -38,9 +38,8 @@ def test_no_return_is_seen_before_it_is_predicted():
         means = mean_features(rows, alive, BASIS)[:, BASIS.of_factors]
         changed = np.where(np.arange(len(rows)) < 40, returns, -returns)
         one, other = (predictions(means, paid, length, BASIS, 0) for paid in (returns, changed))
-    known = (
-        next(end for _, end in growing(len(rows)) if end > 40) - FIRST
-    )  # the block of episode 40 is predicted as a whole
+    # The block of episode 40 is predicted as a whole.
+    known = next(end for _, end in growing(len(rows)) if end > 40) - FIRST
     np.testing.assert_array_equal(one[:known], other[:known])
     assert (one[known:] != other[known:]).all()
 
