@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit.basis import LARGEST, Basis, expand, shapes
+from lare.credit.basis import LARGEST, Basis, cosine_and_sine, expand, shapes
 
 U = np.array([0.5, -1.0, 2.0, 9.0, -0.3], np.float32)
 """Three factors and two entries, one of which is far out."""
@@ -62,3 +62,10 @@ def test_entries_of_a_picture_are_left_out():
     assert basis.inputs == 5002
     assert expand(basis, jnp.zeros((3, 5002))).shape == (3, basis.size) == (3, 15)
     assert Basis(0, 5000, extended=False).size == 0
+
+
+def test_waves_to_the_precision_of_float32():
+    angle = np.linspace(-np.pi, np.pi, 2001)
+    cosine, sine = cosine_and_sine(jnp.asarray(angle, jnp.float32))
+    np.testing.assert_allclose(cosine, np.cos(angle), atol=3e-7)
+    np.testing.assert_allclose(sine, np.sin(angle), atol=3e-7)

@@ -80,7 +80,7 @@ def test_sums_are_those_from_scratch_whatever_the_scales_have_been(method, env):
         taken.add(float(closed.steps))
         assert float(closed.steps) >= float(learner.credit[0].statistics.rows) / closed_form.GROWTH_OF_SUMS - 3 * 12
         for a, b in zip(whole(learner), from_scratch(learner, config), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)  # features are of float32
     assert float(whole(learner).episodes) == len(LONG)
     assert 5 < len(taken) < 25
 

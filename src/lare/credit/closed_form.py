@@ -9,8 +9,8 @@ LaRe without the reward model has signs for w instead:
 
 By which mean and deviation u is standardised decides what the features are. Both move while steps come in, and sums of features
 that were standardised by old ones would be stale. So they stay as they are for a while, and each time that the steps have
-grown by a quarter, all stored episodes are summed again with new ones: a step is summed at most six times on average, however
-many there are.
+grown by a half, all stored episodes are summed again with new ones: a step is summed three times on average, however many
+there are.
 
 The sums need float64: features that nearly repeat each other leave nothing of float32. Where they are kept, each number is the
 sum of two of float32; functions that take or return `Sums` are to be called within `jax.enable_x64(True)`.
@@ -34,12 +34,12 @@ from lare.normalise import RunningMeanStd, deviation
 
 LARGEST_CHOICE = 16
 """Factors whose signs are searched through, all 2^d of them."""
-GROWTH_OF_SUMS = 1.25
+GROWTH_OF_SUMS = 1.5
 """Of the steps, until all episodes are summed again."""
 GROWTH_OF_FIT = 1.05
 """Of the episodes, until the decoder is fitted again."""
 ROUNDS = 20
-"""Of the evidence's fixed point, in each fit. It begins where the last one ended."""
+"""Of the evidence's fixed point, in each fit, at most. It begins where the last one ended."""
 
 
 class LinearDecoder(eqx.Module):

@@ -17,7 +17,7 @@ N(mu, Sigma):
 The precisions are those under which the returns are most likely. At the maximum of the evidence, with n_g features in a
 group and gamma_g of them determined by the data (MacKay, Neural Computation 4, 1992; Tipping, JMLR 1, 2001):
 
-    gamma_g = n_g - alpha_g tr Sigma_gg = beta tr (Sigma S)_gg,     alpha_g = gamma_g / |mu_g|^2,
+    gamma_g = n_g - alpha_g tr Sigma_gg,     alpha_g = gamma_g / |mu_g|^2,
     beta = (N - 1 - sum gamma) / (q - 2 mu . p + mu . S mu)
 
 A group that does not help is switched off by the data (alpha grows), one that is needed is switched on. That regression can be
@@ -33,7 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 RANGE = 1e6
 """A group may explain so many times more, or less, of the returns than its equal share. Beyond, it is off; but not so far off
@@ -41,6 +41,8 @@ that it could not come back."""
 ROUNDING = 1e-10
 """So much of the diagonal of S is added to it: more than float64 has lost there. Where features repeat each other, S alone could
 not be factorised."""
+GAIN = 1e-3
+"""In the log evidence: a round of the fixed point that changes it by less is the last one."""
 LEAST_NOISE = 1e-10
 """Of the returns' variance. Features and returns in float32 tell no smaller one."""
 
@@ -138,20 +140,32 @@ def problem(sums: Sums, form: Int[Array, ""] | int, group: Int[np.ndarray, " fea
 def fit(
     sums: Sums, form: Int[Array, ""] | int, group: Int[np.ndarray, " features"], start: Posterior, rounds: int
 ) -> Posterior:
-    """The posterior under the precisions that some rounds of the fixed point lead to.
+    """The posterior under the precisions that the fixed point leads to.
 
     Args:
         sums: over the episodes.
         form: 0 where the score is a sum over the steps, 1 where it is an average.
         group: the number of each feature's group.
         start: an earlier fit, with whose precisions the first round begins; or `unknown`.
-        rounds: at least 1.
+        rounds: at most; there are fewer where the evidence stops changing.
     """
     given = problem(sums, form, group)
     alpha = jnp.where(start.alpha > 0, start.alpha, given.equal)
     beta = jnp.where(start.beta > 0, start.beta, 2 * given.free / given.q)
-    first = start._replace(alpha=alpha, beta=beta)
-    found = jax.lax.fori_loop(0, rounds, lambda _, known: one_round(given, known.alpha, known.beta), first)
+    first = one_round(given, alpha, beta)
+
+    def unsettled(state: tuple[Int[Array, ""], Float[Array, ""], Posterior]) -> Bool[Array, ""]:
+        done, before, known = state
+        return (done < rounds) & (jnp.abs(known.log_evidence - before) > GAIN)
+
+    def again(
+        state: tuple[Int[Array, ""], Float[Array, ""], Posterior],
+    ) -> tuple[Int[Array, ""], Float[Array, ""], Posterior]:
+        done, _, known = state
+        return done + 1, known.log_evidence, one_round(given, known.alpha, known.beta)
+
+    begin = jnp.array(1), jnp.full_like(first.log_evidence, -jnp.inf), first
+    found = jax.lax.while_loop(unsettled, again, begin)[2]
     enough = (given.free > 0) & (given.unit > 0)
     found = jax.tree.map(lambda new, old: jnp.where(enough, new, old), found, start)
     weight = jnp.where(enough, given.unit * found.weight, 0)
@@ -182,14 +196,13 @@ def one_round(given: Problem, alpha: Float[Array, " groups"], beta: Float[Array,
     alpha, beta = within(given, alpha, beta)
     factor, scale = precision(given, alpha, beta)
     root = solve_triangular(factor, jnp.diag(1 / scale), lower=True)
-    sigma = root.T @ root
-    weight = beta * (sigma @ given.p)
+    weight = beta * ((root @ given.p) @ root)
     left = given.q - 2 * weight @ given.p + weight @ given.s @ weight
     left = jnp.maximum(left, LEAST_NOISE * given.q)
     groups = len(alpha)
-    determined = jnp.zeros(groups).at[given.group].add(beta * jnp.sum(sigma * given.s, axis=1))
     size = jnp.zeros(groups).at[given.group].add(1.0)
-    determined = jnp.clip(determined, 0, size)
+    variances = jnp.zeros(groups).at[given.group].add(jnp.sum(root**2, axis=0))  # tr Sigma_gg
+    determined = jnp.clip(size - alpha * variances, 0, size)
     squares = jnp.zeros(groups).at[given.group].add(weight**2)
     log_evidence = 0.5 * (
         given.free * jnp.log(beta)

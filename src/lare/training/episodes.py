@@ -23,8 +23,8 @@ from lare.data.sampling import episodes_since, in_order
 from lare.training.config import TrainConfig
 from lare.training.learner import episodes_of
 
-ROWS = 1000
-"""Judged rows, about, that are read at a time."""
+ROWS = 8000
+"""The most judged rows that are read at a time, unless a single episode has more."""
 PLACES = prediction.LAST
 """The most episodes that are read at a time."""
 GROWTH = 0.02
@@ -70,10 +70,13 @@ def pieces(
     since: Int[Array, " envs"],
     take: Callable[[Decomposition, Episodes, Bool[Array, " episodes"]], Decomposition],
     config: TrainConfig,
+    expected: int = PLACES,
 ) -> Credit:
-    """What each team's decoder becomes when it `take`s all finished episodes from some number on, some at a time."""
+    """What each team's decoder becomes when it `take`s all finished episodes from some number on, about as many at a time as are
+    expected.
+    """
     longest = config.env.max_steps
-    rows = max(1, ROWS // (config.judged_rows * longest)) * longest
+    rows = max(1, min(expected, PLACES, ROWS // (config.judged_rows * longest))) * longest
     total = jnp.sum(episodes_since(buffer, since))
 
     def piece(carry: tuple[Int[Array, ""], Credit]) -> tuple[Int[Array, ""], Credit]:
@@ -93,7 +96,9 @@ def tell(credit: Credit, buffer: Replay, since: Int[Array, " envs"], config: Tra
         one = returns.predict(one, episodes, there, config.credit)
         return one if one.closed is None else returns.add_episodes(one, episodes, there)
 
-    return pieces(credit, buffer, since, take, config)
+    return pieces(
+        credit, buffer, since, take, config, config.environments * config.rollout_steps // config.env.max_steps
+    )
 
 
 def sum_again(credit: Credit, buffer: Replay, again: Bool[Array, ""], config: TrainConfig) -> Credit:
