@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from lare.latent.design import design as design
     from lare.latent.function import LatentFunction as LatentFunction
     from lare.latent.function import load as load_function  # noqa: F401
+    from lare.plugs.assigner import CreditAssigner as CreditAssigner
     from lare.run.directory import Run as Run
     from lare.run.directory import open_run as open_run
     from lare.run.settings import Settings as Settings
@@ -36,6 +37,7 @@ HOMES = {
     "design": "lare.latent.design",
     "LatentFunction": "lare.latent.function",
     "load_function": "lare.latent.function:load",
+    "CreditAssigner": "lare.plugs.assigner",
     "EpisodicReward": "lare.tasks.episodic",
     "TaskSpec": "lare.tasks.spec",
     "load_task": "lare.tasks.spec",

@@ -9,7 +9,7 @@ from lare.credit.explanation import Explanation
 from lare.latent.function import verified
 from lare.tasks.spec import read_task
 from lare.training.explain import explanation_of
-from lare.training.words import entry_names, words
+from lare.credit.words import entry_names, words
 from toys import Ear, toy_spec
 
 
@@ -93,11 +93,16 @@ def test_sentences(given, form, factors, entries, said):
 
 
 def test_entries_have_the_names_that_the_tasks_text_gives_them():
-    names = entry_names(read_task("HalfCheetah-v4"), 23)
+    task = read_task("HalfCheetah-v4")
+    names = entry_names(task.observation, task.action, 23, task.action_size)
     assert names[7] == "entry 7 of the observation (angle of the front foot (rad))"
     assert names[17].startswith("entry 0 of the action")
     assert len(names) == 23
-    assert entry_names(toy_spec(), 3)[0].startswith("entry 0 of the observation")
+    assert entry_names("", "", 3, 1) == [
+        "entry 0 of the observation",
+        "entry 1 of the observation",
+        "entry 0 of the action",
+    ]
 
 
 @pytest.mark.parametrize("method", ["lare-bayes", "lare-rd", "rrdu"])

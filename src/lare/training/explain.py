@@ -18,7 +18,7 @@ from lare.training.episodes import from_stored
 from lare.training.learner import Learner, init_credit
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
-from lare.training.words import FEWEST, entry_names, words
+from lare.credit.words import FEWEST, entry_names, words
 
 
 def judging(config: TrainConfig) -> TrainConfig:
@@ -63,7 +63,8 @@ def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
         function = run.functions[place] if run.functions else None
         factors = [] if function is None else function.columns_by(run.judges)
         form = returns.form_found(of_seed(learner.credit[place]))
-        entries = entry_names(roles[place], len(found.left)) if not config.of_state else []
+        role = roles[place]
+        entries = [] if config.of_state else entry_names(role.observation, role.action, len(found.left), role.action_size)
         team = f"{config.env.teams[place].name}: " if len(roles) > 1 else ""
         lines += [team + line for line in words(found, form, factors, entries)]
     return lines

@@ -5,7 +5,6 @@ import re
 import numpy as np
 
 from lare.credit.explanation import Explanation
-from lare.tasks.spec import TaskSpec
 
 FEWEST = 20
 """Episodes, below which nothing is said."""
@@ -19,8 +18,15 @@ FORMS = ("sum", "average")
 """Of a score, by number."""
 
 
-def entry_names(spec: TaskSpec, entries: int) -> list[str]:
-    """What the task's text calls the entries of [s', a]: `7: angle of the foot` names entry 7."""
+def entry_names(observation: str, action: str, entries: int, action_size: int) -> list[str]:
+    """What a task's texts call the entries of [s', a]: `7: angle of the foot` names entry 7.
+
+    Args:
+        observation: the text of the observation.
+        action: that of the action.
+        entries: all of them; none has fewer than those of the action, but 0.
+        action_size: how many of them, at the end, are the action's.
+    """
 
     def named(text: str, count: int, kind: str) -> list[str]:
         lines = dict(re.findall(r"^[\s\-*\[]*(\d+)\]?\s*[:.)]\s*(.+)$", text, flags=re.MULTILINE))
@@ -29,8 +35,8 @@ def entry_names(spec: TaskSpec, entries: int) -> list[str]:
             for i in range(count)
         ]
 
-    shown = max(0, entries - spec.action_size)
-    return named(spec.observation, shown, "observation") + named(spec.action, entries - shown, "action")
+    shown = max(0, entries - action_size)
+    return named(observation, shown, "observation") + named(action, entries - shown, "action")
 
 
 def is_bent(found: Explanation, factor: int) -> bool:

@@ -1,0 +1,105 @@
+"""Which stored steps an update of a decoder reads: as `data/sampling.py`, from a `Store`, in NumPy."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Int
+
+from lare.credit.decomposition import CreditSettings, Episodes
+from lare.credit.methods import Fit
+from lare.plugs.store import Episode, Store
+
+
+def batch(store: Store, fit: Fit, settings: CreditSettings, random: np.random.Generator, longest: int) -> Episodes:
+    """Steps of episodes for one update, drawn uniformly with replacement.
+
+    Args:
+        store: with an episode at least.
+        longest: as many steps as an episode can have; batches with the same are of one shape.
+    """
+
+    def drawn(some: int) -> list[Episode]:
+        return [store.episodes[store.oldest[place][1]] for place in random.integers(len(store.oldest), size=some)]
+
+    match fit:
+        case Fit.ALL_STEPS:
+            rows = max(settings.steps, longest)
+            mean = max(1, store.ended_steps // store.ended)
+            return packed(store, drawn(max(1, settings.steps // mean)), max(1, settings.steps // 2), rows)
+        case Fit.SUBTRAJECTORIES:
+            return padded(store, drawn(settings.episodes), longest)
+        case _:
+            chosen = drawn(max(1, settings.steps // settings.drawn_steps))
+            return parts(store, chosen, settings.drawn_steps, random)
+
+
+def parts(store: Store, episodes: Sequence[Episode], drawn: int, random: np.random.Generator) -> Episodes:
+    """`drawn` steps of each episode, without replacement; of a shorter one all, and padding."""
+    steps = np.zeros((len(episodes), drawn), np.int64)
+    belongs = np.zeros((len(episodes), drawn), bool)
+    for place, episode in enumerate(episodes):
+        count = min(drawn, len(episode.steps))
+        steps[place] = episode.steps[0]
+        steps[place, :count] = episode.steps[random.choice(len(episode.steps), count, replace=False, shuffle=False)]
+        belongs[place, :count] = True
+    number = np.where(belongs, np.arange(len(episodes))[:, None], len(episodes))
+    return episodes_of(store, episodes, steps.ravel(), number.ravel(), len(episodes))
+
+
+def packed(store: Store, episodes: Sequence[Episode], places: int, rows: int) -> Episodes:
+    """Whole episodes one behind the other, as many as fit, and padding."""
+    chosen: list[Episode] = []
+    for episode in episodes[:places]:
+        if sum(len(one.steps) for one in chosen) + len(episode.steps) <= rows:
+            chosen.append(episode)
+    steps = np.concatenate([episode.steps for episode in chosen])
+    number = np.repeat(np.arange(len(chosen)), [len(episode.steps) for episode in chosen])
+    more = rows - len(steps)
+    steps, number = np.pad(steps, (0, more), mode="edge"), np.pad(number, (0, more), constant_values=places)
+    return episodes_of(store, chosen, steps, number, places)
+
+
+def padded(store: Store, episodes: Sequence[Episode], longest: int) -> Episodes:
+    """Whole episodes, and the last step of each again until it is as long as the longest can be."""
+    steps = np.concatenate(
+        [np.pad(episode.steps, (0, longest - len(episode.steps)), mode="edge") for episode in episodes]
+    )
+    return episodes_of(store, episodes, steps, np.repeat(np.arange(len(episodes)), longest), len(episodes))
+
+
+def episodes_of(
+    store: Store,
+    episodes: Sequence[Episode],
+    steps: Int[np.ndarray, " rows"],
+    number: Int[np.ndarray, " rows"],
+    places: int,
+) -> Episodes:
+    """The features of some steps, with what their episodes returned."""
+    rows, empty = steps % store.capacity, places - len(episodes)
+    length = np.pad([len(episode.steps) for episode in episodes], (0, empty), constant_values=1)
+    score = np.pad([episode.score for episode in episodes], (0, empty))
+    share = None
+    if store.alive is not None:
+        alive = store.alive[rows]
+        share = (alive / np.maximum(alive.sum(axis=-1, keepdims=True), 1)).astype(np.float32)
+    features = store.features[rows]
+    return Episodes(
+        features=features,  # pyright: ignore[reportArgumentType]
+        episode=number.astype(np.int32),  # pyright: ignore[reportArgumentType]
+        length=length.astype(np.int32),  # pyright: ignore[reportArgumentType]
+        mean_reward=(score / length).astype(np.float32),  # pyright: ignore[reportArgumentType]
+        mask=(np.arange(places) < len(episodes)).astype(np.float32),  # pyright: ignore[reportArgumentType]
+        share=share,  # pyright: ignore[reportArgumentType]
+    )
+
+
+def pieces(store: Store, episodes: Sequence[Episode], places: int, rows: int) -> Iterator[Episodes]:
+    """Whole episodes in their order, some at a time: at most so many of them, in so many rows, and padding."""
+    start = 0
+    while start < len(episodes):
+        end, used = start, 0
+        while end < len(episodes) and end - start < places and used + len(episodes[end].steps) <= rows:
+            used += len(episodes[end].steps)
+            end += 1
+        yield packed(store, episodes[start:end], places, rows)
+        start = end

@@ -1,0 +1,103 @@
+"""The compiled functions behind a `CreditAssigner`, of one team: what `lare.credit` does with batches of steps and episodes.
+
+The order is that of `training/episodes.py`: returns are predicted, then added to sums, then fitted to.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from lare.credit import closed_form, decomposition, descent, returns
+from lare.credit.decomposition import CreditSettings, Decomposition, Episodes
+from lare.credit.methods import METHODS
+from lare.normalise import Scale, magnitude, observe_scale
+
+
+@jax.jit
+def observe_steps(
+    state: Decomposition, features: Float[Array, "rows *agents features"], mask: Bool[Array, "rows *agents"]
+) -> Decomposition:
+    """With new steps in the statistics."""
+    return decomposition.observe_steps(state, features, mask)
+
+
+@jax.jit
+def observe_return(state: Decomposition, mean_reward: Float[Array, ""], length: Int[Array, ""]) -> Decomposition:
+    """With a finished episode in the scales."""
+    return decomposition.observe_returns(state, mean_reward[None], length[None], jnp.ones(1, bool))
+
+
+@jax.jit
+def observe_mean_reward(scale: Scale, mean_reward: Float[Array, ""]) -> Scale:
+    """With a finished episode in a scale of R/T."""
+    return observe_scale(scale, mean_reward[None], jnp.ones(1, bool))
+
+
+@partial(jax.jit, static_argnames="settings")
+def tell(state: Decomposition, episodes: Episodes, settings: CreditSettings) -> Decomposition:
+    """Predict the returns of new episodes, and add them to the sums where there are any."""
+    new = episodes.mask > 0
+    state = returns.predict(state, episodes, new, settings)
+    return state if state.closed is None else returns.add_episodes(state, episodes, new)
+
+
+@jax.jit
+def add(state: Decomposition, episodes: Episodes) -> Decomposition:
+    """Add episodes to the sums, once more."""
+    return returns.add_episodes(state, episodes, episodes.mask > 0)
+
+
+is_stale = jax.jit(returns.is_stale)
+begin_again = jax.jit(returns.begin_again)
+
+
+@partial(jax.jit, static_argnames=("method", "forms"))
+def fit_in_closed_form(state: Decomposition, method: str, forms: tuple[int, ...]) -> Decomposition:
+    """The decoder that the sums lead to."""
+    return returns.fit_in_closed_form(state, METHODS[method], forms)
+
+
+@jax.jit
+def is_due(state: Decomposition) -> Bool[Array, ""]:
+    """Whether there are enough new episodes for another fit in closed form."""
+    assert state.closed is not None
+    return closed_form.is_due(state.closed)
+
+
+@partial(jax.jit, static_argnames=("method", "settings"))
+def descend(
+    state: Decomposition, batches: Episodes, keys: PRNGKeyArray, method: str, settings: CreditSettings
+) -> tuple[Decomposition, Float[Array, ""]]:
+    """One update by a gradient for each of some batches; and the mean of their losses."""
+    fit = METHODS[method].fit
+    assert fit is not None
+
+    def one(state: Decomposition, batch: tuple[Episodes, PRNGKeyArray]) -> tuple[Decomposition, Float[Array, ""]]:
+        state, measured = descent.update(state, *batch, fit, settings)
+        return state, measured["credit/loss"]
+
+    state, losses = jax.lax.scan(one, state, (batches, keys))
+    return state, jnp.mean(losses)
+
+
+@partial(jax.jit, static_argnames=("method", "settings", "as_paid"))
+def rewards(
+    state: Decomposition,
+    features: Float[Array, "rows *agents features"],
+    length: Int[Array, " rows"],
+    method: str,
+    settings: CreditSettings,
+    as_paid: bool,
+) -> Float[Array, "rows *agents"]:
+    """r_hat by the decoder as it stands, 0 as long as it is fitted to nothing; with optimism, where that is set and asked for."""
+    optimistic = as_paid and decomposition.optimistic(METHODS[method], settings)
+    found = decomposition.optimistic_rewards if optimistic else decomposition.proxy_rewards
+    return jnp.where(returns.is_fitted(state), found(state, features, settings, length), 0)
+
+
+@jax.jit
+def divided(r_hat: Float[Array, "*batch"], scale: Scale) -> Float[Array, "*batch"]:
+    """In units of the running root mean square of R/T."""
+    return r_hat / magnitude(scale)

@@ -1,0 +1,149 @@
+"""A `CreditAssigner` on the disk, and on its way to another process. No pickle.
+
+DIRECTORY/
+  assigner.json   what it was made with, and counts
+  state.npz       decoder and statistics; steps and episodes, where they are kept
+  phi.py, .json   the function, and what it was tried on in `state.npz`
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lare.credit.decomposition import CreditSettings
+from lare.credit.methods import find_method
+from lare.errors import LareError, shortened
+from lare.files import write_atomically
+from lare.latent.function import LatentFunction
+from lare.latent.function import load as load_function
+from lare.plugs.assigner import CreditAssigner
+from lare.plugs.layout import Layout
+from lare.plugs.store import Episode
+from lare.run.checkpoint import DAMAGED, opened
+from lare.tasks.spec import TaskSpec, read_text
+
+FORMAT = 1
+TEXT, ARRAYS, FUNCTION = "assigner.json", "state.npz", "phi.py"
+
+
+def text_of(credit: CreditAssigner) -> dict[str, Any]:
+    """What it was made with, and what it counts, as JSON."""
+    return {
+        "format": FORMAT,
+        "method": credit.config.method.name,
+        "task": None if credit.config.task is None else credit.config.task.model_dump(mode="json"),
+        "observation": credit.config.observation.model_dump(mode="json"),
+        "action": credit.config.action.model_dump(mode="json"),
+        "judges": credit.config.judges,
+        "agents": credit.config.agents,
+        "max_steps": credit.config.max_steps,
+        "capacity": credit.store.capacity,
+        "settings": credit.config.settings.model_dump(mode="json"),
+        "seed": credit.config.seed,
+        "fits_per_step": credit.config.fits_per_step,
+        "scale_rewards": credit.config.scale_rewards,
+        "phi": credit.config.phi is not None,
+        "told": credit.told,
+        "fits": credit.fits,
+    }
+
+
+def leaves(credit: CreditAssigner) -> dict[str, Any]:
+    """The decoder and the statistics, by their places."""
+    found, _ = jax.tree_util.tree_flatten_with_path((credit.state, credit.scale))
+    return {f"learned{jax.tree_util.keystr(path)}": leaf for path, leaf in found}
+
+
+def arrays_of(credit: CreditAssigner, episodes: bool) -> dict[str, np.ndarray]:
+    """What it has learned and, where `episodes` is true, what it has met."""
+    credit.learn()
+    arrays = {name: np.asarray(leaf) for name, leaf in leaves(credit).items()}
+    if not episodes:
+        return arrays
+    store = credit.store
+    there = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
+    kept = list(store.episodes.values())
+    arrays |= {name: getattr(store, name)[there] for name in ("features", "length", "mean_reward")}
+    arrays |= {} if store.alive is None else {"alive": store.alive[there]}
+    arrays["counts"] = np.array([store.steps, store.ended, store.ended_steps, store.dropped + len(store.running)])
+    arrays["episodes"] = np.concatenate([np.zeros(0, np.int64), *(one.steps for one in kept)])
+    arrays["lengths"] = np.array([len(one.steps) for one in kept], np.int64)
+    arrays["scores"] = np.array([one.score for one in kept], np.float64)
+    return arrays
+
+
+def save(credit: CreditAssigner, directory: Path, episodes: bool) -> None:
+    """Write a directory; what was there of an earlier one is replaced, each file as a whole."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LareError(f"{directory} cannot be written: {error.strerror}") from error
+    arrays = arrays_of(credit, episodes)
+    if credit.config.phi is not None:
+        credit.config.phi.save(directory / FUNCTION)
+    write_atomically(directory / ARRAYS, lambda file: np.savez(file, allow_pickle=False, **arrays))
+    text = json.dumps(text_of(credit), indent=1).encode()
+    write_atomically(directory / TEXT, lambda file: file.write(text))
+
+
+def load(directory: Path) -> CreditAssigner:
+    """Read such a directory."""
+    path = directory / TEXT
+    try:
+        text = json.loads(read_text(path))
+        with opened(directory / ARRAYS) as saved:
+            arrays = {name: saved[name] for name in saved.files}
+        if not isinstance(text, dict) or text.get("format") != FORMAT:
+            raise LareError(f"{path} is not of format {FORMAT}: another version of LaRe has written it")
+        phi = load_function(directory / FUNCTION, TaskSpec(**text["task"])) if text["phi"] else None
+        credit = CreditAssigner.__new__(CreditAssigner)
+        restore(credit, text, arrays, phi)
+    except (*DAMAGED, TypeError, RecursionError) as error:
+        raise LareError(f"{directory} holds no credit assigner, or a damaged one: {shortened(error)}") from error
+    return credit
+
+
+def restore(
+    credit: CreditAssigner, text: dict[str, Any], arrays: dict[str, np.ndarray], phi: LatentFunction | None
+) -> None:
+    """Make an assigner what another one was."""
+    observation, action = Layout(**text["observation"]), Layout(**text["action"])
+    task = None if text["task"] is None else TaskSpec(**text["task"])
+    credit.__init__(
+        find_method(text["method"]).name,
+        phi,
+        task=task,
+        observation_space=observation,
+        action_space=action,
+        settings=CreditSettings(**text["settings"]),
+        **{name: text[name] for name in ("judges", "agents", "max_steps", "capacity", "seed")},
+        **{name: text[name] for name in ("fits_per_step", "scale_rewards")},
+    )
+    credit.told, credit.fits = text["told"], text["fits"]
+    for name, leaf in leaves(credit).items():
+        if arrays[name].shape != leaf.shape:
+            raise ValueError(f"{name} has shape {arrays[name].shape}, not {leaf.shape}")
+    structure = jax.tree.structure((credit.state, credit.scale))
+    credit.state, credit.scale = jax.tree.unflatten(structure, [jnp.asarray(arrays[name]) for name in leaves(credit)])
+    if "counts" in arrays:
+        restore_steps(credit, arrays)
+
+
+def restore_steps(credit: CreditAssigner, arrays: dict[str, np.ndarray]) -> None:
+    """What an assigner had met."""
+    store = credit.store
+    store.steps, store.ended, store.ended_steps, store.dropped = map(int, arrays["counts"])
+    there = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
+    for name in ("features", "length", "mean_reward"):
+        getattr(store, name)[there] = arrays[name]
+    if "alive" in arrays:
+        store.alive = np.ones((store.capacity, credit.config.agents), bool)
+        store.alive[there] = arrays["alive"]
+    ends = np.cumsum(arrays["lengths"])
+    first = store.ended - len(ends)
+    for place, (end, length, score) in enumerate(zip(ends, arrays["lengths"], arrays["scores"], strict=True)):
+        store.put(first + place, Episode(arrays["episodes"][end - length : end], float(score)))
