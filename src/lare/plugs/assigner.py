@@ -113,6 +113,8 @@ class CreditAssigner:
         """Steps that have no features yet: number, before, action, after."""
         self.pending: list[Episode] = []
         """Episodes that the decoder has not been told of."""
+        self.unseen = self.untold = 0
+        """Steps that wait; steps of the episodes that are pending."""
         self.told = self.fits = 0
         """Episodes that it has been told of; updates by a gradient."""
         self.owed = 0.0
@@ -206,9 +208,10 @@ class CreditAssigner:
             run.last = after[row]
             if ended[row]:
                 self.finish(lanes[row], run.paid)
-        if sum(len(part[0]) for part in self.waiting) >= WAITING:
+        self.unseen += len(rows)
+        if self.unseen >= WAITING:
             self.look()
-        if sum(len(episode.steps) for episode in self.pending) >= PIECE:
+        if self.untold >= PIECE:
             self.learn()
         found = np.full(count, -1)
         found[rows] = numbers
@@ -259,6 +262,7 @@ class CreditAssigner:
         """An episode has ended."""
         episode = self.store.end(lane, score)
         self.pending.append(episode)
+        self.untold += len(episode.steps)
         mean = np.float32(score / len(episode.steps))
         with on_host():
             if self.state is not None:
@@ -278,6 +282,7 @@ class CreditAssigner:
             return
         number, *steps = (np.concatenate(part) for part in zip(*self.waiting, strict=True))
         self.waiting.clear()
+        self.unseen = 0
         for start in range(0, len(number), PIECE):
             part = slice(start, start + PIECE)
             found, places = self.config.features(*(each[part] for each in steps)), number[part] % self.store.capacity
@@ -301,6 +306,7 @@ class CreditAssigner:
         self.look()
         new = [episode for episode in self.pending if episode.steps[0] >= self.store.steps - self.store.capacity]
         self.pending.clear()
+        self.untold = 0
         self.told += len(new)
         if self.state is None or not new:
             return

@@ -1,5 +1,6 @@
 """How a space lies in rows of numbers: every observation and action becomes a row of float32, in Gymnasium's own order."""
 
+import functools
 from typing import Any, Literal
 
 import numpy as np
@@ -27,7 +28,7 @@ class Layout(Checked):
     parts: tuple["Layout", ...] = Field(default=())
     """named, in a row: the spaces that it is made of."""
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """Numbers in a row."""
         if self.kind == "numbers":

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool
 from lare.credit import closed_form, returns
 from lare.credit.explanation import Explanation, explain
 from lare.credit.methods import METHODS, Decoder
+from lare.credit.words import FEWEST, entry_names, words
 from lare.data.replay import Replay
 from lare.run.directory import Run
 from lare.training.config import TrainConfig
@@ -18,7 +19,6 @@ from lare.training.episodes import from_stored
 from lare.training.learner import Learner, init_credit
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
-from lare.credit.words import FEWEST, entry_names, words
 
 
 def judging(config: TrainConfig) -> TrainConfig:
@@ -64,7 +64,9 @@ def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
         factors = [] if function is None else function.columns_by(run.judges)
         form = returns.form_found(of_seed(learner.credit[place]))
         role = roles[place]
-        entries = [] if config.of_state else entry_names(role.observation, role.action, len(found.left), role.action_size)
+        entries = (
+            [] if config.of_state else entry_names(role.observation, role.action, len(found.left), role.action_size)
+        )
         team = f"{config.env.teams[place].name}: " if len(roles) > 1 else ""
         lines += [team + line for line in words(found, form, factors, entries)]
     return lines

@@ -13,12 +13,12 @@ from jaxtyping import Float
 from lare.credit.basis import Basis
 from lare.credit.judging import Judgement
 from lare.credit.judging import judge as judge_rows
+from lare.credit.words import FEWEST, FORMS, entry_names, words
 from lare.errors import LareError
 from lare.latent.function import LatentFunction
 from lare.latent.improve import Evidence, Model, improve
 from lare.tasks.play import Episode, Policy, episodes_of
 from lare.tasks.spec import TaskSpec, the_role
-from lare.credit.words import FEWEST, FORMS, entry_names, words
 
 EPISODES = 40
 """That are played, where none are given."""
@@ -103,7 +103,9 @@ def factors_of(function: LatentFunction, role: TaskSpec, episode: Episode) -> Fl
 def said_of(found: Judgement, names: list[str], role: TaskSpec, basis: Basis) -> list[str]:
     """The sentences that a user reads too."""
     form = None if found.average is None else FORMS[int(found.average)]
-    return words(found.explanation, form, names, entry_names(role.observation, role.action, basis.used_entries, role.action_size))
+    return words(
+        found.explanation, form, names, entry_names(role.observation, role.action, basis.used_entries, role.action_size)
+    )
 
 
 def ranges(names: Sequence[str], factors: Float[np.ndarray, "rows factors"]) -> list[str]:
