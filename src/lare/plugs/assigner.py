@@ -281,8 +281,6 @@ class CreditAssigner:
         if not self.waiting:
             return
         number, *steps = (np.concatenate(part) for part in zip(*self.waiting, strict=True))
-        self.waiting.clear()
-        self.unseen = 0
         for start in range(0, len(number), PIECE):
             part = slice(start, start + PIECE)
             found, places = self.config.features(*(each[part] for each in steps)), number[part] % self.store.capacity
@@ -291,9 +289,10 @@ class CreditAssigner:
                 continue
             alive = np.ones(found.shape[:-1], bool) if self.store.alive is None else self.store.alive[places]
             rows = padding(len(found))
-            mask = np.pad(alive, ((0, rows - len(found)), *[(0, 0)] * (alive.ndim - 1)))
             with on_host():
-                self.state = learning.observe_steps(self.state, padded(found, rows), mask)
+                self.state = learning.observe_steps(self.state, padded(found, rows), padded(alive, rows))
+        self.waiting.clear()  # not before phi has answered
+        self.unseen = 0
 
     def catch_up(self) -> None:
         """Everything that follows from what was met: features, and the new returns where there are enough of them."""
