@@ -3,8 +3,9 @@
     git worktree add ../before COMMIT
     python benchmarks/two_versions.py ../before .
 
-A turn is 500 environment steps of HalfCheetah-v4 with as many updates (td3, ddpg, sac), one rollout of 2000 steps with its updates
-(ppo), or ten iterations of CN-6 with one fit of the decoder (ippo), by each version's own `step_costs.py` and `agents_speed.py`.
+A case is an algorithm, a method and, for ippo, a task (CN-6, unless it is named). A turn is 500 environment steps of HalfCheetah-v4
+with as many updates (td3, ddpg, sac), one rollout of 2000 steps with its updates (ppo), or ten iterations with one fit of the decoder
+(ippo), by each version's own `step_costs.py` and `agents_speed.py`.
 Both processes are bound to the same core, and one waits while the other works.
 """
 
@@ -30,10 +31,10 @@ from pathlib import Path
 
 import agents_speed, measure, step_costs
 
-algorithm, method, steps = sys.argv[1], sys.argv[2], int(sys.argv[3])
+algorithm, method, task, steps = *sys.argv[1:4], int(sys.argv[4])
 with tempfile.TemporaryDirectory() as place:
     if algorithm == "ippo":
-        turn = partial(agents_speed.turn, agents_speed.session(Path(place) / "run", "CN-6", method))
+        turn = partial(agents_speed.turn, agents_speed.session(Path(place) / "run", task, method))
     else:
         turn = partial(measure.advance, step_costs.session(Path(place), algorithm, method), steps)
     turn()
@@ -49,10 +50,10 @@ class Version:
     """A checkout whose training steps are timed."""
 
     def __init__(self, checkout: Path, case: str, core: int):
-        algorithm, method = case.split()
+        algorithm, method, task = [*case.split(), "CN-6"][:3]
         path = os.pathsep.join(str(checkout.resolve() / name) for name in ("src", "benchmarks"))
         self.process = subprocess.Popen(
-            [sys.executable, "-P", "-c", PROGRAM, algorithm, method, str(TURN.get(algorithm, 0))],
+            [sys.executable, "-P", "-c", PROGRAM, algorithm, method, task, str(TURN.get(algorithm, 0))],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -100,21 +101,30 @@ def commit(checkout: Path) -> str:
     ).stdout.strip()
 
 
-def main(before: tyro.conf.Positional[Path], after: tyro.conf.Positional[Path], rounds: int = 9, core: int = 0) -> None:
+def main(
+    before: tyro.conf.Positional[Path],
+    after: tyro.conf.Positional[Path],
+    cases: tuple[str, ...] = CASES,
+    rounds: int = 9,
+    core: int = 0,
+    out: str = "two_versions",
+) -> None:
     """Measure.
 
     Args:
         before: a checkout.
         after: another one.
+        cases: what is timed.
         rounds: how often each has its turn.
         core: which both run on.
+        out: the name of the file in benchmarks/results.
     """
     found = {}
-    for case in CASES:
+    for case in cases:
         found[case] = measured(before, after, case, rounds, core)
         print(f"{case}: {json.dumps({name: round(found[case][name], 3) for name in ('ratio', 'least', 'most')})}")
     write(
-        "two_versions",
+        out,
         {"before": commit(before), "after": commit(after), "rounds": rounds, "processor seconds of a turn": found},
     )
 
