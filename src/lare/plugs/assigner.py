@@ -113,6 +113,8 @@ class CreditAssigner:
         """Steps that have no features yet: number, before, action, after."""
         self.pending: list[Episode] = []
         """Episodes that the decoder has not been told of."""
+        self.returned: list[tuple[float, int]] = []
+        """R/T and T of episodes that the scales have not met."""
         self.unseen = self.untold = 0
         """Steps that wait; steps of the episodes that are pending."""
         self.told = self.fits = 0
@@ -194,21 +196,14 @@ class CreditAssigner:
         rows = np.flatnonzero(known)
         for values, name in ((before, "before"), (action, "action"), (after, "after"), (paid, "reward")):
             check_finite(values[rows], name)
-        numbers = self.store.add(len(rows))
-        if self.store.alive is None and there is not None:
-            self.store.alive = np.ones((self.store.capacity, self.config.agents), bool)
-        if self.store.alive is not None:
-            self.store.alive[numbers % self.store.capacity] = True if there is None else there[rows]
-        self.waiting.append((numbers, before[rows], action[rows], after[rows]))
-        self.owed = min(self.owed + self.config.fits_per_step * len(rows), MOST_OWED)
+        numbers = self.keep(before[rows], action[rows], after[rows], None if there is None else there[rows])
         for number, row in zip(numbers.tolist(), rows.tolist(), strict=True):
             run = self.store.running_of(lanes[row], before[row])
             run.steps.append(number)
             run.paid += float(paid[row])
             run.last = after[row]
             if ended[row]:
-                self.finish(lanes[row], run.paid)
-        self.unseen += len(rows)
+                self.finish(self.store.end(lanes[row], run.paid))
         if self.unseen >= WAITING:
             self.look()
         if self.untold >= PIECE:
@@ -216,6 +211,20 @@ class CreditAssigner:
         found = np.full(count, -1)
         found[rows] = numbers
         return found
+
+    def keep(
+        self, before: np.ndarray, action: np.ndarray, after: np.ndarray, alive: np.ndarray | None
+    ) -> Int[np.ndarray, " steps"]:
+        """Numbers for new steps, which wait for their features from now on."""
+        numbers = self.store.add(len(before))
+        if self.store.alive is None and alive is not None:
+            self.store.alive = np.ones((self.store.capacity, self.config.agents), bool)
+        if self.store.alive is not None:
+            self.store.alive[numbers % self.store.capacity] = True if alive is None else alive
+        self.waiting.append((numbers, before, action, after))
+        self.unseen += len(before)
+        self.owed = min(self.owed + self.config.fits_per_step * len(before), MOST_OWED)
+        return numbers
 
     def add_episode(
         self, before: Any, action: Any, after: Any, reward: Any, *, alive: Any = None
@@ -227,15 +236,24 @@ class CreditAssigner:
         """
         with self.lock:
             before, action, after = self.config.rows(before, action, after)
-            count, lane = len(before), object()
+            count = len(before)
             if not count:
                 raise LareError("the episode has no step")
             if np.ndim(reward) == 0:
-                reward = np.append(np.zeros(count - 1), reward)
-                reward = reward if self.config.agents == 1 else np.repeat(reward[:, None], self.config.agents, axis=1)
-            last = np.arange(count) == count - 1
-            never, every = np.zeros(count, bool), [lane] * count
-            return self.take(before, action, after, reward, last, never, every, None, alive)
+                score, (_, there) = float(reward), self.config.team_reward(np.zeros(count), alive, count)
+            else:
+                paid, there = self.config.team_reward(reward, alive, count)
+                check_finite(paid, "reward")
+                score = float(paid.sum())
+            if not np.isfinite(score):
+                raise LareError(f"the score is {score}: a number must be finite")
+            for values, name in ((before, "before"), (action, "action"), (after, "after")):
+                check_finite(values, name)
+            numbers = self.keep(before, action, after, there)
+            self.finish(self.store.put_new(numbers, score))
+            if self.untold >= PIECE:
+                self.learn()
+            return numbers
 
     def end(self, lane: Hashable, score: float | None = None) -> None:
         """The episode of a lane is over, and returned `score`, or the sum of its rewards.
@@ -251,23 +269,32 @@ class CreditAssigner:
                 raise LareError(f"no episode goes on in lane {lane!r}")
             if score is not None and not np.isfinite(score):
                 raise LareError(f"score = {score} of lane {lane!r} is not finite")
-            self.finish(lane, run.paid if score is None else float(score))
+            self.finish(self.store.end(lane, run.paid if score is None else float(score)))
 
     def drop(self, lane: Hashable) -> None:
         """The episode of a lane will not end: it is never learned from. Its steps can still be paid."""
         with self.lock:
             self.store.drop(lane)
 
-    def finish(self, lane: Hashable, score: float) -> None:
+    def finish(self, episode: Episode) -> None:
         """An episode has ended."""
-        episode = self.store.end(lane, score)
         self.pending.append(episode)
         self.untold += len(episode.steps)
-        mean = np.float32(score / len(episode.steps))
+        self.returned.append((episode.score / len(episode.steps), len(episode.steps)))
+
+    def observe_returned(self) -> None:
+        """Add the episodes that have ended to the scales. Many at a time: a call costs the same for one as for hundreds."""
+        if not self.returned:
+            return
+        mean, length = np.array(self.returned).T
+        rows = padding(len(mean))
+        there = np.arange(rows) < len(mean)
+        mean, length = padded(mean.astype(np.float32), rows), padded(length.astype(np.int32), rows)
+        self.returned.clear()
         with on_host():
             if self.state is not None:
-                self.state = learning.observe_return(self.state, mean, np.int32(len(episode.steps)))
-            self.scale = learning.observe_mean_reward(self.scale, mean)
+                self.state = learning.observe_returns(self.state, mean, length, there)
+            self.scale = learning.observe_mean_rewards(self.scale, mean, there)
 
     def flags(self, values: Any, name: str, count: int) -> Bool[np.ndarray, " steps"]:
         """One for each step."""
@@ -277,7 +304,8 @@ class CreditAssigner:
         return flags
 
     def look(self) -> None:
-        """Give features to the steps that wait for them, and add them to the running statistics."""
+        """Give features to the steps that wait for them, and add them to the running statistics, and episodes to theirs."""
+        self.observe_returned()
         if not self.waiting:
             return
         number, *steps = (np.concatenate(part) for part in zip(*self.waiting, strict=True))
@@ -324,7 +352,7 @@ class CreditAssigner:
     def pieces(self, episodes: Sequence[Episode]) -> Any:
         """Whole episodes, some at a time, in arrays of few shapes."""
         total, longest = sum(len(one.steps) for one in episodes), max(len(one.steps) for one in episodes)
-        rows = padding(max(longest, min(total, PIECE // self.config.agents)))
+        rows = padding(max(longest, min(total, PIECE // self.config.agents, prediction.LAST * longest)))
         return draws.pieces(self.store, episodes, prediction.LAST, rows)
 
     def fit(self, updates: int = 500) -> None:

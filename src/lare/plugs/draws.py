@@ -49,9 +49,11 @@ def parts(store: Store, episodes: Sequence[Episode], drawn: int, random: np.rand
 def packed(store: Store, episodes: Sequence[Episode], places: int, rows: int) -> Episodes:
     """Whole episodes one behind the other, as many as fit, and padding."""
     chosen: list[Episode] = []
+    used = 0
     for episode in episodes[:places]:
-        if sum(len(one.steps) for one in chosen) + len(episode.steps) <= rows:
+        if used + len(episode.steps) <= rows:
             chosen.append(episode)
+            used += len(episode.steps)
     steps = np.concatenate([episode.steps for episode in chosen])
     number = np.repeat(np.arange(len(chosen)), [len(episode.steps) for episode in chosen])
     more = rows - len(steps)

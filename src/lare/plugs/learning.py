@@ -24,15 +24,22 @@ def observe_steps(
 
 
 @jax.jit
-def observe_return(state: Decomposition, mean_reward: Float[Array, ""], length: Int[Array, ""]) -> Decomposition:
-    """With a finished episode in the scales."""
-    return decomposition.observe_returns(state, mean_reward[None], length[None], jnp.ones(1, bool))
+def observe_returns(
+    state: Decomposition,
+    mean_reward: Float[Array, " episodes"],
+    length: Int[Array, " episodes"],
+    mask: Bool[Array, " episodes"],
+) -> Decomposition:
+    """With finished episodes in the scales."""
+    return decomposition.observe_returns(state, mean_reward, length, mask)
 
 
 @jax.jit
-def observe_mean_reward(scale: Scale, mean_reward: Float[Array, ""]) -> Scale:
-    """With a finished episode in a scale of R/T."""
-    return observe_scale(scale, mean_reward[None], jnp.ones(1, bool))
+def observe_mean_rewards(
+    scale: Scale, mean_reward: Float[Array, " episodes"], mask: Bool[Array, " episodes"]
+) -> Scale:
+    """With finished episodes in a scale of R/T."""
+    return observe_scale(scale, mean_reward, mask)
 
 
 @partial(jax.jit, static_argnames="settings")

@@ -79,16 +79,19 @@ class Store:
         Raises:
             LareError: it is longer than all that can be stored.
         """
-        run = self.running.pop(lane)
-        episode = Episode(np.array(run.steps, np.int64), score)
-        if self.steps - run.steps[0] > self.capacity:
+        return self.put_new(np.array(self.running.pop(lane).steps, np.int64), score)
+
+    def put_new(self, steps: Int[np.ndarray, " steps"], score: float) -> Episode:
+        """Keep an episode that has just ended. Raises `LareError` like `end`."""
+        episode = Episode(steps, score)
+        if self.steps - steps[0] > self.capacity:
             raise LareError(
-                f"an episode of {len(run.steps)} steps has ended, and its first ones are not stored any more: "
+                f"an episode of {len(steps)} steps has ended, and its first ones are not stored any more: "
                 f"capacity = {self.capacity} must be larger"
             )
         self.put(self.ended, episode)
         self.ended += 1
-        self.ended_steps += len(run.steps)
+        self.ended_steps += len(steps)
         rows = episode.steps % self.capacity
         self.length[rows] = len(rows)
         self.mean_reward[rows] = score / len(rows)

@@ -1,0 +1,75 @@
+"""Whole episodes, as logs have them: the same credit as step by step, and rewards of steps whose episode's length is known."""
+
+import numpy as np
+import pytest
+
+from lare import CreditAssigner, LareError
+
+
+def episodes(count, random, longest=12):
+    """Of two entries and one action; what they return is linear in the first entry."""
+    for _ in range(count):
+        steps = int(random.integers(1, longest))
+        observation = random.normal(size=(steps + 1, 2)).astype(np.float32)
+        action = random.normal(size=(steps, 1)).astype(np.float32)
+        yield observation, action, 3 * observation[1:, 0].astype(float) + 1
+
+
+def assigner(**others):
+    return CreditAssigner("bayes", observation_space=2, action_space=1, capacity=10_000, **others)
+
+
+def test_whole_episodes_give_the_credit_of_their_steps():
+    whole, stepwise = assigner(), assigner()
+    for observation, action, reward in episodes(150, np.random.default_rng(0)):
+        numbers = whole.add_episode(observation[:-1], action, observation[1:], reward)
+        steps = len(action)
+        for t in range(steps):
+            row = slice(t, t + 1)
+            ended = [t == steps - 1]
+            stepwise.add(observation[:-1][row], action[row], observation[1:][row], reward[row], ended, [False])
+        assert len(numbers) == steps
+    for credit in (whole, stepwise):
+        credit.fit()
+    every = np.arange(whole.store.steps)
+    np.testing.assert_allclose(whole.rewards_at(every), stepwise.rewards_at(every), atol=1e-3)
+    assert whole.metrics()["credit/episodes"] == stepwise.metrics()["credit/episodes"] == 150
+
+
+def test_a_score_stands_for_its_rewards():
+    by_score, by_rewards = assigner(), assigner()
+    for observation, action, reward in episodes(60, np.random.default_rng(1)):
+        by_score.add_episode(observation[:-1], action, observation[1:], reward.sum())
+        by_rewards.add_episode(observation[:-1], action, observation[1:], reward)
+    every = np.arange(by_score.store.steps)
+    np.testing.assert_array_equal(by_score.rewards_at(every), by_rewards.rewards_at(every))
+
+
+def test_observations_need_not_follow_each_other():
+    """A log may say what steps set out from and what they led to, and round one of them."""
+    credit = assigner()
+    credit.add_episode(np.zeros((5, 2)), np.zeros((5, 1)), np.ones((5, 2)), 1.0)
+    assert (credit.store.ended, credit.store.dropped) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"reward": np.nan}, "the score is nan: a number must be finite"),
+        ({"reward": [0.0, np.inf]}, "reward of step 1 holds inf: a number must be finite"),
+        ({"after": np.full((2, 2), np.nan)}, "after of step 0 holds nan: a number must be finite"),
+        ({"reward": [1.0]}, "reward must be one number for each of 2 steps, and its shape is (1,)"),
+    ],
+)
+def test_what_is_no_episode_is_refused(changed, message):
+    given = {"before": np.zeros((2, 2)), "action": np.zeros((2, 1)), "after": np.zeros((2, 2)), "reward": 1.0} | changed
+    credit = assigner()
+    with pytest.raises(LareError) as error:
+        credit.add_episode(**given)
+    assert (str(error.value), credit.store.steps) == (message, 0)
+
+
+def test_an_episode_longer_than_what_is_kept_is_refused():
+    credit = CreditAssigner("bayes", observation_space=2, action_space=1, capacity=4)
+    with pytest.raises(LareError, match=r"\Aan episode of 5 steps has ended, and its first ones are not stored"):
+        credit.add_episode(np.zeros((5, 2)), np.zeros((5, 1)), np.zeros((5, 2)), 1.0)
