@@ -73,3 +73,20 @@ def test_an_episode_longer_than_what_is_kept_is_refused():
     credit = CreditAssigner("bayes", observation_space=2, action_space=1, capacity=4)
     with pytest.raises(LareError, match=r"\Aan episode of 5 steps has ended, and its first ones are not stored"):
         credit.add_episode(np.zeros((5, 2)), np.zeros((5, 1)), np.zeros((5, 2)), 1.0)
+
+
+def test_steps_of_a_longer_episode_add_less_to_an_average():
+    credit = assigner()
+    for observation, action, reward in episodes(200, np.random.default_rng(2)):
+        credit.add_episode(observation[:-1], action, observation[1:], reward.mean())
+        credit.fit_owed()
+    assert credit.form == "average"
+    observation, action, reward = next(episodes(1, np.random.default_rng(3), longest=30))
+    steps = observation[:-1], action, observation[1:]
+    assert credit.rewards(*steps, length=np.full(len(action), len(action))).sum() == pytest.approx(
+        reward.mean(), abs=0.1
+    )
+    once, twice = (credit.rewards(*steps, length=np.full(len(action), long)) for long in (10, 20))
+    np.testing.assert_allclose(once, 2 * twice, rtol=1e-5)
+    with pytest.raises(LareError, match="length must be one number for each of"):
+        credit.rewards(*steps, length=3)

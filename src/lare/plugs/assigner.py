@@ -420,8 +420,11 @@ class CreditAssigner:
             found[known] = self.paid(self.store.features[rows], self.store.lengths(rows), alive, rows)
             return found.reshape(*steps.shape, *self.config.axis)
 
-    def rewards(self, before: Any, action: Any, after: Any) -> Float[np.ndarray, " n"]:
+    def rewards(self, before: Any, action: Any, after: Any, *, length: Any = None) -> Float[np.ndarray, "n *agents"]:
         """r_hat of any steps, by the newest decoder: (n,), of many agents (n, agents). They are not stored.
+
+        `length` is T of each step's episode, (n,), where it is known: of a score that is an average over steps, each adds a T-th.
+        Unless given, it is that of the episodes so far, on average.
 
         Raises:
             LareError: the method pays by the return of the step's episode (`ircr`), or shapes do not fit.
@@ -432,7 +435,10 @@ class CreditAssigner:
         with self.lock:
             self.catch_up()
             found = self.config.features(*self.config.rows(before, action, after))
-            return self.paid(found, np.full(len(found), self.store.usual_length), None, None)
+            long = np.full(len(found), self.store.usual_length) if length is None else np.asarray(length, np.int32)
+            if long.shape != (len(found),):
+                raise LareError(f"length must be one number for each of {len(found)} steps, and its shape is {long.shape}")
+            return self.paid(found, long, None, None)
 
     def paid(
         self, features: np.ndarray, length: np.ndarray, alive: np.ndarray | None, rows: np.ndarray | None
