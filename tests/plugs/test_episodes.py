@@ -90,3 +90,20 @@ def test_steps_of_a_longer_episode_add_less_to_an_average():
     np.testing.assert_allclose(once, 2 * twice, rtol=1e-5)
     with pytest.raises(LareError, match="length must be one number for each of"):
         credit.rewards(*steps, length=3)
+
+
+def test_what_is_not_to_be_forgotten_is_not():
+    """A fifth of the episodes fit into the ring. Those of a log are all learned from; those of a loop make way for newer ones."""
+    every, newest = (
+        CreditAssigner("rd-linear", observation_space=2, action_space=1, capacity=500, forget=forget)
+        for forget in (False, True)
+    )
+    for observation, action, reward in episodes(400, np.random.default_rng(4)):
+        for credit in (every, newest):
+            credit.add_episode(observation[:-1], action, observation[1:], reward)
+            credit.fit_owed()
+    for credit in (every, newest):
+        credit.metrics()
+    known = [float(np.sum(credit.state.closed.summed.episodes)) for credit in (every, newest)]
+    assert known[0] == 400
+    assert known[1] < 300

@@ -65,6 +65,7 @@ class CreditAssigner:
         seed: int = 0,
         fits_per_step: float = 1.0,
         scale_rewards: bool = False,
+        forget: bool = True,
     ):
         """An assigner that has met nothing yet.
 
@@ -82,6 +83,8 @@ class CreditAssigner:
             seed: of its weights, and of what is drawn.
             fits_per_step: updates of a decoder that descends a gradient, for each step that was added.
             scale_rewards: divide r_hat by the running root mean square of R/T.
+            forget: whether a fit in closed form may forget episodes whose steps are not kept any more, as a policy changes. The
+                episodes of a log are all worth the same.
 
         Raises:
             LareError: method, function, task and spaces do not go together.
@@ -104,6 +107,7 @@ class CreditAssigner:
             seed,
             fits_per_step,
             scale_rewards,
+            forget,
         )
         check(self.config)
         self.state = self.new_state()
@@ -342,7 +346,8 @@ class CreditAssigner:
                 self.state = learning.tell(self.state, piece, self.config.settings)
             if self.state.closed is None:
                 return
-            if self.config.method.fit is not Fit.SIGNS and learning.is_stale(self.state):
+            whole = self.config.forget or self.store.steps <= self.store.capacity
+            if self.config.method.fit is not Fit.SIGNS and whole and learning.is_stale(self.state):
                 self.state = learning.begin_again(self.state)
                 for piece in self.pieces(list(self.store.episodes.values())):
                     self.state = learning.add(self.state, piece)

@@ -38,6 +38,7 @@ class CreditConfig:
     seed: int
     fits_per_step: float
     scale_rewards: bool
+    forget: bool
 
     @property
     def axis(self) -> tuple[int, ...]:

@@ -46,6 +46,7 @@ def text_of(credit: CreditAssigner) -> dict[str, Any]:
         "seed": credit.config.seed,
         "fits_per_step": credit.config.fits_per_step,
         "scale_rewards": credit.config.scale_rewards,
+        "forget": credit.config.forget,
         "phi": credit.config.phi is not None,
         "told": credit.told,
         "fits": credit.fits,
@@ -121,7 +122,7 @@ def restore(
         action_space=action,
         settings=CreditSettings(**text["settings"]),
         **{name: text[name] for name in ("judges", "agents", "max_steps", "capacity", "seed")},
-        **{name: text[name] for name in ("fits_per_step", "scale_rewards")},
+        **{name: text[name] for name in ("fits_per_step", "scale_rewards", "forget")},
     )
     credit.told, credit.fits = text["told"], text["fits"]
     for name, leaf in leaves(credit).items():
