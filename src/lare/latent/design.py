@@ -12,7 +12,7 @@ from lare.errors import LareError
 from lare.latent.checks import Check, Failed, factors_of
 from lare.latent.function import LatentFunction, normal
 from lare.latent.jailed import JailedProgram, WorkerFailed
-from lare.latent.verify import Verdict, random_steps, verify
+from lare.latent.verify import Steps, Verdict, tried_on, verify
 from lare.llm import prompts
 from lare.llm.model import Model, recorded_model
 from lare.llm.prompts import Kind, Message, Stage
@@ -66,13 +66,13 @@ class Attempt:
     """Everything that is wrong with it, for the model; empty where it passed."""
 
 
-def examine(reply: str, task: TaskSpec, kind: Kind) -> Attempt:
+def examine(reply: str, task: TaskSpec, kind: Kind, steps: Steps | None = None) -> Attempt:
     """Read and verify a reply."""
     try:
         source = normal(parse(reply).functions)
     except MalformedReply as error:
         return Attempt(reply, "", Verdict((), 0), str(error))
-    verdict = verify(source, task, kind)
+    verdict = verify(source, task, kind, steps)
     return Attempt(reply, source, verdict, verdict.errors)
 
 
@@ -91,6 +91,8 @@ class Conversation:
     model: Model
     recorder: Recorder
     said: Callable[[str], None]
+    steps: Steps | None = None
+    """What functions are tried on; random steps of the environment where None."""
 
     def ask(self, stage: Stage, messages: Sequence[Message]) -> str:
         """A reply to a request, another one each time that it is asked."""
@@ -115,20 +117,20 @@ class Conversation:
     def sound(self, replies: Sequence[str]) -> list[str]:
         """Those that can be read and pass."""
         with ThreadPoolExecutor() as pool:
-            tried = list(pool.map(lambda reply: examine(reply, self.task, self.kind), replies))
+            tried = list(pool.map(lambda reply: examine(reply, self.task, self.kind, self.steps), replies))
         for number, attempt in enumerate(tried, start=1):
             self.said(f"candidate {number}: {first_line(attempt)}")
         return [attempt.reply for attempt in tried if not attempt.errors]
 
     def correct(self, request: list[Message], reply: str) -> Attempt:
         """Verify a reply, and ask for a better one as long as it does not pass. Raises `DesignFailed`."""
-        attempt = examine(reply, self.task, self.kind)
+        attempt = examine(reply, self.task, self.kind, self.steps)
         for number in range(2, ATTEMPTS + 1):
             self.said(f"attempt {number - 1}: {first_line(attempt)}")
             if not attempt.errors:
                 return attempt
             request = prompts.correct(request, quoted(attempt.reply), attempt.errors)
-            attempt = examine(self.ask("correct", request), self.task, self.kind)
+            attempt = examine(self.ask("correct", request), self.task, self.kind, self.steps)
         self.said(f"attempt {ATTEMPTS}: {first_line(attempt)}")
         if not attempt.errors:
             return attempt
@@ -138,7 +140,7 @@ class Conversation:
         """Take a reply as it is if it runs at all: the ablation without pre-verification. Raises `DesignFailed`."""
         try:
             source = normal(parse(reply).functions)
-            factors = run_once(source, self.task, self.kind)
+            factors = run_once(source, self.task, self.kind, self.steps)
         except (MalformedReply, Failed, WorkerFailed) as error:
             raise self.failed(f"the reply does not run: {error}") from error
         return Attempt(reply, source, Verdict((Check("executed", True, ""),), factors.shape[1]), "")
@@ -170,9 +172,9 @@ def quoted(reply: str) -> str:
     return reply[:LONGEST_QUOTE] if reply.strip() else "(an empty reply)"
 
 
-def run_once(source: str, task: TaskSpec, kind: Kind) -> np.ndarray:
+def run_once(source: str, task: TaskSpec, kind: Kind, steps: Steps | None = None) -> np.ndarray:
     """What a program gives on steps of its task, without the gate, in the jail. Raises where it does not run."""
-    observation, action = random_steps(task)
+    observation, action = tried_on(task, steps)
     with contextlib.closing(JailedProgram(source, observation.shape[1], action.shape[1], gated=False)) as program:
         return factors_of(program.failed or program.call(observation, action), len(observation), kind)
 
@@ -186,6 +188,7 @@ def design(
     pre_verification: bool = True,
     record: Path | None = None,
     said: Callable[[str], None] = lambda _: None,
+    steps: Steps | None = None,
 ) -> LatentFunction:
     """Ask a model for `phi` until there is one that passes every check.
 
@@ -202,6 +205,8 @@ def design(
         pre_verification: without it (the paper's ablation), the first function is kept if it runs at all, in its jail.
         record: a file that takes every exchange, from the first reply on.
         said: is told how it goes.
+        steps: observations and actions that functions are tried on, where there is no environment: (n, observation size) and
+            (n, action size), as `lare.logged_steps` takes them from a data set.
 
     Raises:
         DesignFailed: no attempt passed. `DesignBroken` where the model could not be asked any more, `DesignStopped` after Ctrl-C.
@@ -212,9 +217,9 @@ def design(
         raise LareError(f"candidates = {candidates}: from 1 to {MOST_CANDIDATES}")
     model = model or recorded_model(task.name, kind, draw)
     # What cannot be played is found out before a model is paid; and it is played once, before threads want the steps.
-    random_steps(task)
+    tried_on(task, steps)
     recorder = Recorder(task.name, kind, getattr(model, "temperature", None), record)
-    conversation = Conversation(task, kind, model, recorder, said)
+    conversation = Conversation(task, kind, model, recorder, said, steps)
     try:
         request, reply = conversation.begin(candidates, pre_verification)
         attempt = conversation.correct(request, reply) if pre_verification else conversation.once(reply)

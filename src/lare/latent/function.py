@@ -16,7 +16,7 @@ from lare.errors import LareError, shortened
 from lare.latent.checks import Check
 from lare.latent.evaluator import Evaluator
 from lare.latent.names import factor_meanings, names_of
-from lare.latent.verify import verify
+from lare.latent.verify import Steps, verify
 from lare.llm.prompts import Kind
 from lare.tasks.spec import Judges, TaskSpec, read_text
 
@@ -165,10 +165,10 @@ def normal(source: str) -> str:
     return "\n".join(lines).rstrip("\n")
 
 
-def verified(source: str, task: TaskSpec, kind: Kind = "factors") -> LatentFunction:
-    """A function from source. Raises `LareError` with every error where it does not pass."""
+def verified(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | None = None) -> LatentFunction:
+    """A function from source, tried on `steps` as `verify` says. Raises `LareError` with every error where it does not pass."""
     source = normal(source)
-    verdict = verify(source, task, kind)
+    verdict = verify(source, task, kind, steps)
     if not verdict.passed:
         raise LareError(f"the function does not fit task {task.name!r}: {verdict.errors}")
     return LatentFunction(task.name, kind, source, verdict.size, verdict.checks)
@@ -214,8 +214,14 @@ def per_role(given: Sequence[Given], task: TaskSpec) -> list[tuple[Given, TaskSp
     return list(zip(given, task.roles, strict=True))
 
 
-def load(path: str | Path, task: TaskSpec) -> LatentFunction:
+def load(path: str | Path, task: TaskSpec, steps: Steps | None = None) -> LatentFunction:
     """Read a function that `save` or a person wrote, and verify it again, whoever wrote it.
+
+    Args:
+        path: of the function, .py or .json.
+        task: that it is for.
+        steps: observations and actions that it is tried on, where there is no environment: (n, observation size) and
+            (n, action size).
 
     Raises:
         LareError: it cannot be read, or does not pass for this task.
@@ -224,7 +230,7 @@ def load(path: str | Path, task: TaskSpec) -> LatentFunction:
     header, source = split_header(read_text(source_path))
     kind: Kind = "reward" if f"{HEADER}kind: reward" in header else "factors"
     try:
-        function = verified(source, task, kind)
+        function = verified(source, task, kind, steps)
     except LareError as error:
         raise LareError(f"{source_path}: {error}") from error
     function = with_provenance(function, source_path.with_suffix(".json"))

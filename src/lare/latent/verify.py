@@ -24,6 +24,10 @@ PATIENCE = 20
 """Environment steps, at most, for each of them: agents that have left have none."""
 
 
+Steps = tuple[Float[np.ndarray, "steps observation"], Float[np.ndarray, "steps action"]]
+"""Observations as the function judges them, and the actions beside them: rows of the task's sizes."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """What was found. Passed when there is a check and every one of them passed."""
@@ -45,14 +49,21 @@ class Verdict:
         return "\n".join(check.message for check in self.checks if not check.passed)
 
 
-def verify(source: str, task: TaskSpec, kind: Kind = "factors") -> Verdict:
+def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | None = None) -> Verdict:
     """Try a source, in a process without this one's environment, files and rights.
 
+    Args:
+        source: Python.
+        task: whose sizes of observations and actions it is for.
+        kind: what it is to return.
+        steps: what it is tried on, (n, observation size) and (n, action size), where there is no environment; 256 of them are
+            enough. Unless given, random steps of the task's environment.
+
     Raises:
-        LareError: the task's environment cannot be made, there is no process to be had, or each team of the task has a
-            function of its own.
+        LareError: the task's environment cannot be made, the steps are not of the task's sizes, there is no process to be had,
+            or each team of the task has a function of its own.
     """
-    observation, action = random_steps(the_role(task))
+    observation, action = tried_on(task, steps)
     sizes = observation.shape[1], action.shape[1]
     try:
         with contextlib.ExitStack() as stack:
@@ -75,6 +86,31 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors") -> Verdict:
             return Verdict(checks, size, tuple(advice(factors, names_of(source, size))), program.isolation)
     except (WorkerFailed, Failed) as error:
         return Verdict((Check("runs", False, f"E-RUN: {error}"),), 0)
+
+
+def tried_on(task: TaskSpec, steps: Steps | None) -> Steps:
+    """The steps that a function of a task is tried on: at most `STEPS` of those given, at equal distances; or random ones.
+
+    Raises:
+        LareError: as `verify`.
+    """
+    role = the_role(task)
+    if steps is None:
+        return random_steps(role)
+    found = []
+    for values, name, size in zip(
+        steps, ("observations", "actions"), (role.observation_size, role.action_size), strict=True
+    ):
+        rows = np.asarray(values)
+        if rows.dtype.kind not in "biuf" or rows.shape != (len(steps[0]), size) or not len(rows):
+            raise LareError(
+                f"{name} of steps must be rows of {size} numbers, as {name[:-1]}_size of {role.name} says, as many as the other "
+                f"array has and one at least: the shape is {rows.shape}"
+            )
+        if not np.isfinite(rows).all():
+            raise LareError(f"{name} of steps hold a number that is not finite")
+        found.append(rows[np.linspace(0, len(rows) - 1, min(STEPS, len(rows))).astype(int)].astype(np.float32))
+    return found[0], found[1]
 
 
 def random_steps(

@@ -26,6 +26,9 @@ PETTINGZOO = "pettingzoo/"
 OF_THE_ENVIRONMENT = ("environment", "arguments", "max_episode_steps", "judged_from", "judges")
 """Keys that a team has from its task. Its own spec may say them too, to be used alone, but nothing else."""
 
+NO_ENVIRONMENT = "none"
+"""Stands for the environment in a spec of logs, whose environment is not at hand."""
+
 FILL_IN = "FILL IN"
 """Stands in a new spec where nobody has said something yet."""
 
@@ -39,7 +42,7 @@ class TaskSpec(Checked):
     """What the task is called, in commands and in the names of runs."""
     environment: Annotated[str, Field(min_length=1)]
     """Gymnasium id, where `module:id` imports the module that registers it first; or the name of another family's environment,
-    as `particles/CN-6`."""
+    as `particles/CN-6`; or `none`, where there are logs only: functions are designed and logs relabelled, and nothing trains."""
     observation_size: Annotated[int, Field(ge=1)]
     action_size: Annotated[int, Field(ge=1)]
     judges: Judges = "after"
@@ -50,7 +53,7 @@ class TaskSpec(Checked):
     action: Annotated[str, Field(min_length=1)]
     """What each entry of the action means."""
     max_episode_steps: Annotated[int | None, Field(ge=1)] = None
-    """Time limit, for an environment that has none of its own."""
+    """Time limit, for an environment that has none of its own; or of the episodes of logs."""
     score: Literal["sum", "average"] | None = None
     """Whether what an episode returns is a sum over its steps, or an average or a mark, which does not grow with them. Where the
     task does not say, training finds out which predicts returns better."""
@@ -211,6 +214,9 @@ def the_role(spec: TaskSpec) -> TaskSpec:
 
 def check_against_environment(spec: TaskSpec) -> None:
     """Make the environment once and compare. Raises `LareError` at the first thing that does not fit."""
-    from lare.tasks.table import env_spec  # which knows all families, as this file need not
+    from lare.tasks.table import check_logs, env_spec  # which knows all families, as this file need not
 
-    env_spec(spec)
+    if spec.environment == NO_ENVIRONMENT:
+        check_logs(spec)
+    else:
+        env_spec(spec)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from lare.errors import LareError
 from lare.tasks.env import EnvSpec, HostEnv, JaxEnv
-from lare.tasks.spec import OF_THE_ENVIRONMENT, TaskSpec
+from lare.tasks.spec import NO_ENVIRONMENT, OF_THE_ENVIRONMENT, TaskSpec
 
 NOT_FOR_ALL = ("max_episode_steps", "arguments", "agents")
 """Keys of a task that only some families read. The others refuse them: what is said and not heard would mislead."""
@@ -62,6 +62,16 @@ FAMILIES = {
     "pettingzoo": Family(pettingzoo, reads=("max_episode_steps", "arguments", "agents")),
 }
 
+def no_environment(task: TaskSpec, **_: Any) -> HostEnv:
+    raise LareError(
+        f"task {task.name!r} has no environment (environment = {NO_ENVIRONMENT!r}), so that nothing can be played or trained: "
+        "lare relabel works on its logs; lare design and lare verify need them, by --data"
+    )
+
+
+LOGS = Family(no_environment, reads=("max_episode_steps",))
+"""Of a task that speaks of logs only."""
+
 GYMNASIUM = Family(gymnasium, reads=("max_episode_steps",))
 """Of every other name."""
 
@@ -72,7 +82,7 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
     Raises:
         LareError: it cannot be made, or is not what the task says.
     """
-    family = FAMILIES.get(task.family, GYMNASIUM)
+    family = LOGS if task.environment == NO_ENVIRONMENT else FAMILIES.get(task.family, GYMNASIUM)
     check_keys(task, family)
     env = family.make(task, **kwargs)
     try:
@@ -95,6 +105,15 @@ def known_spec(task: str) -> EnvSpec:
     if isinstance(env, HostEnv):
         env.close()
     return env.spec
+
+
+def check_logs(task: TaskSpec) -> None:
+    """Raise `LareError` where a task that speaks of logs only says what only an environment could hear."""
+    check_keys(task, LOGS)
+    usual = {"teams": (), "team": None, "measures": (), "judged_from": "observation"}
+    for key, nothing in usual.items():
+        if getattr(task, key) != nothing:
+            raise LareError(f"task {task.name!r}: {key} makes no difference to logs: leave it out")
 
 
 def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
