@@ -192,29 +192,32 @@ class CreditAssigner:
         if len(lanes) != count:
             raise LareError(f"lanes has {len(lanes)} entries, and there are {count} steps")
         rows = np.flatnonzero(known)
+        # Copies, for an environment may write its next step into the same memory.
+        before, action, after, paid, ended = (part[rows] for part in (before, action, after, paid, ended))
         for values, name in ((before, "before"), (action, "action"), (after, "after"), (paid, "reward")):
-            check_finite(values[rows], name)
-        numbers = self.store.add(len(rows))
+            check_finite(values, rows, name)
+        found = np.full(count, -1)
+        if not len(rows):
+            return found
+        found[rows] = numbers = self.store.add(len(rows))
         if self.store.alive is None and there is not None:
             self.store.alive = np.ones((self.store.capacity, self.config.agents), bool)
         if self.store.alive is not None:
             self.store.alive[numbers % self.store.capacity] = True if there is None else there[rows]
-        self.waiting.append((numbers, before[rows], action[rows], after[rows]))
+        self.waiting.append((numbers, before, action, after))
         self.owed = min(self.owed + self.config.fits_per_step * len(rows), MOST_OWED)
-        for number, row in zip(numbers.tolist(), rows.tolist(), strict=True):
-            run = self.store.running_of(lanes[row], before[row])
+        for place, (number, row) in enumerate(zip(numbers.tolist(), rows.tolist(), strict=True)):
+            run = self.store.running_of(lanes[row], before[place])
             run.steps.append(number)
-            run.paid += float(paid[row])
-            run.last = after[row]
-            if ended[row]:
+            run.paid += float(paid[place])
+            run.last = after[place]
+            if ended[place]:
                 self.finish(lanes[row], run.paid)
         self.unseen += len(rows)
         if self.unseen >= WAITING:
             self.look()
         if self.untold >= PIECE:
             self.learn()
-        found = np.full(count, -1)
-        found[rows] = numbers
         return found
 
     def add_episode(
@@ -392,7 +395,7 @@ class CreditAssigner:
             found[known] = self.paid(self.store.features[rows], self.store.lengths(rows), alive, rows)
             return found.reshape(*steps.shape, *self.config.axis)
 
-    def rewards(self, before: Any, action: Any, after: Any) -> Float[np.ndarray, " n"]:
+    def rewards(self, before: Any, action: Any, after: Any) -> Float[np.ndarray, "n *agents"]:
         """r_hat of any steps, by the newest decoder: (n,), of many agents (n, agents). They are not stored.
 
         Raises:
@@ -548,8 +551,8 @@ def padded(rows: np.ndarray, count: int) -> np.ndarray:
     return np.pad(rows, ((0, count - len(rows)), *[(0, 0)] * (rows.ndim - 1)))
 
 
-def check_finite(values: np.ndarray, name: str) -> None:
-    """Raise `LareError` at the first number that is not."""
+def check_finite(values: np.ndarray, rows: np.ndarray, name: str) -> None:
+    """Raise `LareError` at the first number that is not, of the rows that have these places in what was given."""
     if not np.isfinite(values).all():
         place = np.argwhere(~np.isfinite(values))[0]
-        raise LareError(f"{name} of step {place[0]} holds {values[tuple(place)]}: a number must be finite")
+        raise LareError(f"{name} of row {rows[place[0]]} holds {values[tuple(place)]}: a number must be finite")
