@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lare.errors import LareError
 from lare.tasks.environment import make
 from lare.tasks.episodic import TRUE_REWARD, EpisodicReward
 from lare.tasks.spec import read_task, shipped_tasks
@@ -101,3 +102,38 @@ def test_it_can_be_made_again_from_its_spec():
     environment = EpisodicReward(make("Pendulum-v1"))
     again = gymnasium.make(environment.spec)
     assert isinstance(again, EpisodicReward)
+
+
+class Scored(Scripted):
+    """Its last info has a score."""
+
+    def step(self, action):
+        *rest, info = super().step(action)
+        return *rest, info | ({"score": self.score} if not self.left else {})
+
+
+def test_a_score_may_be_paid_instead():
+    environment = EpisodicReward(Scored([1.0, 2.0, 4.0]), score="score")
+    environment.unwrapped.score = np.float32(9)
+    environment.reset()
+    paid, infos = play(environment, 3)
+    assert paid == [0.0, 0.0, 9.0]
+    assert [info[TRUE_REWARD] for info in infos] == [1.0, 2.0, 4.0]
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("goals", 1, "the info of the last step has no 'goals': it has 'mine', 'score'"),
+        ("score", "high", "info['score'] of the last step is 'high', which is no score"),
+        ("score", math.nan, "info['score'] of the last step is nan: a score must be finite"),
+    ],
+)
+def test_a_score_that_is_none_is_refused(key, value, message):
+    environment = EpisodicReward(Scored([1.0, 2.0]), score=key)
+    environment.unwrapped.score = value
+    environment.reset()
+    play(environment, 1)
+    with pytest.raises(LareError) as refused:
+        play(environment, 1)
+    assert str(refused.value) == message

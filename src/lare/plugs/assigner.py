@@ -198,22 +198,25 @@ class CreditAssigner:
         if len(lanes) != count:
             raise LareError(f"lanes has {len(lanes)} entries, and there are {count} steps")
         rows = np.flatnonzero(known)
+        # Copies, for an environment may write its next step into the same memory.
+        before, action, after, paid, ended = (part[rows] for part in (before, action, after, paid, ended))
         for values, name in ((before, "before"), (action, "action"), (after, "after"), (paid, "reward")):
-            check_finite(values[rows], name)
-        numbers = self.keep(before[rows], action[rows], after[rows], None if there is None else there[rows])
-        for number, row in zip(numbers.tolist(), rows.tolist(), strict=True):
-            run = self.store.running_of(lanes[row], before[row])
+            check_finite(values, rows, name)
+        found = np.full(count, -1)
+        if not len(rows):
+            return found
+        found[rows] = numbers = self.keep(before, action, after, None if there is None else there[rows])
+        for place, (number, row) in enumerate(zip(numbers.tolist(), rows.tolist(), strict=True)):
+            run = self.store.running_of(lanes[row], before[place])
             run.steps.append(number)
-            run.paid += float(paid[row])
-            run.last = after[row]
-            if ended[row]:
+            run.paid += float(paid[place])
+            run.last = after[place]
+            if ended[place]:
                 self.finish(self.store.end(lanes[row], run.paid))
         if self.unseen >= WAITING:
             self.look()
         if self.untold >= PIECE:
             self.learn()
-        found = np.full(count, -1)
-        found[rows] = numbers
         return found
 
     def keep(
@@ -239,20 +242,21 @@ class CreditAssigner:
             LareError: as `add`; or the episode has no step.
         """
         with self.lock:
-            before, action, after = self.config.rows(before, action, after)
+            before, action, after = (part.copy() for part in self.config.rows(before, action, after))
             count = len(before)
+            rows = np.arange(count)
             if not count:
                 raise LareError("the episode has no step")
             if np.ndim(reward) == 0:
                 score, (_, there) = float(reward), self.config.team_reward(np.zeros(count), alive, count)
             else:
                 paid, there = self.config.team_reward(reward, alive, count)
-                check_finite(paid, "reward")
+                check_finite(paid, rows, "reward")
                 score = float(paid.sum())
             if not np.isfinite(score):
                 raise LareError(f"the score is {score}: a number must be finite")
             for values, name in ((before, "before"), (action, "action"), (after, "after")):
-                check_finite(values, name)
+                check_finite(values, rows, name)
             numbers = self.keep(before, action, after, there)
             self.finish(self.store.put_new(numbers, score))
             if self.untold >= PIECE:
@@ -442,7 +446,9 @@ class CreditAssigner:
             found = self.config.features(*self.config.rows(before, action, after))
             long = np.full(len(found), self.store.usual_length) if length is None else np.asarray(length, np.int32)
             if long.shape != (len(found),):
-                raise LareError(f"length must be one number for each of {len(found)} steps, and its shape is {long.shape}")
+                raise LareError(
+                    f"length must be one number for each of {len(found)} steps, and its shape is {long.shape}"
+                )
             return self.paid(found, long, None, None)
 
     def paid(
@@ -587,8 +593,8 @@ def padded(rows: np.ndarray, count: int) -> np.ndarray:
     return np.pad(rows, ((0, count - len(rows)), *[(0, 0)] * (rows.ndim - 1)))
 
 
-def check_finite(values: np.ndarray, name: str) -> None:
-    """Raise `LareError` at the first number that is not."""
+def check_finite(values: np.ndarray, rows: np.ndarray, name: str) -> None:
+    """Raise `LareError` at the first number that is not, of the rows that have these places in what was given."""
     if not np.isfinite(values).all():
         place = np.argwhere(~np.isfinite(values))[0]
-        raise LareError(f"{name} of step {place[0]} holds {values[tuple(place)]}: a number must be finite")
+        raise LareError(f"{name} of row {rows[place[0]]} holds {values[tuple(place)]}: a number must be finite")

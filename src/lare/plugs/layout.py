@@ -38,26 +38,25 @@ class Layout(Checked):
     def rows(self, values: Any, name: str) -> Float[np.ndarray, "*batch size"]:
         """A batch of elements as rows; as Gymnasium's vector environments have batches, a mapping of batches for a mapping.
 
-        The batch may have several axes, of steps and of agents. Rows that are made already are taken as they are.
+        The batch may have several axes, of steps and of agents. Rows that are made already are taken as they are, but for a Box
+        without an axis, where (n, 1) would be read as n times 1 elements.
 
         Raises:
             LareError: they are no elements of the space.
         """
-        if self.kind == "named":
-            missing = [key for key in self.names if key not in values] if isinstance(values, dict) else ["a dict"]
+        if self.kind == "named" and isinstance(values, dict):
+            missing = [key for key in self.names if key not in values]
             if missing:
-                raise LareError(f"{name} has no {missing[0]}: it needs {', '.join(self.names)}")
+                raise LareError(f"{name} has no {missing[0]!r}: it needs {', '.join(map(repr, self.names))}")
             return self.joined([values[key] for key in self.names], name)
         if self.kind == "in a row" and isinstance(values, tuple | list) and len(values) == len(self.parts):
             return self.joined(values, name)
-        array = np.asarray(values)
-        if array.dtype.kind not in "biuf":
-            raise LareError(f"{name} must be numbers, and is {shortened(values)}")
+        array = array_of(values, name)
         if self.kind == "choices":
             return self.chosen(array, name)
-        sizes = array.shape[len(array.shape) - len(self.shape) :]
-        if sizes == self.shape:
-            return array.reshape(*array.shape[: array.ndim - len(sizes)], self.size).astype(np.float32, copy=False)
+        lead = array.shape[: array.ndim - len(self.shape)]
+        if self.kind == "numbers" and array.shape == (*lead, *self.shape):
+            return in_float32(array.reshape(*lead, self.size))
         return self.as_they_are(array, name)
 
     def joined(self, values: Any, name: str) -> Float[np.ndarray, "*batch size"]:
@@ -67,27 +66,51 @@ class Layout(Checked):
             part.rows(value, f"{name}[{label!r}]")
             for part, value, label in zip(self.parts, values, labels, strict=True)
         ]
+        for part in parts:
+            if part.shape[:-1] != parts[0].shape[:-1]:
+                one, other = parts[0].shape[:-1], part.shape[:-1]
+                raise LareError(
+                    f"the parts of {name} have the shapes {one} and {other}: they are not of the same steps"
+                )
         return np.concatenate(parts, axis=-1)
 
-    def chosen(self, array: Shaped[np.ndarray, "*batch"], name: str) -> Float[np.ndarray, "*batch size"]:
+    def chosen(self, array: Shaped[np.ndarray, "*shape"], name: str) -> Float[np.ndarray, "*batch size"]:
         """Numbers of choices as rows with a single 1 for each place."""
         single = not self.shape
         if single and array.ndim and array.shape[-1] == self.size and array.dtype.kind == "f":
-            return array.astype(np.float32, copy=False)
+            return in_float32(array)
         places = array[..., None] if single else array
         if places.shape[-1:] != (len(self.choices),):
             return self.as_they_are(array, name)
-        numbers = places.astype(np.int64) - np.asarray(self.first)
+        with np.errstate(invalid="ignore"):  # what is not a number is no choice either
+            numbers = places.astype(np.int64) - np.asarray(self.first)
         if np.any((numbers < 0) | (numbers >= np.asarray(self.choices)) | (numbers + np.asarray(self.first) != places)):
             raise LareError(f"{name} holds a choice that there is not: {shortened(array)}")
         return np.concatenate(
             [np.eye(count, dtype=np.float32)[numbers[..., place]] for place, count in enumerate(self.choices)], axis=-1
         )
 
-    def as_they_are(self, array: Shaped[np.ndarray, "*batch"], name: str) -> Float[np.ndarray, "*batch size"]:
+    def as_they_are(self, array: Shaped[np.ndarray, "*shape"], name: str) -> Float[np.ndarray, "*batch size"]:
         """Rows that are made already."""
         if array.ndim == 0 or array.shape[-1] != self.size:
             raise LareError(f"{name} must be rows of {self.size} numbers, and has the shape {array.shape}")
+        return in_float32(array)
+
+
+def array_of(values: Any, name: str) -> Shaped[np.ndarray, "*shape"]:
+    """Numbers as an array. Raises `LareError` where they are none."""
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError):  # lists of unequal length; what another library will not give away
+        array = np.empty(0, object)
+    if array.dtype.kind not in "biuf":
+        raise LareError(f"{name} must be numbers, and is {shortened(values)}")
+    return array
+
+
+def in_float32(array: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """The same numbers; infinite where they are too large, which the assigner refuses."""
+    with np.errstate(over="ignore"):
         return array.astype(np.float32, copy=False)
 
 

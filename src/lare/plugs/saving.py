@@ -22,7 +22,7 @@ from lare.latent.function import LatentFunction
 from lare.latent.function import load as load_function
 from lare.plugs.assigner import CreditAssigner
 from lare.plugs.layout import Layout
-from lare.plugs.store import Episode
+from lare.plugs.store import Episode, Store
 from lare.run.checkpoint import DAMAGED, opened
 from lare.tasks.spec import TaskSpec, read_text
 
@@ -63,14 +63,15 @@ def arrays_of(credit: CreditAssigner, episodes: bool) -> dict[str, np.ndarray]:
     """What it has learned and, where `episodes` is true, what it has met."""
     credit.learn()
     arrays = {name: np.asarray(leaf) for name, leaf in leaves(credit).items()}
+    store = credit.store
+    arrays["counts"] = np.array([store.ended, store.ended_steps, store.dropped + len(store.running)])
     if not episodes:
         return arrays
-    store = credit.store
     there = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
     kept = list(store.episodes.values())
     arrays |= {name: getattr(store, name)[there] for name in ("features", "length", "mean_reward")}
     arrays |= {} if store.alive is None else {"alive": store.alive[there]}
-    arrays["counts"] = np.array([store.steps, store.ended, store.ended_steps, store.dropped + len(store.running)])
+    arrays["steps"] = np.array(store.steps)
     arrays["episodes"] = np.concatenate([np.zeros(0, np.int64), *(one.steps for one in kept)])
     arrays["lengths"] = np.array([len(one.steps) for one in kept], np.int64)
     arrays["scores"] = np.array([one.score for one in kept], np.float64)
@@ -130,19 +131,20 @@ def restore(
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {leaf.shape}")
     structure = jax.tree.structure((credit.state, credit.scale))
     credit.state, credit.scale = jax.tree.unflatten(structure, [jnp.asarray(arrays[name]) for name in leaves(credit)])
-    if "counts" in arrays:
-        restore_steps(credit, arrays)
-
-
-def restore_steps(credit: CreditAssigner, arrays: dict[str, np.ndarray]) -> None:
-    """What an assigner had met."""
     store = credit.store
-    store.steps, store.ended, store.ended_steps, store.dropped = map(int, arrays["counts"])
+    store.ended, store.ended_steps, store.dropped = map(int, arrays["counts"])
+    if "steps" in arrays:
+        restore_steps(store, arrays)
+
+
+def restore_steps(store: Store, arrays: dict[str, np.ndarray]) -> None:
+    """What an assigner had met."""
+    store.steps = int(arrays["steps"])
     there = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
     for name in ("features", "length", "mean_reward"):
         getattr(store, name)[there] = arrays[name]
     if "alive" in arrays:
-        store.alive = np.ones((store.capacity, credit.config.agents), bool)
+        store.alive = np.ones((store.capacity, store.features.shape[1]), bool)
         store.alive[there] = arrays["alive"]
     ends = np.cumsum(arrays["lengths"])
     first = store.ended - len(ends)

@@ -1,9 +1,13 @@
 """The episodic setting: nothing is paid until the episode ends, and then everything at once."""
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
+
+from lare.errors import LareError, shortened
 
 TRUE_REWARD = "true_reward"
 """Where `info` keeps the reward of the step."""
@@ -23,9 +27,16 @@ class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
     True
     """
 
-    def __init__(self, env: gymnasium.Env):
-        RecordConstructorArgs.__init__(self)
+    def __init__(self, env: gymnasium.Env, score: str | None = None):
+        """Wrap an environment.
+
+        Args:
+            env: the environment.
+            score: a key of the last step's `info` that holds the score of the episode, which is paid instead of the sum.
+        """
+        RecordConstructorArgs.__init__(self, score=score)
         gymnasium.Wrapper.__init__(self, env)
+        self.score = score
         self.so_far = 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -33,7 +44,27 @@ class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One step. Raises `LareError` where the last step's `info` has no score, and one is to be paid."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.so_far += float(reward)
-        paid = self.so_far if terminated or truncated else 0.0
+        paid = 0.0
+        if terminated or truncated:
+            paid = self.so_far if self.score is None else score_in(info, self.score)
         return observation, paid, terminated, truncated, {**info, TRUE_REWARD: float(reward)}
+
+
+def score_in(info: Mapping[str, Any], key: str) -> float:
+    """The score of an episode, from the `info` of its last step.
+
+    Raises:
+        LareError: it is not there, or no finite number.
+    """
+    if key not in info:
+        raise LareError(f"the info of the last step has no {key!r}: it has {', '.join(map(repr, info)) or 'nothing'}")
+    try:
+        score = float(info[key])
+    except (TypeError, ValueError):
+        raise LareError(f"info[{key!r}] of the last step is {shortened(info[key])}, which is no score") from None
+    if not math.isfinite(score):
+        raise LareError(f"info[{key!r}] of the last step is {score}: a score must be finite")
+    return score
