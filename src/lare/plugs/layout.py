@@ -69,7 +69,9 @@ class Layout(Checked):
         for part in parts:
             if part.shape[:-1] != parts[0].shape[:-1]:
                 one, other = parts[0].shape[:-1], part.shape[:-1]
-                raise LareError(f"the parts of {name} have the shapes {one} and {other}: they are not of the same steps")
+                raise LareError(
+                    f"the parts of {name} have the shapes {one} and {other}: they are not of the same steps"
+                )
         return np.concatenate(parts, axis=-1)
 
     def chosen(self, array: Shaped[np.ndarray, "*shape"], name: str) -> Float[np.ndarray, "*batch size"]:
