@@ -1,0 +1,41 @@
+"""Whether an environment and an assigner speak of the same observations and actions, and how the one's become the other's."""
+
+from typing import Any
+
+import gymnasium
+
+from lare.errors import LareError
+from lare.plugs.assigner import CreditAssigner
+from lare.plugs.layout import layout_of
+
+
+class Rows:
+    """Observations and actions of an environment, as its assigner takes them.
+
+    They are handed on as they are where both have the same spaces. Where the assigner knows only how many numbers there are, from
+    a task file for instance, they become rows of numbers.
+
+    Raises:
+        LareError: the assigner was made for other sizes.
+    """
+
+    def __init__(self, credit: CreditAssigner, observations: gymnasium.Space, actions: gymnasium.Space):
+        self.observation, self.action = layout_of(observations, "observation_space"), layout_of(actions, "action_space")
+        known = credit.config
+        for name, own, other in (
+            ("observation", self.observation, known.observation),
+            ("action", self.action, known.action),
+        ):
+            if own.size != other.size:
+                raise LareError(
+                    f"{name}s of the environment are rows of {own.size} numbers, and the assigner was made for {other.size}"
+                )
+        self.same = self.observation == known.observation, self.action == known.action
+
+    def observations(self, batch: Any, name: str) -> Any:
+        """A batch of observations."""
+        return batch if self.same[0] else self.observation.rows(batch, name)
+
+    def actions(self, batch: Any) -> Any:
+        """A batch of actions."""
+        return batch if self.same[1] else self.action.rows(batch, "action")
