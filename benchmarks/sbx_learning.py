@@ -9,7 +9,6 @@ other; one core does (`taskset -c 0 python ...`).
 """
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,8 +18,8 @@ import jax
 import numpy as np
 import sbx
 import tyro
+from evaluations import Evaluations, evaluate
 from measure import TD3, provenance
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -54,40 +53,6 @@ def model_of(algorithm: str, environment: gymnasium.Env, warmup: int, seed: int)
             return sbx.SAC("MlpPolicy", environment, **usual, **OFF_POLICY)
         case _:
             return sbx.PPO("MlpPolicy", VecNormalize(DummyVecEnv([lambda: environment])), seed=seed, **PPO)
-
-
-def evaluate(model: Any, environment: gymnasium.Env, seed: int, episodes: int) -> float:
-    """Mean return of the deterministic policy, from the same starts at every evaluation."""
-    normal = model.get_vec_normalize_env()
-    returns = np.zeros(episodes)
-    for episode in range(episodes):
-        observation, _ = environment.reset(seed=1_000_000 + 1000 * seed + episode)
-        ended = False
-        while not ended:
-            seen = observation if normal is None else normal.normalize_obs(observation)
-            action, _ = model.predict(seen, deterministic=True)
-            observation, reward, terminated, truncated, _ = environment.step(action)
-            returns[episode] += float(reward)
-            ended = terminated or truncated
-    return float(returns.mean())
-
-
-class Evaluations(BaseCallback):
-    """Evaluates after the update that follows every so many steps."""
-
-    def __init__(self, every: int, report: Callable[[int], None]):
-        super().__init__()
-        self.every, self.report = every, report
-
-    def _on_rollout_start(self) -> None:
-        if self.num_timesteps and self.num_timesteps % self.every == 0:
-            self.report(self.num_timesteps)
-
-    def _on_training_end(self) -> None:
-        self.report(self.num_timesteps)
-
-    def _on_step(self) -> bool:
-        return True
 
 
 def main(

@@ -6,10 +6,10 @@ import pytest
 
 import lare
 from lare.credit.explanation import Explanation
+from lare.credit.words import entry_names, words
 from lare.latent.function import verified
 from lare.tasks.spec import read_task
 from lare.training.explain import explanation_of
-from lare.credit.words import entry_names, words
 from toys import Ear, toy_spec
 
 

@@ -7,7 +7,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from lare.credit import closed_form, decomposition, descent, returns
 from lare.credit.decomposition import CreditSettings, Decomposition, Episodes
@@ -79,7 +79,7 @@ def descend(
     fit = METHODS[method].fit
     assert fit is not None
 
-    def one(state: Decomposition, batch: tuple[Episodes, PRNGKeyArray]) -> tuple[Decomposition, Float[Array, ""]]:
+    def one(state: Decomposition, batch: tuple[Episodes, Key[Array, ""]]) -> tuple[Decomposition, Float[Array, ""]]:
         state, measured = descent.update(state, *batch, fit, settings)
         return state, measured["credit/loss"]
 

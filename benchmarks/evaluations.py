@@ -1,0 +1,42 @@
+"""How models of Stable-Baselines3 and SBX are evaluated while they learn."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+
+def evaluate(model: Any, environment: gymnasium.Env, seed: int, episodes: int) -> float:
+    """Mean return of the deterministic policy, from the same starts at every evaluation."""
+    normal = model.get_vec_normalize_env()
+    returns = np.zeros(episodes)
+    for episode in range(episodes):
+        observation, _ = environment.reset(seed=1_000_000 + 1000 * seed + episode)
+        ended = False
+        while not ended:
+            seen = observation if normal is None else normal.normalize_obs(observation)
+            action, _ = model.predict(seen, deterministic=True)
+            observation, reward, terminated, truncated, _ = environment.step(action)
+            returns[episode] += float(reward)
+            ended = terminated or truncated
+    return float(returns.mean())
+
+
+class Evaluations(BaseCallback):
+    """Evaluates after the update that follows every so many steps."""
+
+    def __init__(self, every: int, report: Callable[[int], None]):
+        super().__init__()
+        self.every, self.report = every, report
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps and self.num_timesteps % self.every == 0:
+            self.report(self.num_timesteps)
+
+    def _on_training_end(self) -> None:
+        self.report(self.num_timesteps)
+
+    def _on_step(self) -> bool:
+        return True

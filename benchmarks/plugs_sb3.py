@@ -1,0 +1,158 @@
+"""What `lare.plugs.sb3` costs Stable-Baselines3, and what it gives.
+
+    python benchmarks/plugs_sb3.py cost                                      results/plugs/sb3_cost.json
+    python benchmarks/plugs_sb3.py learn --algorithm td3 --rewards lare-bayes   results/plugs/sb3-td3-lare-bayes.jsonl
+
+`cost`: processor time of a whole step of TD3 on HalfCheetah-v4 with networks of 256-256, plain and with the plug, by turns within
+one process. A turn is one episode, so that a decoder in closed form is fitted in it. One core does.
+
+`learn`: true returns of the deterministic policy. `episodic` and `dense` are Stable-Baselines3 alone; everything else is a method,
+with the plug, and sees the return of whole episodes only. Hyperparameters of TD3 are the paper's; PPO's those of `sbx_learning.py`.
+"""
+
+import json
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import jax
+import numpy as np
+import torch
+import tyro
+from evaluations import Evaluations, evaluate
+from measure import TD3 as TD3_SETTINGS
+from measure import interleave, provenance, show, summary, write
+from stable_baselines3 import PPO, TD3
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import lare
+from lare.plugs.sb3 import CreditCallback, CreditReplayBuffer
+
+TASK, RESULTS = "HalfCheetah-v4", Path(__file__).parent / "results" / "plugs"
+PPO_SETTINGS: dict[str, Any] = {
+    "learning_rate": lambda left: 3e-4 * left,
+    "clip_range": lambda left: 0.2 * left,
+    "n_steps": 2000,
+    "batch_size": 64,
+    "n_epochs": 10,
+    "gamma": 0.99,
+    "gae_lambda": 0.95,
+    "ent_coef": 0.01,
+    "policy_kwargs": {"net_arch": [256, 256], "activation_fn": torch.nn.Tanh},
+}
+
+
+def assigner(method: str, task: lare.TaskSpec, seed: int, **more: Any) -> lare.CreditAssigner:
+    """With the function of the recorded replies, where the method needs one."""
+    phi = lare.design(task) if method.startswith("lare-") else None
+    return lare.CreditAssigner(method, phi, task=task, seed=seed, **more)
+
+
+def environment_of(task: lare.TaskSpec, dense: bool) -> gymnasium.Env:
+    """A true reward at every step, or the return at the end."""
+    made = gymnasium.make(task.environment)
+    return made if dense else lare.EpisodicReward(made)
+
+
+def td3(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> TD3:
+    """TD3 on the true rewards (`dense`), on the return (`episodic`), or on those of a method."""
+    environment = environment_of(task, rewards == "dense")
+    plug = {}
+    if rewards not in ("dense", "episodic"):
+        credit = assigner(rewards, task, seed, capacity=TD3_SETTINGS["buffer_size"])
+        plug = {"replay_buffer_class": CreditReplayBuffer, "replay_buffer_kwargs": {"credit": credit}}
+    noise = NormalActionNoise(np.zeros(task.action_size), 0.1 * np.ones(task.action_size))
+    settings: Any = TD3_SETTINGS | {"policy_kwargs": dict(TD3_SETTINGS["policy_kwargs"])}  # SB3 writes into it
+    return TD3(
+        "MlpPolicy",
+        environment,
+        action_noise=noise,
+        learning_starts=warmup,
+        seed=seed,
+        device="cpu",
+        **settings,
+        **plug,
+    )
+
+
+def ppo(task: lare.TaskSpec, rewards: str, seed: int) -> tuple[PPO, list[CreditCallback]]:
+    """PPO, normalised by VecNormalize; and what makes it learn from a method."""
+    environment = VecNormalize(DummyVecEnv([partial(environment_of, task, rewards == "dense")]))
+    settings: Any = PPO_SETTINGS | {"policy_kwargs": dict(PPO_SETTINGS["policy_kwargs"])}
+    model = PPO("MlpPolicy", environment, seed=seed, device="cpu", **settings)
+    if rewards in ("dense", "episodic"):
+        return model, []
+    return model, [CreditCallback(assigner(rewards, task, seed, scale_rewards=True))]
+
+
+def cost(rounds: int = 4, steps: int = 1000, methods: tuple[str, ...] = ("lare-bayes", "lare-rrdu")) -> None:
+    """Measure a step.
+
+    Args:
+        rounds: how often each has its turn, after one that is not counted.
+        steps: environment steps in a turn, a multiple of an episode.
+        methods: of the plug.
+    """
+    task = lare.load_task(TASK)
+    models = {name: td3(task, name, 0, steps) for name in ("episodic", *methods)}
+
+    def advance(model: TD3, by: int = steps) -> None:
+        model.learn(by, reset_num_timesteps=False, log_interval=1_000_000)
+
+    for model in models.values():
+        advance(model)
+    turns = {name: partial(advance, model) for name, model in models.items()}
+    table = summary(interleave(turns, rounds, time.process_time), steps, "episodic")
+    show("TD3, processor time", table, "episodic")
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    figures = {"task": TASK, "seeds": [0], "rounds": rounds, "steps in a turn": steps}
+    write("plugs/sb3_cost", {**figures, "processor milliseconds for a step": table})
+
+
+def learn(
+    algorithm: Literal["td3", "ppo"] = "td3",
+    rewards: str = "lare-bayes",
+    task: str = TASK,
+    seeds: int = 3,
+    steps: int = 100_000,
+    evaluate_every: int = 10_000,
+    episodes: int = 10,
+    warmup: int = 10_000,
+) -> None:
+    """Train, and append a line of JSON for each evaluation to results/plugs/sb3-ALGORITHM-REWARDS.jsonl.
+
+    Args:
+        algorithm: whose learning curve.
+        rewards: `episodic`, `dense`, or a method for the plug.
+        task: of the package.
+        seeds: how many seeds, from 0, one after the other.
+        steps: environment steps of each seed.
+        evaluate_every: environment steps between two evaluations; of ppo a multiple of 2000.
+        episodes: in one evaluation.
+        warmup: random steps before the first update; ppo has none.
+    """
+    spec = lare.load_task(task)
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    out = RESULTS / f"sb3-{algorithm}-{rewards}.jsonl"
+    with out.open("a") as file:
+        print(json.dumps({"task": task, "steps": steps, **provenance()}), file=file)
+    true = gymnasium.make(spec.environment)
+    for seed in range(seeds):
+        model, callbacks = ppo(spec, rewards, seed) if algorithm == "ppo" else (td3(spec, rewards, seed, warmup), [])
+
+        def report(step: int, model: Any = model, seed: int = seed) -> None:
+            line = {"step": step, "seed": seed, "evaluation/return": evaluate(model, true, seed, episodes)}
+            with out.open("a") as file:
+                print(json.dumps(line), file=file)
+            print(f"seed {seed}  step {step:>7d}  return {line['evaluation/return']:10.1f}", flush=True)
+
+        model.learn(steps, log_interval=1_000_000, callback=[*callbacks, Evaluations(evaluate_every, report)])
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_platforms", "cpu")
+    torch.set_num_threads(1)
+    tyro.extras.subcommand_cli_from_dict({"cost": cost, "learn": learn}, description=__doc__)
