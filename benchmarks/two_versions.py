@@ -3,9 +3,9 @@
     git worktree add ../before COMMIT
     python benchmarks/two_versions.py ../before .
 
-A case is an algorithm, a method and, for ippo, a task (CN-6, unless it is named). A turn is 500 environment steps of HalfCheetah-v4
-with as many updates (td3, ddpg, sac), one rollout of 2000 steps with its updates (ppo), or ten iterations with one fit of the decoder
-(ippo), by each version's own `step_costs.py` and `agents_speed.py`.
+A case is an algorithm, a method and, for ippo, a task (CN-6, unless it is named). A turn is 500 environment steps of
+HalfCheetah-v4 with as many updates (td3, ddpg, sac), one rollout of 2000 steps with its updates (ppo), or ten iterations with one
+fit of the decoder (ippo), by each version's own `step_costs.py` and `agents_speed.py`.
 Both processes are bound to the same core, and one waits while the other works.
 """
 

@@ -56,8 +56,8 @@ def test_observations_need_not_follow_each_other():
     ("changed", "message"),
     [
         ({"reward": np.nan}, "the score is nan: a number must be finite"),
-        ({"reward": [0.0, np.inf]}, "reward of step 1 holds inf: a number must be finite"),
-        ({"after": np.full((2, 2), np.nan)}, "after of step 0 holds nan: a number must be finite"),
+        ({"reward": [0.0, np.inf]}, "reward of row 1 holds inf: a number must be finite"),
+        ({"after": np.full((2, 2), np.nan)}, "after of row 0 holds nan: a number must be finite"),
         ({"reward": [1.0]}, "reward must be one number for each of 2 steps, and its shape is (1,)"),
     ],
 )
