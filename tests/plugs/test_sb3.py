@@ -465,37 +465,6 @@ def test_every_method_pays(method, phi, reward):
     credit.close()
 
 
-def returns(model, episodes=20):
-    env, total = gymnasium.wrappers.TimeLimit(Chase(), STEPS_OF_TOY), 0.0
-    for episode in range(episodes):
-        shown, ended = env.reset(seed=episode)[0], False
-        while not ended:
-            shown, reward, terminated, truncated, _ = env.step(model.predict(shown, deterministic=True)[0])
-            total, ended = total + reward, terminated or truncated
-    return total / episodes
-
-
-def test_it_learns_where_the_return_alone_teaches_little():
-    settings = {"learning_starts": 200, "buffer_size": 3000, "batch_size": 64, "learning_rate": 3e-3, "gamma": 0.9}
-    late = lambda: gymnasium.wrappers.TimeLimit(Chase(), STEPS_OF_TOY)  # noqa: E731
-    credit = assigner("bayes", capacity=3000, settings=None)
-    noise = NormalActionNoise(np.zeros(1), 0.2 * np.ones(1))
-    paid = td3(lare.EpisodicReward(late()), credit, action_noise=noise, **settings)
-    paid.learn(1500)
-    alone = TD3(
-        "MlpPolicy",
-        lare.EpisodicReward(late()),
-        seed=0,
-        device="cpu",
-        policy_kwargs=dict(NET),
-        action_noise=noise,
-        **settings,
-    )
-    alone.learn(1500)
-    assert returns(paid) > -1.5
-    assert returns(alone) < returns(paid) - 2
-
-
 def refused(message):
     return pytest.raises(LareError, match=f"^{re.escape(message)}$")
 
