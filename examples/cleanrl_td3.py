@@ -7,7 +7,7 @@ The lines that end in `# LaRe` are all that LaRe adds.
 """
 # Spaces and modules say little of their types here, as in CleanRL.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false, reportOperatorIssue=false
-# pyright: reportPossiblyUnbound=false
+# pyright: reportPossiblyUnboundVariable=false, reportOptionalIterable=false
 
 import random
 import time
