@@ -442,7 +442,9 @@ class CreditAssigner:
             found = self.config.features(*self.config.rows(before, action, after))
             long = np.full(len(found), self.store.usual_length) if length is None else np.asarray(length, np.int32)
             if long.shape != (len(found),):
-                raise LareError(f"length must be one number for each of {len(found)} steps, and its shape is {long.shape}")
+                raise LareError(
+                    f"length must be one number for each of {len(found)} steps, and its shape is {long.shape}"
+                )
             return self.paid(found, long, None, None)
 
     def paid(

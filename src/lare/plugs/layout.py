@@ -69,7 +69,7 @@ class Layout(Checked):
         ]
         return np.concatenate(parts, axis=-1)
 
-    def chosen(self, array: Shaped[np.ndarray, "*batch"], name: str) -> Float[np.ndarray, "*batch size"]:
+    def chosen(self, array: Shaped[np.ndarray, "..."], name: str) -> Float[np.ndarray, "*batch size"]:
         """Numbers of choices as rows with a single 1 for each place."""
         single = not self.shape
         if single and array.ndim and array.shape[-1] == self.size and array.dtype.kind == "f":
@@ -84,7 +84,7 @@ class Layout(Checked):
             [np.eye(count, dtype=np.float32)[numbers[..., place]] for place, count in enumerate(self.choices)], axis=-1
         )
 
-    def as_they_are(self, array: Shaped[np.ndarray, "*batch"], name: str) -> Float[np.ndarray, "*batch size"]:
+    def as_they_are(self, array: Shaped[np.ndarray, "..."], name: str) -> Float[np.ndarray, "*batch size"]:
         """Rows that are made already."""
         if array.ndim == 0 or array.shape[-1] != self.size:
             raise LareError(f"{name} must be rows of {self.size} numbers, and has the shape {array.shape}")

@@ -7,7 +7,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from lare.credit import closed_form, decomposition, descent, returns
 from lare.credit.decomposition import CreditSettings, Decomposition, Episodes
@@ -35,9 +35,7 @@ def observe_returns(
 
 
 @jax.jit
-def observe_mean_rewards(
-    scale: Scale, mean_reward: Float[Array, " episodes"], mask: Bool[Array, " episodes"]
-) -> Scale:
+def observe_mean_rewards(scale: Scale, mean_reward: Float[Array, " episodes"], mask: Bool[Array, " episodes"]) -> Scale:
     """With finished episodes in a scale of R/T."""
     return observe_scale(scale, mean_reward, mask)
 
@@ -75,13 +73,13 @@ def is_due(state: Decomposition) -> Bool[Array, ""]:
 
 @partial(jax.jit, static_argnames=("method", "settings"))
 def descend(
-    state: Decomposition, batches: Episodes, keys: PRNGKeyArray, method: str, settings: CreditSettings
+    state: Decomposition, batches: Episodes, keys: Key[Array, " updates"], method: str, settings: CreditSettings
 ) -> tuple[Decomposition, Float[Array, ""]]:
     """One update by a gradient for each of some batches; and the mean of their losses."""
     fit = METHODS[method].fit
     assert fit is not None
 
-    def one(state: Decomposition, batch: tuple[Episodes, PRNGKeyArray]) -> tuple[Decomposition, Float[Array, ""]]:
+    def one(state: Decomposition, batch: tuple[Episodes, Key[Array, ""]]) -> tuple[Decomposition, Float[Array, ""]]:
         state, measured = descent.update(state, *batch, fit, settings)
         return state, measured["credit/loss"]
 
