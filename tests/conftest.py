@@ -36,7 +36,16 @@ for option, value in CACHE.items():
     os.environ.setdefault(option.upper(), str(value))
     jax.config.update(option, value)
 
-collect_ignore = ["toys.py", "jax_toys.py", "hosts.py", "parallel_toys.py", "servers.py", "recipes.py", "programs.py"]
+collect_ignore = [
+    "toys.py",
+    "jax_toys.py",
+    "hosts.py",
+    "parallel_toys.py",
+    "servers.py",
+    "recipes.py",
+    "programs.py",
+    "logged.py",
+]
 """No tests in there, and looking for doctests would import it, and register its environments, a second time."""
 
 __all__ = ["PHI", "Chase", "toy_spec"]

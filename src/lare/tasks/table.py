@@ -62,6 +62,7 @@ FAMILIES = {
     "pettingzoo": Family(pettingzoo, reads=("max_episode_steps", "arguments", "agents")),
 }
 
+
 def no_environment(task: TaskSpec, **_: Any) -> HostEnv:
     raise LareError(
         f"task {task.name!r} has no environment (environment = {NO_ENVIRONMENT!r}), so that nothing can be played or trained: "
