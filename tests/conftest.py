@@ -45,6 +45,7 @@ collect_ignore = [
     "recipes.py",
     "programs.py",
     "shown.py",
+    "logged.py",
 ]
 """No tests in there, and looking for doctests would import it, and register its environments, a second time."""
 

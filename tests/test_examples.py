@@ -5,6 +5,9 @@ from pathlib import Path
 
 import pytest
 
+import lare
+from logged import logged
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
@@ -12,3 +15,12 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 def test_a_loop_of_ones_own_learns_credit():
     """Ten episodes of random actions tell the decoder most of what the true rewards are."""
     assert runpy.run_path(str(EXAMPLES / "own_loop.py"))["main"](episodes=10) > 0.5
+
+
+def test_td3_bc_trains_on_a_relabelled_log(tmp_path):
+    """On all three kinds of rewards, for a few updates: that it learns is not for a test of seconds."""
+    pytest.importorskip("torch")
+    lare.relabel(list(logged(12)), tmp_path / "new", method="rd-linear")
+    main = runpy.run_path(str(EXAMPLES / "offline_td3_bc.py"))["main"]
+    for rewards in ("rewards", "paid", "end"):
+        assert main(str(tmp_path / "new"), rewards, steps=3) == []

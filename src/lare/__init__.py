@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from lare.latent.design import design as design
     from lare.latent.function import LatentFunction as LatentFunction
     from lare.latent.function import load as load_function  # noqa: F401
+    from lare.logs.relabel import relabel as relabel
+    from lare.logs.steps import logged_steps as logged_steps
     from lare.plugs.assigner import CreditAssigner as CreditAssigner
     from lare.run.directory import Run as Run
     from lare.run.directory import open_run as open_run
@@ -37,6 +39,8 @@ HOMES = {
     "design": "lare.latent.design",
     "LatentFunction": "lare.latent.function",
     "load_function": "lare.latent.function:load",
+    "relabel": "lare.logs.relabel",
+    "logged_steps": "lare.logs.steps",
     "CreditAssigner": "lare.plugs.assigner",
     "EpisodicReward": "lare.tasks.episodic",
     "TaskSpec": "lare.tasks.spec",

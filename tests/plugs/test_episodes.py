@@ -107,3 +107,12 @@ def test_what_is_not_to_be_forgotten_is_not():
     known = [float(np.sum(credit.state.closed.summed.episodes)) for credit in (every, newest)]
     assert known[0] == 400
     assert known[1] < 300
+
+
+def test_a_decoder_that_descends_a_gradient_learns_from_whole_episodes():
+    credit = CreditAssigner("rrdu", observation_space=2, action_space=1, capacity=10_000, fits_per_step=0.0)
+    for observation, action, reward in episodes(40, np.random.default_rng(5)):
+        credit.add_episode(observation[:-1], action, observation[1:], reward)
+    credit.fit(16)
+    assert credit.metrics()["credit/fits"] == 16
+    assert np.isfinite(credit.rewards_at([0])).all()

@@ -12,6 +12,7 @@ import traceback
 from lare.cli.design import design
 from lare.cli.functions import new_task, prompt, verify
 from lare.cli.lists import algorithms, methods, tasks
+from lare.cli.logs import relabel
 from lare.cli.parse import parse
 from lare.cli.runs import cross_play, evaluate, report, train
 from lare.cli.studies import compare, reproduce, sweep
@@ -31,6 +32,7 @@ COMMANDS = {
     "prompt": prompt,
     "design": design,
     "verify": verify,
+    "relabel": relabel,
     "train": train,
     "evaluate": evaluate,
     "sweep": sweep,

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from lare.cli.terminal import Kind, Task, free_name, progress, say
+from lare.cli.terminal import Data, Kind, Task, free_name, progress, say, steps_of
 from lare.errors import LareError
 from lare.latent.design import DesignFailed
 from lare.latent.design import design as design_function
@@ -34,6 +34,7 @@ def design(
     price: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="IN OUT")] = None,
     temperature: float | None = None,
     record: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    data: Data = None,
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
 ) -> None:
     """Design the latent function of a task: candidates, combine, verify, correct.
@@ -58,12 +59,14 @@ def design(
         price: of a million tokens in and out, to have the cost reckoned.
         temperature: of the model; the server's own unless given.
         record: a file that takes every exchange, for --model FILE; it must not exist, and not be the .json of --out.
+        data: logged episodes whose steps functions are tried on, instead of random ones of the environment: a directory, a Parquet
+            file, or the id of a local data set of Minari's.
         out: a .py file to write, with the replies and checks in a .json beside it; it must not exist.
     """
     from lare.llm.budget import Budget
     from lare.llm.live import LiveModel
     from lare.llm.model import RECORDED, recorded_model
-    from lare.tasks.spec import load_task
+    from lare.tasks.spec import load_task, read_task
 
     shipped = model in (None, RECORDED)
     live = not shipped and not str(model).endswith(".json")
@@ -72,8 +75,12 @@ def design(
         raise LareError("--policy plays episodes for --reflect: say how many rounds")
     if reflect < 0:
         raise LareError(f"reflect = {reflect}: there can be no fewer rounds than none")
+    if data is not None and reflect:
+        raise LareError(
+            "--reflect plays episodes in the environment, and --data is for where there is none: leave one out"
+        )
     check_files(out, record)
-    spec, cost = load_task(task), Budget(requests, budget)
+    spec, cost = load_task(task) if data is None else read_task(task), Budget(requests, budget)
     plays = policy_that_plays(policy, spec)
     if live:
         asked = LiveModel(str(model), base_url, temperature, cost, said=progress)
@@ -88,6 +95,7 @@ def design(
             pre_verification=pre_verification,
             record=record,
             said=progress,
+            steps=steps_of(data, spec),
         )
         if reflect:
             from lare.training.reflect import reflect as reflect_on

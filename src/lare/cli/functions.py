@@ -1,13 +1,18 @@
 """Latent functions: the request, a task of one's own, verification."""
 
 import sys
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from tyro.conf import Positional
 
-from lare.cli.terminal import Kind, Task, say, write_new
+from lare.cli.terminal import Data, Kind, Task, say, steps_of, write_new
+from lare.errors import LareError
+
+if TYPE_CHECKING:
+    from lare.tasks.new import Draft
 
 
 def prompt(task: Task, kind: Kind = "factors") -> None:
@@ -28,19 +33,18 @@ def new_task(
     environment: Annotated[Positional[str], tyro.conf.arg(metavar="ENV_ID")],
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
 ) -> None:
-    """Write a first task file of an environment, from its spaces and its documentation.
+    """Write a first task file of an environment, from its spaces and its documentation; or of a log, from its arrays.
 
     Whatever speaks of rewards is left out, and what could not be found is marked for you to fill in. Where the agents are
     of several kinds, a file for each kind is written beside it.
 
     Args:
         environment: a Gymnasium id, as Pendulum-v1; module:id imports the module that registers it first; or
-            pettingzoo/MODULE:NAME, where NAME makes a PettingZoo ParallelEnv.
+            pettingzoo/MODULE:NAME, where NAME makes a PettingZoo ParallelEnv. Or a directory of logged episodes, a Parquet
+            file, or the id of a local data set of Minari's.
         out: the file to write, which must not exist; the task's name with .toml unless given.
     """
-    from lare.tasks.new import draft
-
-    drafted = draft(environment)
+    drafted = draft_of(environment)
     path = out or Path(f"{drafted.name}.toml")
     write_new(path, drafted.toml, "--out")
     for name, text in drafted.teams.items():
@@ -48,15 +52,39 @@ def new_task(
     left_out = f"; {drafted.left_out} sentences or rows that spoke of rewards were left out" if drafted.left_out else ""
     say(f"wrote {', '.join(map(str, (path, *(path.parent / name for name in drafted.teams))))}{left_out}")
     for key in drafted.missing:
-        say(f"  fill in: {key} (the environment does not document it)")
-    say(f"read it, then: lare design {path} --model NAME --out phi.py")
-    say(f"or, without a model: write phi.py by what lare prompt {path} says; --method rrdu needs none")
+        say(f"  fill in: {key} ({environment} does not document it)")
+    data = f" --data {environment}" if drafted.of_logs else ""
+    say(f"read it, then: lare design {path}{data} --model NAME --out phi.py")
+    none = "lare relabel without --function" if drafted.of_logs else "--method rrdu"
+    say(f"or, without a model: write phi.py by what lare prompt {path} says; {none} needs none")
+
+
+def draft_of(named: str) -> "Draft":
+    """A first spec of an environment, or of a log."""
+    from lare.tasks.new import draft
+
+    if Path(named).exists():
+        from lare.logs.draft import draft_of_logs
+
+        return draft_of_logs(named)
+    try:
+        return draft(named)
+    except LareError:
+        if find_spec("minari") is None:
+            raise
+        from lare.logs.draft import draft_of_logs
+        from lare.logs.minari import is_local
+
+        if not is_local(named):
+            raise
+        return draft_of_logs(named)
 
 
 def verify(
     file: Annotated[Positional[Path], tyro.conf.arg(metavar="FILE")],
     task: Annotated[str, tyro.conf.arg(metavar="TASK")],
     kind: Kind = "factors",
+    data: Data = None,
 ) -> None:
     """Verify a function: what it may contain, and what it must do. It runs in a process without rights.
 
@@ -66,15 +94,18 @@ def verify(
         file: Python source, or a function that `lare design` saved.
         task: a shipped name (see `lare tasks`), or the path of a task file.
         kind: what it is to return: several factors, or one reward.
+        data: logged episodes whose steps it is tried on, instead of random ones of the environment: a directory, a Parquet file,
+            or the id of a local data set of Minari's.
     """
     from lare.latent.function import read_source
     from lare.latent.verify import verify as verify_source
-    from lare.tasks.spec import load_task
+    from lare.tasks.spec import load_task, read_task
 
     source, changed = read_source(file)
     if changed:
         say("note    the source is not the one that was saved: its hash is another")
-    verdict = verify_source(source, load_task(task), kind)
+    spec = load_task(task) if data is None else read_task(task)
+    verdict = verify_source(source, spec, kind, steps_of(data, spec))
     for check in verdict.checks:
         say(f"{'passed' if check.passed else 'FAILED'}  {check.name}")
         for line in check.message.splitlines():

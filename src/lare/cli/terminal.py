@@ -3,17 +3,22 @@
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from tyro.conf import Positional
 
 from lare.errors import LareError
 
+if TYPE_CHECKING:
+    from lare.latent.verify import Steps
+    from lare.tasks.spec import TaskSpec
+
 Task = Annotated[Positional[str], tyro.conf.arg(metavar="TASK")]
 RunDirectory = Annotated[Positional[Path], tyro.conf.arg(metavar="RUN")]
 RunDirectories = Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN")]
 Kind = Literal["factors", "reward"]
+Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET")]
 
 WIDTH = 200
 """Characters in a line of a file."""
@@ -43,6 +48,15 @@ def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 def progress(text: str) -> None:
     """What is worth knowing on the way, apart from the result."""
     sys.stderr.write(legible(text) + "\n")
+
+
+def steps_of(data: str | None, task: "TaskSpec") -> "Steps | None":
+    """Steps of a log, where one was given."""
+    if data is None:
+        return None
+    from lare.logs.steps import logged_steps
+
+    return logged_steps(data, task)
 
 
 def free_name(path: Path) -> Path:

@@ -54,6 +54,8 @@ class Draft:
     """Sentences and rows that spoke of rewards."""
     teams: dict[str, str] = field(default_factory=dict)
     """Specs of teams, by the names of the files that the spec says they are in."""
+    of_logs: bool = False
+    """Whether it speaks of logs, and of no environment."""
 
 
 def draft(environment_id: str) -> Draft:

@@ -1,0 +1,73 @@
+"""Steps a second of `lare.relabel`, in closed form: a million synthetic steps of 11 entries and 3 actions, in memory.
+
+    python benchmarks/relabel.py [STEPS]
+
+Reading is a slice of an array; writing is one .npz file an episode of 1,000 steps. What is measured is the wall clock of the whole,
+of the pass that fits and of the pass that pays and writes, and the peak of the process's memory.
+"""
+
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from measure import write
+
+import lare
+
+LENGTH, ENTRIES, ACTIONS = 1000, 11, 3
+
+
+class Log:
+    """Episodes that are made when they are asked for, always the same."""
+
+    def __init__(self, episodes: int):
+        self.count = episodes
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __iter__(self) -> Iterator[Mapping[str, np.ndarray]]:
+        weight = np.random.default_rng(0).normal(size=ENTRIES)
+        for number in range(self.count):
+            random = np.random.default_rng([1, number])
+            observations = random.standard_normal((LENGTH + 1, ENTRIES), np.float32) + random.normal(size=ENTRIES)
+            actions = random.standard_normal((LENGTH, ACTIONS), np.float32)
+            yield {"observations": observations, "actions": actions, "score": observations[1:].sum(axis=0) @ weight}
+
+
+def main(steps: int) -> None:
+    began = {}
+
+    def told(stage: str, done: int, count: int | None) -> None:
+        began.setdefault(stage, time.perf_counter())
+
+    start = time.perf_counter()
+    for _ in Log(steps // LENGTH):
+        pass
+    making = time.perf_counter() - start
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        found = lare.relabel(Log(steps // LENGTH), Path(folder) / "new", told=told)
+        end = time.perf_counter()
+    figures = {
+        "steps": found.steps,
+        "episodes": found.episodes,
+        "seconds": end - start,
+        "steps a second": found.steps / (end - start),
+        "seconds of the pass that fits": began["write"] - start,
+        "seconds of the pass that writes": end - began["write"],
+        "seconds of making the episodes, in each pass": making,
+        "peak memory, MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "held-out R^2": found.return_r2,
+    }
+    for name, value in figures.items():
+        print(f"{name:46s} {value:,.2f}")
+    write("relabel", {"results": figures})
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000)

@@ -1,0 +1,140 @@
+"""Minari data sets. r_hat takes the place of the rewards; the old ones are in `infos["paid"]`, whose first entry is the reset's."""
+
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lare.errors import LareError, shortened
+from lare.logs.episode import Form, Logged, checked
+from lare.logs.output import check_free, whole
+from lare.logs.source import Hints, Paid
+from lare.plugs.layout import layout_of
+
+try:
+    import minari
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_dataset import MinariDataset, parse_dataset_id
+    from minari.dataset.minari_storage import MinariStorage
+    from minari.namespace import create_namespace, list_local_namespaces
+    from minari.storage.datasets_root_dir import get_dataset_path
+except ImportError as missing:
+    raise LareError("Minari data sets need the extra lare-rl[minari]: pip install 'lare-rl[minari]'") from missing
+
+COPIED = (
+    *("author", "author_email", "code_permalink", "algorithm_name", "requirements", "eval_env_spec"),
+    *("ref_min_score", "ref_max_score", "num_episodes_average_score"),
+)
+"""Of the metadata of a data set."""
+
+
+class MinariLogs:
+    """A data set of one agent, of any spaces that lie in rows."""
+
+    def __init__(self, dataset: Any, hints: Hints):
+        self.dataset: MinariDataset = dataset
+        self.name = str(dataset.spec.dataset_id)
+        self.count: int | None = int(dataset.total_episodes)
+        if not self.count:
+            raise LareError(f"{self.name} has no episode")
+        spec = dataset.env_spec
+        limit = hints.limit or (spec.max_episode_steps if spec is not None else None)
+        observation = layout_of(dataset.observation_space, f"the observation space of {self.name}")
+        self.form = Form(observation, layout_of(dataset.action_space, f"the action space of {self.name}"), limit)
+
+    def episodes(self) -> Iterator[Logged]:
+        """One at a time, in the order of their numbers."""
+        indices = self.dataset.episode_indices
+        storage = self.dataset.storage
+        both = zip(storage.get_episodes(indices), storage.get_episode_metadata(indices), strict=True)
+        for number in indices.tolist():
+            name = f"{self.name}, episode {number}"
+            try:
+                values, about = next(both)
+            except Exception as error:  # whatever h5py, pyarrow and Minari say of a file that anybody may have written
+                raise LareError(f"{name} cannot be read: {shortened(error)}") from error
+            values = {key: value for key, value in values.items() if key != "id"}
+            infos = values.get("infos") or {}
+            if "paid" in infos:
+                values["paid"] = np.asarray(infos["paid"])[1:]
+            yield checked(name, values, self.form, {**values, "infos": infos, "seed": about.get("seed")})
+
+    def check_out(self, out: str | Path, overwrite: bool) -> None:
+        """An id of Minari's."""
+        path = path_of(out)
+        if path.parent.exists():  # a namespace of Minari's that is not there yet is made
+            check_free(path, overwrite)
+
+    def write(self, out: str | Path, episodes: Iterable[Paid], overwrite: bool, about: str) -> str | Path:
+        """A data set of another id, in the same format."""
+        path, dataset_id, source = path_of(out), str(out), self.dataset.storage
+        namespace, _, _ = parse_dataset_id(dataset_id)
+        if namespace is not None and namespace not in list_local_namespaces():
+            create_namespace(namespace)
+        metadata = source.metadata
+        with whole(path, overwrite) as new, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of Minari's: that an environment's spec cannot be kept
+            new.mkdir()
+            storage = MinariStorage.new(
+                new / "data",
+                source.observation_space,
+                source.action_space,
+                self.dataset.env_spec,
+                source.FORMAT,
+                jpeg_encoding=source.jpeg_encoding,
+            )
+            storage.update_metadata(
+                {
+                    **{key: metadata[key] for key in COPIED if metadata.get(key) is not None},
+                    "dataset_id": dataset_id,
+                    "minari_version": minari.__version__,
+                    "description": f"{metadata.get('description') or self.name}\n\n{about}",
+                }
+            )
+            storage.update_episodes(map(buffer_of, episodes))
+        return dataset_id
+
+
+def buffer_of(paid: Paid) -> EpisodeBuffer:
+    """An episode as Minari writes it."""
+    kept = paid.episode.kept
+    return EpisodeBuffer(
+        seed=kept["seed"],
+        observations=kept["observations"],
+        actions=kept["actions"],
+        rewards=paid.r_hat,  # pyright: ignore[reportArgumentType] - an array does as well
+        terminations=kept["terminations"],
+        truncations=kept["truncations"],
+        infos={**kept["infos"], "paid": np.append(0.0, paid.episode.paid)},
+    )
+
+
+def load(dataset_id: str) -> MinariDataset:
+    """A local data set. Raises `LareError` where there is none: nothing is downloaded."""
+    try:
+        return minari.load_dataset(dataset_id)
+    except Exception as error:  # whatever h5py and Minari say of files that anybody may have written
+        if not (get_dataset_path(dataset_id) / "data").exists():
+            raise LareError(
+                f"there is no {dataset_id}: neither a path nor a local data set of Minari (minari list local; "
+                "minari download fetches one)"
+            ) from error
+        raise LareError(f"{dataset_id} cannot be read by Minari: {shortened(error)}") from error
+
+
+def is_local(dataset_id: str) -> bool:
+    """Whether Minari has a data set of that id here."""
+    return (get_dataset_path(dataset_id) / "data").is_dir()
+
+
+def path_of(dataset_id: str | Path) -> Path:
+    """Where a data set of that id stands. Raises `LareError` where it is no id."""
+    try:
+        parse_dataset_id(str(dataset_id))
+    except (ValueError, TypeError):
+        raise LareError(
+            f"{dataset_id} is no id of Minari's, as cheetah/relabelled-v0: a name, -v and a number"
+        ) from None
+    return get_dataset_path(str(dataset_id))

@@ -1,0 +1,50 @@
+"""What is written whole or not at all: under another name, which becomes the right one at the end."""
+
+import contextlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from uuid import uuid4
+
+from lare.errors import LareError
+
+
+def check_free(out: Path, overwrite: bool) -> None:
+    """Raise `LareError` where something is there that is not to be overwritten, or nothing can be written."""
+    if out.exists() and not overwrite:
+        raise LareError(f"{out} exists, and is not overwritten without overwrite (--overwrite)")
+    if not out.name or not out.parent.is_dir():
+        raise LareError(f"{out} cannot be written: there is no directory {out.parent}")
+
+
+@contextlib.contextmanager
+def whole(out: Path, overwrite: bool) -> Iterator[Path]:
+    """A path beside `out` to write to, a file or a directory. At the end it takes the place of `out`; after an error it is removed.
+
+    Raises:
+        LareError: it cannot be written, or something is there.
+    """
+    check_free(out, overwrite)
+    new, old = (out.with_name(f".{out.name}.{uuid4().hex}.{kind}") for kind in ("new", "old"))
+    try:
+        yield new
+        check_free(out, overwrite)
+        if out.exists():
+            out.rename(old)
+        new.rename(out)
+    except OSError as error:
+        raise LareError(f"{out} cannot be written ({error.strerror or error}); what was there is as it was") from error
+    finally:
+        if old.exists() and not out.exists():
+            old.rename(out)
+        for path in (new, old):
+            remove(path)
+
+
+def remove(path: Path) -> None:
+    """A file, or a directory with all that is in it; or nothing."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)

@@ -1,0 +1,273 @@
+"""`relabel`: the same log with r_hat for rewards, and how well returns are predicted that nothing was fitted to.
+
+Two passes over the log, neither of which holds it: one shows the episodes to a `CreditAssigner`, one asks it what their steps
+are worth and writes them.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lare.credit.decomposition import CreditSettings
+from lare.credit.methods import Reward, find_method
+from lare.errors import LareError
+from lare.latent.function import LatentFunction
+from lare.logs.episode import Logged
+from lare.logs.source import Paid, Source, open_logs
+from lare.plugs.assigner import CreditAssigner
+from lare.tasks.spec import TaskSpec
+
+PIECE = 8192
+"""Steps that are paid for at a time: `phi` answers for many as fast as for few."""
+BLOCK = 10
+"""Of so many episodes in a row, a fair share is held out: a log that is sorted is held out evenly."""
+FEWEST = 8
+"""Held-out episodes, below which nothing is said of them."""
+LEAST_CAPACITY = 100_000
+UPDATES = 10_000
+"""Of a decoder that descends a gradient."""
+
+
+@dataclass(frozen=True)
+class Relabelled:
+    """What was done, and how good it is."""
+
+    out: str | Path
+    method: str
+    episodes: int
+    steps: int
+    cut: int
+    """Episodes that were cut off before their end: paid, and not learned from."""
+    held_out: int
+    """Whole episodes that nothing was fitted to."""
+    return_r2: float
+    """R^2 of the returns of those; NaN where they are fewer than 8, all the same, or r_hat is not in the unit of returns."""
+    return_correlation: float
+    """Of those returns and their predictions; NaN like that."""
+    explanation: tuple[str, ...]
+    """What returns say of the factors: `CreditAssigner.explanation`."""
+
+    @property
+    def words(self) -> list[str]:
+        """All of it, a sentence each."""
+        said = [f"{self.steps:,} steps of {self.episodes:,} episodes were given rewards by {self.method}."]
+        if self.cut:
+            said.append(f"{self.cut:,} of the episodes were cut before their end: they were not learned from.")
+        said += predicted(self)
+        return [*said, *self.explanation]
+
+
+def predicted(found: Relabelled) -> list[str]:
+    """How well unseen returns are predicted, in words."""
+    if found.held_out < FEWEST:
+        return [
+            f"How well unseen returns are predicted is not known: {found.held_out} episodes were held out, 8 are needed."
+        ]
+    of = f"returns of {found.held_out:,} episodes that were held out"
+    if math.isnan(found.return_correlation):
+        return [f"The {of}, or what is predicted of them, are all the same: nothing can be said of these rewards."]
+    if math.isnan(found.return_r2):
+        return [
+            f"The {of}, which nothing was fitted to, go with what is predicted: correlation {found.return_correlation:.2f}."
+        ]
+    said = [f"The {of}, which nothing was fitted to, are predicted with an R^2 of {found.return_r2:.2f}."]
+    if found.return_r2 < 0.1:
+        said.append(
+            "Warning: that is no better than their mean. These rewards say next to nothing: do not train on them."
+        )
+    return said
+
+
+@dataclass
+class Tally:
+    """Running sums over the episodes of a pass."""
+
+    episodes: int = 0
+    steps: int = 0
+    cut: int = 0
+    returns: list[float] = field(default_factory=list)
+    """Of those held out."""
+    predicted: list[float] = field(default_factory=list)
+
+    def r2(self) -> float:
+        """1 - squared errors / variation."""
+        returns, predicted = np.array(self.returns), np.array(self.predicted)
+        spread = np.sum((returns - returns.mean()) ** 2) if len(returns) else 0
+        told = len(returns) >= FEWEST and spread > 1e-10 * np.sum(returns**2)
+        return float(1 - np.sum((returns - predicted) ** 2) / spread) if told else math.nan
+
+    def correlation(self) -> float:
+        """Pearson's."""
+        returns, predicted = np.array(self.returns), np.array(self.predicted)
+        varies = len(returns) >= FEWEST and all(np.ptp(one) > 1e-6 * np.abs(one).max() for one in (returns, predicted))
+        return float(np.corrcoef(returns, predicted)[0, 1]) if varies else math.nan
+
+
+Told = Callable[[str, int, int | None], None]
+"""Told which pass it is, episodes so far, and all of them where that is known."""
+
+
+def relabel(
+    source: Any,
+    out: str | Path,
+    *,
+    method: str | None = None,
+    phi: LatentFunction | None = None,
+    task: TaskSpec | None = None,
+    hold_out: float = 0.1,
+    settings: CreditSettings | None = None,
+    updates: int = UPDATES,
+    memory: float = 1.0,
+    seed: int = 0,
+    overwrite: bool = False,
+    told: Told = lambda stage, done, count: None,
+) -> Relabelled:
+    """Give the steps of logged episodes rewards that add up to what the episodes returned.
+
+    Args:
+        source: a directory of .npz or Parquet files, a Parquet file, a Minari id or data set, flat arrays by name, or a list of
+            mappings of arrays (docs/logs.md).
+        out: a path or, for a data set of Minari's, an id. It is written whole or not at all.
+        method: how credit is assigned; unless given, `lare-bayes` with a `phi`, and `bayes` without.
+        phi: a function that judges the steps; it needs its `task`.
+        task: what `phi` was designed for, the time limit, and of how many choices actions are.
+        hold_out: share of the whole episodes that nothing is fitted to, so that they can tell how good the rewards are.
+        settings: of the decoder.
+        updates: of a decoder that descends a gradient.
+        memory: GiB, about, for what the decoder sees of steps. A fit in closed form goes by all episodes, whatever fits into it;
+            other fits go by the last ones that do.
+        seed: of what is held out, and of a decoder's weights.
+        overwrite: what is at `out`.
+        told: is told of the progress.
+
+    Raises:
+        LareError: the log is damaged or empty, `out` cannot be written or exists, or method, function and task do not go together.
+    """
+    if not 0 <= hold_out <= 0.9:
+        raise LareError(f"hold_out = {hold_out}: a share from 0 to 0.9")
+    if not 0 < memory < math.inf or updates < 1:
+        raise LareError(f"memory = {memory} and updates = {updates} must be more than 0")
+    logs = open_logs(source, task)
+    logs.check_out(out, overwrite)
+    name = method or ("bayes" if phi is None else "lare-bayes")
+    credit = assigner(logs, name, phi, task, settings, memory, seed)
+    try:
+        seen = learn(credit, logs, hold_out, seed, updates, told)
+        explanation, tally = tuple(credit.explanation()), Tally()
+        about = f"Rewards by lare relabel, {name}; what was paid is in infos['paid'], behind the entry of the reset."
+        written = logs.write(out, pay(credit, logs, hold_out, seed, tally, seen, told), overwrite, about)
+    finally:
+        credit.close()
+    r2 = tally.r2() if credit.config.method.in_units else math.nan
+    counted = tally.episodes, tally.steps, tally.cut, len(tally.returns)
+    return Relabelled(written, name, *counted, r2, tally.correlation(), explanation)
+
+
+def assigner(
+    logs: Source,
+    name: str,
+    phi: LatentFunction | None,
+    task: TaskSpec | None,
+    settings: CreditSettings | None,
+    memory: float,
+    seed: int,
+) -> CreditAssigner:
+    """An assigner whose steps take so much memory, at most."""
+    if find_method(name).reward is Reward.UNIFORM:
+        raise LareError(f"{name} pays all steps of an episode alike, by its return: a log needs no decoder for that")
+
+    def made(capacity: int) -> CreditAssigner:
+        return CreditAssigner(
+            name,
+            phi,
+            task=task,
+            observation_space=logs.form.observation.size,  # rows already
+            action_space=logs.form.action.size,
+            capacity=capacity,
+            settings=settings,
+            seed=seed,
+            fits_per_step=0.0,
+            forget=False,
+        )
+
+    row = 4 * made(1).config.basis.inputs + 16  # features, and what the store knows of each step
+    return made(max(LEAST_CAPACITY, int(memory * 2**30 / row)))
+
+
+def held(hold_out: float, seed: int) -> Iterator[bool]:
+    """Which whole episodes are held out, without end: of each `BLOCK` a share by chance."""
+    number = 0
+    while True:
+        share = math.floor((number + 1) * BLOCK * hold_out + 1e-9) - math.floor(number * BLOCK * hold_out + 1e-9)
+        chosen = np.random.default_rng([seed, number]).permutation(BLOCK)[:share]
+        yield from (place in chosen for place in range(BLOCK))
+        number += 1
+
+
+def learn(
+    credit: CreditAssigner, logs: Source, hold_out: float, seed: int, updates: int, told: Told
+) -> tuple[int, int]:
+    """The first pass: fit to the whole episodes that are not held out. Gives how many there were, and their steps."""
+    out, count, steps, last = held(hold_out, seed), 0, 0, None
+    for episode in logs.episodes():
+        if episode.whole and not next(out):
+            last = episode.name
+            try:
+                credit.add_episode(episode.before, episode.action, episode.after, episode.paid)
+                credit.fit_owed()
+            except LareError as error:
+                raise LareError(f"{episode.name}: {error}") from error
+        count, steps = count + 1, steps + len(episode)
+        told("fit", count, logs.count)
+    if last is None and credit.config.method.fit is not None:
+        raise LareError(
+            f"{logs.name}: none of {count} episodes is whole and not held out: there is no return to learn from"
+        )
+    credit.fit(updates)
+    return count, steps
+
+
+def pay(
+    credit: CreditAssigner,
+    logs: Source,
+    hold_out: float,
+    seed: int,
+    tally: Tally,
+    seen: tuple[int, int],
+    told: Told,
+) -> Iterator[Paid]:
+    """The second pass: every episode with its rewards, and in `tally` what is predicted of those held out."""
+    out = held(hold_out, seed)
+    for some in pieces(logs.episodes()):
+        lengths = [len(episode) for episode in some]
+        before, action, after = (
+            np.concatenate([getattr(episode, part) for episode in some]) for part in ("before", "action", "after")
+        )
+        r_hat = credit.rewards(before, action, after, length=np.repeat(lengths, lengths))
+        for episode, rewards in zip(some, np.split(r_hat, np.cumsum(lengths)[:-1]), strict=True):
+            if episode.whole and next(out):
+                tally.returns.append(float(episode.paid.sum()))
+                tally.predicted.append(float(rewards.sum(dtype=np.float64)))
+            tally.episodes, tally.steps = tally.episodes + 1, tally.steps + len(episode)
+            tally.cut += not episode.whole
+            yield Paid(episode, rewards)
+            told("write", tally.episodes, seen[0])
+    if (tally.episodes, tally.steps) != seen:
+        raise LareError(f"{logs.name} has changed while it was read: {seen[0]} episodes first, then {tally.episodes}")
+
+
+def pieces(episodes: Iterator[Logged]) -> Iterator[list[Logged]]:
+    """Some episodes at a time, as soon as they have `PIECE` steps together."""
+    some, steps = [], 0
+    for episode in episodes:
+        some.append(episode)
+        steps += len(episode)
+        if steps >= PIECE:
+            yield some
+            some, steps = [], 0
+    if some:
+        yield some

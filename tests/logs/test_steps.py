@@ -1,0 +1,52 @@
+"""Steps of a log that functions are tried on."""
+
+import numpy as np
+import pytest
+
+import lare
+from lare import LareError
+from lare.latent.verify import verify
+from logged import PHI, logged
+
+
+@pytest.mark.parametrize("judges", ["before", "after"])
+def test_steps_are_from_all_over_the_log(task, judges):
+    episodes = list(logged(40))
+    observation, action = lare.logged_steps(episodes, task.model_copy(update={"judges": judges}))
+    assert (observation.shape, action.shape) == ((256, 2), (256, 1))
+    known = slice(None, -1) if judges == "before" else slice(1, None)
+    every = np.concatenate([one["observations"][known] for one in episodes])
+    assert {row.tobytes() for row in observation} <= {row.tobytes() for row in every}
+
+
+@pytest.mark.parametrize(
+    ("steps", "message"),
+    [
+        (
+            (np.zeros((3, 4)), np.zeros((3, 1))),
+            "observations of steps must be rows of 2 numbers, as observation_size of Logs says, as many as the other array has "
+            "and one at least: the shape is (3, 4)",
+        ),
+        (
+            (np.zeros((3, 2)), np.zeros((2, 1))),
+            "actions of steps must be rows of 1 numbers, as action_size of Logs says, as many as the other array has and one at "
+            "least: the shape is (2, 1)",
+        ),
+        ((np.zeros((3, 2)), np.full((3, 1), np.inf)), "actions of steps hold a number that is not finite"),
+    ],
+)
+def test_steps_of_other_sizes_are_refused(task, steps, message):
+    with pytest.raises(LareError) as error:
+        verify(PHI, task, steps=steps)
+    assert str(error.value) == message
+
+
+def test_a_task_without_an_environment_takes_nothing_that_only_an_environment_hears(tmp_path, task):
+    path = tmp_path / "task.toml"
+    path.write_text(
+        'name = "Logs"\nenvironment = "none"\nobservation_size = 2\naction_size = 1\ndescription = "d"\nobservation = "o"\n'
+        'action = "a"\nmeasures = ["x"]\n'
+    )
+    with pytest.raises(LareError) as error:
+        lare.load_task(path)
+    assert str(error.value) == "task 'Logs': measures makes no difference to logs: leave it out"
