@@ -27,11 +27,6 @@ def test_steps_are_from_all_over_the_log(task, judges):
             "observations of steps must be rows of 2 numbers, as observation_size of Logs says, as many as the other array has "
             "and one at least: the shape is (3, 4)",
         ),
-        (
-            (np.zeros((3, 2)), np.zeros((2, 1))),
-            "actions of steps must be rows of 1 numbers, as action_size of Logs says, as many as the other array has and one at "
-            "least: the shape is (2, 1)",
-        ),
         ((np.zeros((3, 2)), np.full((3, 1), np.inf)), "actions of steps hold a number that is not finite"),
     ],
 )
