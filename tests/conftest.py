@@ -26,12 +26,16 @@ CACHE = {
     "jax_persistent_cache_min_compile_time_secs": 0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
 }
-# Code that runs for a moment need not be optimised for minutes. The second flag halves the time that small programs take to
-# compile; a JAX that does not know it would end the process, so it is given to those that do.
+# Code that runs for a moment need not be optimised for minutes. Fusion emitters double the time that small programs take to
+# compile, and a program in parts, for the compiler's threads, takes a fifth more; a JAX that does not know a flag would end the
+# process, so these are given to those that do.
 QUICK = ["--xla_backend_optimization_level=0"]
 if jax.__version_info__ < (0, 11):
-    QUICK.append("--xla_cpu_use_fusion_emitters=false")
+    QUICK += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *QUICK]).strip()
+# There are as many workers as cores. Several threads in each (of t-SNE, and of NumPy's linear algebra) would spin for a core.
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
 for option, value in CACHE.items():
     os.environ.setdefault(option.upper(), str(value))
     jax.config.update(option, value)
