@@ -36,6 +36,8 @@ from lare.tasks.spec import Judges, TaskSpec
 
 WAITING = 256
 """Steps, at most, that wait for `phi` and for the running statistics: a call costs the same for one row as for hundreds."""
+SAMPLE = 256
+"""Steps, about, that `phi` is tried on when it is read again."""
 PIECE = 8192
 """Rows of features that are looked at at a time."""
 GROWTH = 0.02
@@ -119,6 +121,8 @@ class CreditAssigner:
         """Episodes that the decoder has not been told of."""
         self.returned: list[tuple[float, int]] = []
         """R/T and T of episodes that the scales have not met."""
+        self.sample: list[tuple[np.ndarray, np.ndarray]] = []
+        """The first observations and actions: a `phi` that is read from a file is tried on them again."""
         self.unseen = self.untold = 0
         """Steps that wait; steps of the episodes that are pending."""
         self.told = self.fits = 0
@@ -317,6 +321,9 @@ class CreditAssigner:
         if not self.waiting:
             return
         number, *steps = (np.concatenate(part) for part in zip(*self.waiting, strict=True))
+        if self.config.phi is not None and sum(len(rows) for rows, _ in self.sample) < SAMPLE:
+            _, action, after = (part.reshape(-1, part.shape[-1])[:SAMPLE].copy() for part in steps)
+            self.sample.append((after, action))
         for start in range(0, len(number), PIECE):
             part = slice(start, start + PIECE)
             found, places = self.config.features(*(each[part] for each in steps)), number[part] % self.store.capacity

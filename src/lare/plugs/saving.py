@@ -28,6 +28,8 @@ from lare.tasks.spec import TaskSpec, read_text
 
 FORMAT = 1
 TEXT, ARRAYS, FUNCTION = "assigner.json", "state.npz", "phi.py"
+TRIED = ("tried/observation", "tried/action")
+"""What `phi` is tried on when it is read again: there may be no environment."""
 
 
 def text_of(credit: CreditAssigner) -> dict[str, Any]:
@@ -65,6 +67,8 @@ def arrays_of(credit: CreditAssigner, episodes: bool) -> dict[str, np.ndarray]:
     arrays = {name: np.asarray(leaf) for name, leaf in leaves(credit).items()}
     store = credit.store
     arrays["counts"] = np.array([store.ended, store.ended_steps, store.dropped + len(store.running)])
+    for name, parts in zip(TRIED, zip(*credit.sample, strict=True), strict=False):
+        arrays[name] = np.concatenate(parts)
     if not episodes:
         return arrays
     there = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
@@ -101,7 +105,8 @@ def load(directory: Path) -> CreditAssigner:
             arrays = {name: saved[name] for name in saved.files}
         if not isinstance(text, dict) or text.get("format") != FORMAT:
             raise LareError(f"{path} is not of format {FORMAT}: another version of LaRe has written it")
-        phi = load_function(directory / FUNCTION, TaskSpec(**text["task"])) if text["phi"] else None
+        tried = (arrays[TRIED[0]], arrays[TRIED[1]]) if set(TRIED) <= set(arrays) else None
+        phi = load_function(directory / FUNCTION, TaskSpec(**text["task"]), steps=tried) if text["phi"] else None
         credit = CreditAssigner.__new__(CreditAssigner)
         restore(credit, text, arrays, phi)
     except (*DAMAGED, TypeError, RecursionError) as error:
@@ -126,6 +131,8 @@ def restore(
         **{name: text[name] for name in ("fits_per_step", "scale_rewards", "forget")},
     )
     credit.told, credit.fits = text["told"], text["fits"]
+    if set(TRIED) <= set(arrays):
+        credit.sample.append((arrays[TRIED[0]], arrays[TRIED[1]]))
     for name, leaf in leaves(credit).items():
         if arrays[name].shape != leaf.shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {leaf.shape}")
