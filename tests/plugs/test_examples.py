@@ -47,12 +47,11 @@ def test_without_the_marked_lines_it_is_the_plain_algorithm(name, tmp_path):
 
 @pytest.mark.parametrize("method", ["bayes", "rrdu"])
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_it_trains_on_what_the_assigner_says(name, method, capsys):
+def test_it_trains_on_what_the_assigner_says(name, method):
     """The environment is the same, and with other rewards other actions follow."""
     returns = run(ROOT / "examples" / name, method=method)
     assert len(returns) > 5
     assert returns[-1] != run(ROOT / "examples" / name, method="dense")[-1]
-    assert "credit/return_r2" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", SCRIPTS)

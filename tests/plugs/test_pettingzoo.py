@@ -111,9 +111,9 @@ def test_a_team_may_be_one():
 
 
 def test_spaces_of_other_kinds_become_rows():
-    parts = spaces.Dict(seed=spaces.Box(-9, 9, (1,)), count=spaces.Discrete(9))
+    parts = spaces.Dict(place=spaces.Box(-9, 9, (1,)), count=spaces.Discrete(9))
     toy = Kept(NAMES[:2], observations=dict.fromkeys(NAMES[:2], parts))
-    toy.seen = lambda agent: {"seed": np.zeros(1, np.float32), "count": toy.steps}
+    toy.seen = lambda agent: {"place": np.zeros(1, np.float32), "count": toy.steps}
     credit = credit_for(agents=2, observation_space=10)
     play(CreditParallel(toy, credit))
     credit.look()
@@ -121,7 +121,7 @@ def test_spaces_of_other_kinds_become_rows():
 
 
 def test_pettingzoos_own_test_finds_no_fault(recwarn):
-    parallel_api_test(CreditParallel(Toy(NAMES), credit_for()), num_cycles=20)
+    parallel_api_test(CreditParallel(Kept(NAMES), credit_for()), num_cycles=20)
     recwarn.clear()
 
 
