@@ -36,7 +36,7 @@ def made(name, episodes, observation=None, action=None, **others):
 
 def with_infos(episodes):
     for number, one in enumerate(episodes):
-        yield one | {"seed": number, "infos": {"height": np.arange(len(one["observations"]), dtype=float)}}
+        yield one | {"seed": number, "infos": {"height": [float(t) for t in range(len(one["observations"]))]}}
 
 
 @pytest.mark.parametrize("data_format", ["hdf5", "arrow"])

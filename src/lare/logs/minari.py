@@ -93,13 +93,26 @@ class MinariLogs:
                     "description": f"{metadata.get('description') or self.name}\n\n{about}",
                 }
             )
-            storage.update_episodes(map(buffer_of, episodes))
+            storage.update_episodes(buffer_of(paid, source.FORMAT) for paid in episodes)
         return dataset_id
 
 
-def buffer_of(paid: Paid) -> EpisodeBuffer:
+def flat(infos: dict[str, Any]) -> dict[str, Any]:
+    """Rows of single numbers as lists: Minari writes them into Arrow as arrays, and cannot read those again."""
+    return {
+        key: flat(one)
+        if isinstance(one, dict)
+        else one.tolist()
+        if np.ndim(one) == 1 and hasattr(one, "tolist")
+        else one
+        for key, one in infos.items()
+    }
+
+
+def buffer_of(paid: Paid, data_format: str) -> EpisodeBuffer:
     """An episode as Minari writes it."""
     kept = paid.episode.kept
+    infos = {**kept["infos"], "paid": np.append(0.0, paid.episode.paid)}
     return EpisodeBuffer(
         seed=kept["seed"],
         observations=kept["observations"],
@@ -107,7 +120,7 @@ def buffer_of(paid: Paid) -> EpisodeBuffer:
         rewards=paid.r_hat,  # pyright: ignore[reportArgumentType] - an array does as well
         terminations=kept["terminations"],
         truncations=kept["truncations"],
-        infos={**kept["infos"], "paid": np.append(0.0, paid.episode.paid)},
+        infos=infos if data_format == "hdf5" else flat(infos),
     )
 
 
