@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -150,7 +151,6 @@ DAMAGES = {
     "a list": lambda directory: (directory / TEXT).write_text("[]"),
     "deep": lambda directory: (directory / TEXT).write_text("[" * 10_000),
     "no text": lambda directory: (directory / TEXT).write_bytes(b"\xff\xfe\x00"),
-    "no function text": lambda directory: (directory / FUNCTION).write_text("import os"),
 }
 
 
@@ -162,6 +162,21 @@ def test_what_is_damaged_is_a_line(damage, tmp_path, saved):
     with pytest.raises(LareError) as refused:
         CreditAssigner.load(tmp_path)
     assert "\n" not in str(refused.value)
+
+
+def test_a_function_is_verified_again(tmp_path, saved):
+    for path in saved.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / FUNCTION).write_text("import os")
+    with pytest.raises(LareError, match="the function does not fit task 'Chase': E-"):
+        CreditAssigner.load(tmp_path)
+
+
+def test_without_an_environment_it_is_verified_on_what_was_shown(tmp_path, phi):
+    credit, new = trained("lare-bayes", phi)
+    credit.config = replace(credit.config, task=credit.config.task.model_copy(update={"environment": "none"}))
+    credit.save(tmp_path)
+    np.testing.assert_array_equal(CreditAssigner.load(tmp_path).rewards(*new[:3]), credit.rewards(*new[:3]))
 
 
 @pytest.fixture(scope="module")

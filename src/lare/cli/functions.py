@@ -52,7 +52,7 @@ def new_task(
     left_out = f"; {drafted.left_out} sentences or rows that spoke of rewards were left out" if drafted.left_out else ""
     say(f"wrote {', '.join(map(str, (path, *(path.parent / name for name in drafted.teams))))}{left_out}")
     for key in drafted.missing:
-        say(f"  fill in: {key} ({environment} does not document it)")
+        say(f"  fill in: {key} ({'the log' if drafted.of_logs else 'the environment'} does not document it)")
     data = f" --data {environment}" if drafted.of_logs else ""
     say(f"read it, then: lare design {path}{data} --model NAME --out phi.py")
     none = "lare relabel without --function" if drafted.of_logs else "--method rrdu"

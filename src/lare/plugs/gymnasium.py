@@ -198,7 +198,8 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         found = np.zeros(self.num_envs)
         last = infos.get("final_info", infos) if self.mode == AutoresetMode.SAME_STEP else infos
         for place in np.flatnonzero(ended):
-            own = {name: values[place] for name, values in last.items() if last.get(f"_{name}", ended)[place]}
+            known = (name for name in last if not name.startswith("_"))  # `_name` says which environments have `name`
+            own = {name: last[name][place] for name in known if last.get(f"_{name}", ended)[place]}
             found[place] = score_in(own, self.score)
         return found
 
