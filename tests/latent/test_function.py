@@ -40,7 +40,7 @@ def function(sound) -> LatentFunction:
 @pytest.fixture
 def trusting(monkeypatch, sound):
     """Every source passes: for what is about files alone, and would start two workers for each."""
-    monkeypatch.setattr(module, "verify", lambda source, task, kind: Verdict(sound.checks, sound.size))
+    monkeypatch.setattr(module, "verify", lambda source, task, kind, steps: Verdict(sound.checks, sound.size))
 
 
 def test_verified(sound):
