@@ -338,8 +338,8 @@ class CreditAssigner:
         self.unseen = 0
 
     def catch_up(self) -> None:
-        """Everything that follows from what was met: features, and the new returns where there are enough of them."""
-        self.look()
+        """What follows from the episodes that have ended, where there are enough new ones."""
+        self.observe_returned()
         if len(self.pending) >= max(GROWTH * self.told, 1):
             self.learn()
 
@@ -394,6 +394,8 @@ class CreditAssigner:
             self.catch_up()
             if not self.config.method.descends or not self.store.episodes:
                 return
+            if self.owed >= CHUNK:
+                self.look()
             while self.owed >= CHUNK:
                 self.owed -= CHUNK
                 self.descend(CHUNK)
@@ -431,6 +433,8 @@ class CreditAssigner:
             flat = steps.ravel()
             known = flat >= 0
             rows = self.store.rows(flat[known])
+            if len(rows) and flat.max() >= self.store.steps - self.unseen:  # one of them waits for its features
+                self.look()
             found = np.zeros((len(flat), *self.config.axis), np.float32)
             alive = None if self.store.alive is None else self.store.alive[rows]
             found[known] = self.paid(self.store.features[rows], self.store.lengths(rows), alive, rows)
@@ -474,11 +478,13 @@ class CreditAssigner:
                     share = np.asarray(within_range(self.scale, jnp.asarray(self.store.mean_reward[rows])))
                     share = np.where(self.store.length[rows] > 0, share, 0.5)
                     found = np.broadcast_to(share.reshape(-1, *[1] * len(self.config.axis)), shape)
+                case _ if not self.fitted:
+                    return np.zeros(shape, np.float32)
                 case _:
                     size = padding(len(features))
                     long = np.pad(length, (0, size - len(length)), constant_values=1)
-                    name = self.config.method.name
-                    found = learning.rewards(self.state, padded(features, size), long, name, self.config.settings, True)
+                    name, settings = self.config.method.name, self.config.settings
+                    found = learning.rewards(self.paying, padded(features, size), long, name, settings)
                     found = learning.divided(found, self.scale) if self.config.scale_rewards else found
                     found = np.asarray(found)[: len(features)]
         found = np.array(found, np.float32)
@@ -487,6 +493,21 @@ class CreditAssigner:
             mean = (found * there).sum(axis=-1, keepdims=True) / np.maximum(there.sum(axis=-1, keepdims=True), 1)
             found = np.repeat(mean, self.config.agents, axis=-1)
         return np.where(there, found, 0).astype(np.float32)
+
+    @property
+    def fitted(self) -> bool:
+        """Whether the decoder has learned anything yet."""
+        if self.state is None or self.config.method.descends:
+            return self.fits > 0
+        return bool(returns.is_fitted(self.state))
+
+    @property
+    def paying(self) -> Decomposition:
+        """The decoder, with what it needs to pay: a call with all that it has learned from would take twice as long."""
+        assert self.state is not None
+        optimistic = decomposition.optimistic(self.config.method, self.config.settings)
+        light = self.state._replace(optimizer=(), rivals=None)
+        return light if optimistic else light._replace(closed=None)
 
     def metrics(self) -> dict[str, float]:
         """How it goes, without a true reward.

@@ -87,19 +87,18 @@ def descend(
     return state, jnp.mean(losses)
 
 
-@partial(jax.jit, static_argnames=("method", "settings", "as_paid"))
+@partial(jax.jit, static_argnames=("method", "settings"))
 def rewards(
     state: Decomposition,
     features: Float[Array, "rows *agents features"],
     length: Int[Array, " rows"],
     method: str,
     settings: CreditSettings,
-    as_paid: bool,
 ) -> Float[Array, "rows *agents"]:
-    """r_hat by the decoder as it stands, 0 as long as it is fitted to nothing; with optimism, where that is set and asked for."""
-    optimistic = as_paid and decomposition.optimistic(METHODS[method], settings)
+    """r_hat by the decoder as it stands; with optimism, where that is set."""
+    optimistic = decomposition.optimistic(METHODS[method], settings)
     found = decomposition.optimistic_rewards if optimistic else decomposition.proxy_rewards
-    return jnp.where(returns.is_fitted(state), found(state, features, settings, length), 0)
+    return found(state, features, settings, length)
 
 
 @jax.jit
