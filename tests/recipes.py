@@ -127,13 +127,10 @@ COMPILED = {}
 
 def jitted(function, config):
     """A function for one configuration, compiled once."""
-    key = function, id(config)
+    key = function, repr(config)  # the same for one that is made again
     if key not in COMPILED:
-        COMPILED[key] = (
-            config,
-            jax.jit(partial(function, config=config)),
-        )  # which keeps the configuration, and so its number
-    return COMPILED[key][1]
+        COMPILED[key] = jax.jit(partial(function, config=config))
+    return COMPILED[key]
 
 
 def told(learner, config):

@@ -56,10 +56,13 @@ def test_episodes_of_all_environments_are_drawn_alike(held):
 
 
 def test_drawn_episodes_are_whole_and_finished(held):
-    drawn = sampling.sample_episodes(held, jax.random.key(0), (50,))
-    for env, first, length, mean in zip(*drawn.first, drawn.length, drawn.mean_reward, strict=True):
-        index = replay.Index(jnp.full(length, env), first + jnp.arange(length))
-        steps = replay.read(held, index)
+    drawn = jax.tree.map(np.asarray, sampling.sample_episodes(held, jax.random.key(0), (50,)))
+    place, longest = np.arange(12), max(LENGTHS)
+    assert drawn.length.max() == longest == len(place)
+    env, number = np.broadcast_arrays(drawn.first.env[:, None], drawn.first.number[:, None] + place)
+    read = jax.tree.map(np.asarray, jax.jit(replay.read)(held, replay.Index(jnp.asarray(env), jnp.asarray(number))))
+    for row, (length, mean) in enumerate(zip(drawn.length, drawn.mean_reward, strict=True)):
+        steps = jax.tree.map(lambda leaf, row=row, length=length: leaf[row, :length], read)
         assert steps.finished.all()
         assert not steps.episodic_reward[:-1].any()
         assert float(mean[0]) == pytest.approx(float(steps.before["reward"].mean()), rel=1e-4)
@@ -99,11 +102,17 @@ def one(draw):
     return jax.tree.map(lambda leaf: np.asarray(leaf[0]), draw)
 
 
+@jax.jit
+def packed(held, key):
+    """An update on about 24 steps, of episodes of 12 at most."""
+    return sampling.sample_packed(held, key, 1, 24, 12)
+
+
 @pytest.mark.parametrize("key", range(4))
 @pytest.mark.parametrize("envs", [1, 3])
 def test_packed_episodes_are_whole_and_masked_never_padded(key, envs):
     config = config_of("rd", env=ENV, environments=envs)
-    drawn = one(sampling.sample_packed(stored(config).replay, jax.random.key(key), 1, 24, 12))
+    drawn = one(packed(stored(config).replay, jax.random.key(key)))
     length, mask = drawn.episodes.length, drawn.episodes.mask
     # About 24 steps: mean length 8.2, so two episodes, if they fit.
     assert 1 <= mask.sum() <= 2

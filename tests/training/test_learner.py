@@ -27,6 +27,7 @@ from recipes import (
     config_of,
     every_step,
     factors_for,
+    jitted,
     paid_by,
     steps_of,
     stored,
@@ -47,7 +48,7 @@ def fitted(learner, config, key=0):
     """One update of the decoders on what is drawn by a key, and what it measured."""
     draw = common.sample_credit(learner.replay, jax.random.key(key), 1, config)
     draw = jax.tree.map(lambda leaf: leaf[0], draw)
-    return jax.jit(partial(common.fit, config=config))(learner.credit, learner.replay, draw, jax.random.key(1))
+    return jitted(common.fit, config)(learner.credit, learner.replay, draw, jax.random.key(1))
 
 
 # A single agent.

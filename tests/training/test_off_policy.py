@@ -75,13 +75,13 @@ def test_seeds_in_lockstep_are_seeds_alone():
     config = config_of("lare-rrdu")
     functions = compiled(config)
     keys = jax.vmap(jax.random.key)(jnp.arange(3))
-    start, steps = new_learners(keys, config), steps_of()
+    start, steps = jax.jit(partial(new_learners, config=config))(keys), steps_of()
     many, factors = (
         jax.tree.map(lambda leaf: np.stack([leaf] * 3), part) for part in (steps, factors_for(config, steps))
     )
-    alone = jax.tree.map(lambda leaf: leaf[1], start)
+    alone = jax.tree.map(lambda leaf: np.asarray(leaf)[1], start)
     together, _ = functions.improve(functions.learn_returns(functions.store(start, many, factors)), many, keys, 0)
     alone = with_steps(alone, config, steps)
     alone, _ = jax.jit(partial(off_policy.improve_one, config=config))(alone, steps, keys[1], jnp.array(0))
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
-        np.testing.assert_allclose(a[1], b, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(np.asarray(a)[1], b, rtol=1e-4, atol=1e-5)

@@ -149,20 +149,20 @@ def test_seeds_in_lockstep_are_seeds_alone():
     """Also where they have had a different number of updates, and batches of different length."""
     config = qmix("lare-rrdu", rollout_steps=TOTAL)
     functions, keys = compiled(config), jax.vmap(jax.random.key)(jnp.arange(2))
-    start = new_learners(keys, config)
+    start = jax.jit(partial(new_learners, config=config))(keys)
     of_each = [steps_of(TOGETHER, 2, seed) for seed in (0, 1)]
     goes_on = of_each[1].after.truncated.copy()
     goes_on[np.cumsum(LENGTHS)[0] - 1, 0] = goes_on[TOTAL - 1] = False
     of_each[1] = of_each[1]._replace(after=of_each[1].after._replace(truncated=goes_on))
     factors = [factors_for(config, steps) for steps in of_each]
     both, all_factors = (jax.tree.map(lambda *leaves: np.stack(leaves), *part) for part in (of_each, factors))
-    alone = [jax.tree.map(lambda leaf, seed=seed: leaf[seed], start) for seed in (0, 1)]
+    alone = [jax.tree.map(lambda leaf, seed=seed: np.asarray(leaf)[seed], start) for seed in (0, 1)]
     started = functions.learn_returns(functions.store(start, both, all_factors))
     together, measured = functions.improve(started, both, keys, 0)
     assert measured["algorithm/updates"].tolist() == [5, 3]
+    improve = jax.jit(partial(sequences.improve, config=config))
     for seed in (0, 1):
         learner = one_seed(with_steps(alone[seed], config, of_each[seed], factors[seed]))
-        improve = jax.jit(partial(sequences.improve, config=config))
         found, _ = improve(learner, one_seed(of_each[seed]), keys[seed][None], jnp.array(0))
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(found), strict=True):
-            np.testing.assert_allclose(a[seed], b[0], rtol=1e-3, atol=1e-5)
+            np.testing.assert_allclose(np.asarray(a)[seed], np.asarray(b)[0], rtol=1e-3, atol=1e-5)
