@@ -1,4 +1,4 @@
-"""Every method with an algorithm of each kind: they train and report, or are refused in one line."""
+"""Every method, and every kind of method with an algorithm of each kind: they train and report, or are refused in one line."""
 
 import jax
 import numpy as np
@@ -13,9 +13,16 @@ from lare.tasks.spec import read_task
 from lare.training import session as sessions
 from toys import pick_spec, toy_spec
 
-GRID = [(kind, method) for kind in ("td3", "ippo", "qmix") for method in METHODS]
+ONE_OF_EACH_KIND = ("dense", "episodic", "ircr", "rrdu", "diaster", "lare-rd", "lare-bayes", "llm-reward")
+"""Of each reward, of both ways to fit, of what is drawn and what is whole, of raw features and factors; diaster, fitted apart."""
+
+FOR_MANY = tuple(method for method, row in METHODS.items() if row.for_many_only)
+
+GRID = [("td3", method) for method in METHODS]
+GRID += [(kind, method) for kind in ("ippo", "qmix") for method in (*ONE_OF_EACH_KIND, *FOR_MANY)]
 GRID += [("ppo", method) for method in ("dense", "rrdu", "diaster", "arel", "lare-rd", "lare-linear", "llm-reward")]
-"""ppo is ippo of one agent: one method of each kind, and diaster, which many agents do not have."""
+"""Every method with the algorithm that costs least of those that it is for. What it adds to others of its kind is in its decoder
+and its features, which know of no algorithm; what they are of many agents is in `test_learner.py`. ppo is ippo of one agent."""
 
 
 def task_of(kind):
