@@ -223,4 +223,4 @@ def test_a_few_short_episodes_are_waited_for():
     assert counts[:40] == list(range(1, 41))
     waits = np.diff(np.flatnonzero(np.diff(counts[100:])))
     assert waits.min() >= 2
-    assert counts[-1] >= 200 / (1 + episodes.GROWTH) - 1
+    assert counts[-1] >= 200 / (1 + returns.GROWTH) - 1

@@ -20,6 +20,8 @@ from lare.credit.prediction import Predictions, remember, squared_errors
 BETTER = 0.95
 """Times the squared error of a sum's predictions must be that of an average's, before it is taken for one. Where all episodes are
 equally long, both are the same but for rounding."""
+GROWTH = 0.02
+"""By which the episodes must have grown before a decoder is told of the new ones. Where they are short, a few are waited for."""
 ROUNDING = 1e-6
 """Of the squared returns: errors are not told apart that are smaller."""
 

@@ -40,8 +40,6 @@ SAMPLE = 256
 """Steps, about, that `phi` is tried on when it is read again."""
 PIECE = 8192
 """Rows of features that are looked at at a time."""
-GROWTH = 0.02
-"""By which the episodes must have grown before the decoder is told of the new ones, as in `training/episodes.py`."""
 CHUNK = 16
 """Updates of a decoder by a gradient in one call."""
 MOST_OWED = 256
@@ -340,7 +338,7 @@ class CreditAssigner:
     def catch_up(self) -> None:
         """What follows from the episodes that have ended, where there are enough new ones."""
         self.observe_returned()
-        if len(self.pending) >= max(GROWTH * self.told, 1):
+        if len(self.pending) >= max(returns.GROWTH * self.told, 1):
             self.learn()
 
     def learn(self) -> None:

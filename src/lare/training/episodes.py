@@ -27,8 +27,6 @@ ROWS = 8000
 """The most judged rows that are read at a time, unless a single episode has more."""
 PLACES = prediction.LAST
 """The most episodes that are read at a time."""
-GROWTH = 0.02
-"""By which the episodes must have grown. Where they are short, a few of them are waited for."""
 
 Credit = tuple[Decomposition, ...]
 
@@ -39,7 +37,7 @@ def learn_returns(
     """The decoders of each team, with a leading seed axis, when they have been told of what has finished; and how much that is."""
     before = jnp.sum(counted, axis=1)
     new = jnp.sum(buffer.episodes, axis=1) - before
-    due = new >= jnp.maximum(GROWTH * before, 1)
+    due = new >= jnp.maximum(returns.GROWTH * before, 1)
     learn = partial(learn_those_due, buffer=buffer, counted=counted, due=due, config=config)
     credit = jax.lax.cond(jnp.any(due), learn, lambda same: same, credit)
     return credit, jnp.where(due[:, None], buffer.episodes, counted).astype(counted.dtype)
