@@ -17,6 +17,8 @@ from lare.latent.function import LatentFunction, verified
 from lare.run.settings import Settings
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import FAMILIES, Family
+from lare.training import explain
+from lare.training import session as sessions
 from toys import PHI, REWARD, Chase, toy_spec
 
 # Most of a small run's time is compilation, and many tests compile the same. JAX may have been imported already, and
@@ -61,6 +63,29 @@ def forget_what_was_compiled():
     """What JAX keeps of every program would grow to gigabytes, and Python would look through it again and again."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compile_once():
+    """A run that is resumed, or trained or explained again, has the functions that were compiled for it the first time.
+
+    A few of them are kept, until a module's last test.
+    """
+    kept, ahead, explaining = {}, sessions.compile_ahead, explain.explaining
+
+    def once(key, make):
+        kept[key] = kept.pop(key) if key in kept else make()
+        if len(kept) > 8:
+            del kept[next(iter(kept))]
+        return kept[key]
+
+    def of_run(run, config, functions):
+        return once((repr(config), len(run.seeds)), lambda: ahead(run, config, functions))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sessions, "compile_ahead", of_run)
+        patch.setattr(explain, "explaining", lambda config: once(repr(config), lambda: explaining(config)))
+        yield
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """What the stored returns of a run say of its factors, whatever decoder it trains with."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -39,10 +40,13 @@ def explanations(learner: Learner, config: TrainConfig) -> list[Explanation]:
     if not known or int(jnp.sum(one.replay.episodes - one.replay.oldest)) < FEWEST:
         return []
     with jax.enable_x64(True):
-        found = jax.jit(partial(explain_stored, config=chosen))(
-            one.replay, tuple(credit.average for credit in one.credit)
-        )
+        found = explaining(chosen)(one.replay, tuple(credit.average for credit in one.credit))
         return [jax.tree.map(np.asarray, each) for each in found]
+
+
+def explaining(config: TrainConfig) -> Callable[..., list[Explanation]]:
+    """`explain_stored`, compiled."""
+    return jax.jit(partial(explain_stored, config=config))
 
 
 def explain_stored(buffer: Replay, average: tuple[Bool[Array, ""], ...], config: TrainConfig) -> list[Explanation]:
