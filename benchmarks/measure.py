@@ -49,6 +49,18 @@ TD3 = {
 }
 """Hyperparameters of the paper's TD3, as Stable-Baselines3 and SBX call them."""
 
+PPO = {
+    "learning_rate": lambda left: 3e-4 * left,
+    "clip_range": lambda left: 0.2 * left,
+    "n_steps": 2000,
+    "batch_size": 64,
+    "n_epochs": 10,
+    "gamma": 0.99,
+    "gae_lambda": 0.95,
+    "ent_coef": 0.01,
+}
+"""The same of ours of PPO; its networks of 256-256 with tanh are named in each library's own way."""
+
 
 def apart(rewards: Float[np.ndarray, "episodes steps *agents"]) -> Float[np.ndarray, "episodes steps *agents"]:
     """Rewards as deviations from their episode's mean."""

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 import tyro
 from evaluations import Evaluations, evaluate
+from measure import PPO as PPO_COMMON
 from measure import TD3 as TD3_SETTINGS
 from measure import interleave, provenance, show, summary, write
 from stable_baselines3 import PPO, TD3
@@ -32,17 +33,7 @@ import lare
 from lare.plugs.sb3 import CreditCallback, CreditReplayBuffer
 
 TASK, RESULTS = "HalfCheetah-v4", Path(__file__).parent / "results" / "plugs"
-PPO_SETTINGS: dict[str, Any] = {
-    "learning_rate": lambda left: 3e-4 * left,
-    "clip_range": lambda left: 0.2 * left,
-    "n_steps": 2000,
-    "batch_size": 64,
-    "n_epochs": 10,
-    "gamma": 0.99,
-    "gae_lambda": 0.95,
-    "ent_coef": 0.01,
-    "policy_kwargs": {"net_arch": [256, 256], "activation_fn": torch.nn.Tanh},
-}
+PPO_SETTINGS: dict[str, Any] = {**PPO_COMMON, "policy_kwargs": {"net_arch": [256, 256], "activation_fn": torch.nn.Tanh}}
 
 
 def assigner(method: str, task: lare.TaskSpec, seed: int, **more: Any) -> lare.CreditAssigner:

@@ -19,22 +19,13 @@ import numpy as np
 import sbx
 import tyro
 from evaluations import Evaluations, evaluate
+from measure import PPO as PPO_COMMON
 from measure import TD3, provenance
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 OFF_POLICY = {name: value for name, value in TD3.items() if name != "policy_delay"}
-PPO = {
-    "learning_rate": lambda left: 3e-4 * left,
-    "clip_range": lambda left: 0.2 * left,
-    "n_steps": 2000,
-    "batch_size": 64,
-    "n_epochs": 10,
-    "gamma": 0.99,
-    "gae_lambda": 0.95,
-    "ent_coef": 0.01,
-    "policy_kwargs": {"net_arch": [256, 256], "activation_fn": nn.tanh},
-}
+PPO = {**PPO_COMMON, "policy_kwargs": {"net_arch": [256, 256], "activation_fn": nn.tanh}}
 
 
 def model_of(algorithm: str, environment: gymnasium.Env, warmup: int, seed: int) -> Any:

@@ -176,50 +176,35 @@ class CreditAssigner:
             LareError: shapes do not fit, a number is not finite, or an episode is longer than `capacity`.
         """
         with self.lock:
-            return self.take(before, action, after, reward, terminated, truncated, lanes, valid, alive)
-
-    def take(
-        self,
-        before: Any,
-        action: Any,
-        after: Any,
-        reward: Any,
-        terminated: Any,
-        truncated: Any,
-        lanes: Sequence[Hashable] | None,
-        valid: Any,
-        alive: Any,
-    ) -> Int[np.ndarray, " steps"]:
-        """`add`, by one thread at a time."""
-        before, action, after = self.config.rows(before, action, after)
-        count = len(before)
-        paid, there = self.config.team_reward(reward, alive, count)
-        ended = self.flags(terminated, "terminated", count) | self.flags(truncated, "truncated", count)
-        known = np.ones(count, bool) if valid is None else self.flags(valid, "valid", count)
-        lanes = range(count) if lanes is None else lanes
-        if len(lanes) != count:
-            raise LareError(f"lanes has {len(lanes)} entries, and there are {count} steps")
-        rows = np.flatnonzero(known)
-        # Copies, for an environment may write its next step into the same memory.
-        before, action, after, paid, ended = (part[rows] for part in (before, action, after, paid, ended))
-        for values, name in ((before, "before"), (action, "action"), (after, "after"), (paid, "reward")):
-            check_finite(values, rows, name)
-        found = np.full(count, -1)
-        if not len(rows):
+            before, action, after = self.config.rows(before, action, after)
+            count = len(before)
+            paid, there = self.config.team_reward(reward, alive, count)
+            ended = self.flags(terminated, "terminated", count) | self.flags(truncated, "truncated", count)
+            known = np.ones(count, bool) if valid is None else self.flags(valid, "valid", count)
+            lanes = range(count) if lanes is None else lanes
+            if len(lanes) != count:
+                raise LareError(f"lanes has {len(lanes)} entries, and there are {count} steps")
+            rows = np.flatnonzero(known)
+            # Copies, for an environment may write its next step into the same memory.
+            before, action, after, paid, ended = (part[rows] for part in (before, action, after, paid, ended))
+            for values, name in ((before, "before"), (action, "action"), (after, "after"), (paid, "reward")):
+                check_finite(values, rows, name)
+            found = np.full(count, -1)
+            if not len(rows):
+                return found
+            found[rows] = numbers = self.keep(before, action, after, None if there is None else there[rows])
+            for place, (number, row) in enumerate(zip(numbers.tolist(), rows.tolist(), strict=True)):
+                run = self.store.running_of(lanes[row], before[place])
+                run.steps.append(number)
+                run.paid += float(paid[place])
+                run.last = after[place]
+                if ended[place]:
+                    self.finish(self.store.end(lanes[row], run.paid))
+            if self.unseen >= WAITING:
+                self.look()
+            if self.untold >= PIECE:
+                self.learn()
             return found
-        found[rows] = numbers = self.keep(before, action, after, None if there is None else there[rows])
-        for place, (number, row) in enumerate(zip(numbers.tolist(), rows.tolist(), strict=True)):
-            run = self.store.running_of(lanes[row], before[place])
-            run.steps.append(number)
-            run.paid += float(paid[place])
-            run.last = after[place]
-            if ended[place]:
-                self.finish(self.store.end(lanes[row], run.paid))
-        if self.unseen >= WAITING:
-            self.look()
-        if self.untold >= PIECE:
-            self.learn()
-        return found
 
     def keep(
         self, before: np.ndarray, action: np.ndarray, after: np.ndarray, alive: np.ndarray | None
