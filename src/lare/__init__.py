@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from lare.deploy.export import export as export
     from lare.errors import LareError as LareError
     from lare.experiments.evaluation import evaluate_run as evaluate_run
     from lare.experiments.evaluation import policy_of as policy_of
@@ -36,6 +37,7 @@ HOMES = {
     "evaluate_run": "lare.experiments.evaluation",
     "policy_of": "lare.experiments.evaluation",
     "write_report": "lare.experiments.report",
+    "export": "lare.deploy.export",
     "design": "lare.latent.design",
     "LatentFunction": "lare.latent.function",
     "load_function": "lare.latent.function:load",

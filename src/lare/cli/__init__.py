@@ -14,7 +14,7 @@ from lare.cli.functions import new_task, prompt, verify
 from lare.cli.lists import algorithms, methods, tasks
 from lare.cli.logs import relabel
 from lare.cli.parse import parse
-from lare.cli.runs import cross_play, evaluate, report, train
+from lare.cli.runs import cross_play, evaluate, export, report, train
 from lare.cli.studies import compare, reproduce, sweep
 from lare.cli.terminal import say
 from lare.errors import LareError
@@ -37,6 +37,7 @@ COMMANDS = {
     "evaluate": evaluate,
     "sweep": sweep,
     "report": report,
+    "export": export,
     "compare": compare,
     "cross-play": cross_play,
     "reproduce": reproduce,

@@ -3,7 +3,7 @@
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from tyro.conf import Positional
@@ -12,7 +12,10 @@ from lare.cli.design import BUDGET, REQUESTS
 from lare.cli.terminal import RunDirectories, RunDirectory, progress, say, show
 from lare.errors import LareError
 from lare.llm.model import Model
-from lare.run.settings import Settings, set_in_vain
+from lare.run.settings import ResolvedSettings, Settings, set_in_vain
+
+if TYPE_CHECKING:
+    from lare.training.progress import Listener
 
 DEFAULTS = Settings()
 
@@ -26,6 +29,8 @@ def train(
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     tensorboard: bool = False,
+    wandb: Annotated[str | None, tyro.conf.arg(metavar="PROJECT")] = None,
+    mlflow: Annotated[str | None, tyro.conf.arg(metavar="EXPERIMENT")] = None,
 ) -> None:
     """Train on a task's episodic rewards. Ctrl-C saves and leaves; --resume goes on.
 
@@ -39,6 +44,8 @@ def train(
         out: the run directory, which must not exist; runs/TASK-METHOD-ALGORITHM-sSEED unless given.
         resume: a run directory to go on with, from its last checkpoint and with its own settings.
         tensorboard: write TensorBoard events into the run directory too (needs the extra lare-rl[tensorboard]).
+        wandb: send the metrics of each seed to a project of Weights & Biases too (needs the extra lare-rl[wandb]).
+        mlflow: send the metrics of each seed to an experiment of MLflow too (needs the extra lare-rl[mlflow]).
     """
     import lare
     from lare.latent.function import CHANGED, load, per_role
@@ -50,7 +57,8 @@ def train(
         if (task, function, out, settings) != (None, (), None, DEFAULTS):
             raise LareError("--resume goes on with the run's own settings: give it no task and no other settings")
         asked = model_of(model, base_url, open_run(resume).config.task.name)
-        run = lare.resume(resume, model=asked, tensorboard=tensorboard)
+        listeners = listeners_of(wandb, mlflow, open_run(resume).config.settings)
+        run = lare.resume(resume, model=asked, tensorboard=tensorboard, listeners=listeners)
     elif task is None:
         raise LareError("say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR")
     else:
@@ -67,8 +75,30 @@ def train(
                     f"the function by {one.model.removesuffix(CHANGED)} is not the one that was saved: its hash is another"
                 )
         asked = model_of(model, base_url, spec.name)
-        run = lare.train(spec, settings, function=functions, model=asked, out=out, tensorboard=tensorboard)
+        run = lare.train(
+            spec,
+            settings,
+            function=functions,
+            model=asked,
+            out=out,
+            tensorboard=tensorboard,
+            listeners=listeners_of(wandb, mlflow, resolved),
+        )
     say(f"finished {run.directory}; to see it: lare report {run.directory}")
+
+
+def listeners_of(wandb: str | None, mlflow: str | None, settings: ResolvedSettings) -> "list[Listener]":
+    """The terminal, and the tracking services that are asked for."""
+    from lare.training.progress import Terminal
+    from lare.training.trackers import MLflow, WeightsAndBiases
+
+    told: list[Listener] = [Terminal()]
+    kept = settings.model_dump(mode="json")
+    if wandb is not None:
+        told.append(WeightsAndBiases(project=wandb, config=kept))
+    if mlflow is not None:
+        told.append(MLflow(mlflow, parameters=kept))
+    return told
 
 
 def model_of(model: str | None, base_url: str | None, task: str) -> Model | None:
@@ -130,6 +160,27 @@ def report(runs: RunDirectories, out: Path | None = None) -> None:
     from lare.experiments.report import write_report
 
     say(f"wrote {write_report(list(runs), out)}")
+
+
+def export(run: RunDirectory, out: Annotated[Path, tyro.conf.arg(metavar="DIR")], seed: int | None = None) -> None:
+    """Write policy and rewards for programs that have neither LaRe nor JAX.
+
+    Both are written as NumPy arrays with a loader and, with the extra lare-rl[onnx], as ONNX.
+
+    Args:
+        run: a run directory.
+        out: the directory to write, which must not exist.
+        seed: whose policy and decoder; the first seed's unless given.
+    """
+    import lare
+    from lare.run.directory import open_run
+
+    found = lare.export(open_run(run), out, seed)
+    say(f"wrote {', '.join(found.functions)} to {found.directory}; exported.py there says how to call them")
+    if found.left_out:
+        progress(f"there is no reward function: {found.left_out}")
+    if not found.onnx:
+        progress("without the package onnx, no .onnx files were written: pip install 'lare-rl[onnx]'")
 
 
 def cross_play(

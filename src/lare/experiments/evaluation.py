@@ -34,9 +34,7 @@ def policy_of(run: Run, seed: int | None = None) -> Callable[[np.ndarray], Any]:
     Raises:
         LareError: it is a run of many agents, or has no such seed, or no checkpoint.
     """
-    if seed is not None and seed not in run.seeds:
-        raise LareError(f"{run.directory} has no seed {seed}: there are {', '.join(map(str, run.seeds))}")
-    act = acting(run, 0 if seed is None else run.seeds.index(seed))
+    act = acting(run, run.place_of(seed))
     if not env_spec(run.config.task).discrete:
         return act
     space = choices(run)

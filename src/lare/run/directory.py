@@ -124,6 +124,14 @@ class Run:
         """Which observation the factors judge a step by."""
         return self.config.settings.judged_by(self.config.task)
 
+    def place_of(self, seed: int | None) -> int:
+        """The place of a seed among those of the run; of None, the first. Raises `LareError` where there is no such seed."""
+        if seed is None:
+            return 0
+        if seed not in self.seeds:
+            raise LareError(f"{self.directory} has no seed {seed}: there are {', '.join(map(str, self.seeds))}")
+        return self.seeds.index(seed)
+
     def has_checkpoint(self) -> bool:
         """Whether it came as far as its first checkpoint."""
         return (self.checkpoint / STATE).exists()

@@ -1,0 +1,111 @@
+"""`lare export`: what a run has learned, for programs that have neither LaRe nor JAX.
+
+DIRECTORY/
+  export.json              what is there: task, seed, step; inputs, outputs and operations of each function
+  policy.npz, .onnx        observation -> action
+  reward.npz, .onnx        factors, steps -> r_hat; where teams learn, reward_TEAM
+  latent_function.py       phi, where the method has one
+  exported.py              the ten lines of NumPy that run the .npz files
+"""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from lare.deploy import exported, onnx
+from lare.deploy.graph import BATCH, Graph
+from lare.deploy.policy import policy
+from lare.deploy.reward import reward, unexported
+from lare.errors import LareError
+from lare.experiments.evaluation import choices
+from lare.files import write_atomically
+from lare.run.directory import Run, function_file
+from lare.source import source
+from lare.training.compiled import compiled
+from lare.training.seeds import of_seed
+from lare.training.session import load_learner
+
+TEXT, LOADER = "export.json", "exported.py"
+
+
+class Exported(NamedTuple):
+    """What was written."""
+
+    directory: Path
+    functions: tuple[str, ...]
+    """`policy`, and `reward` or one for each team."""
+    left_out: str | None
+    """Why there is no reward; None where there is one."""
+    onnx: bool
+    """Whether there are ONNX files: the package `onnx` is installed."""
+
+
+def export(run: Run, out: str | Path, seed: int | None = None) -> Exported:
+    """Write the policy and the proxy rewards of a seed (the first, unless given) to a directory that must not exist.
+
+    Policies are deterministic. Rewards are those of the last checkpoint's decoder, in the unit of the true rewards.
+
+    Raises:
+        LareError: there is no such seed, no checkpoint, or the directory exists or cannot be written.
+    """
+    out = Path(out)
+    place = run.place_of(seed)
+    config, learner, host, _ = load_learner(run)
+    actor = jax.tree.map(lambda leaf: leaf[place], compiled(config).actor(learner, host["step"]))
+    start = choices(run).start if config.env.discrete and config.env.agents == 1 else 0
+    graphs = {"policy": policy(actor, config, start)}
+    credit = of_seed(learner, place).credit
+    left_out = unexported(config, credit[0].decoder if credit else None)
+    functions: dict[str, str] = {}
+    if left_out is None:
+        for team, role in enumerate(run.config.task.roles):
+            name = "reward" if role is run.config.task else f"reward_{role.team}"
+            graphs[name] = reward(credit[team] if credit else None, config, team)
+            if run.functions:
+                functions[name] = function_file(run.config.task, role)
+    try:
+        out.mkdir(parents=True)
+    except FileExistsError:
+        raise LareError(f"{out} exists, and is not overwritten; choose another --out") from None
+    except OSError as error:
+        raise LareError(f"{out} cannot be written: {error.strerror}") from error
+    text: dict[str, Any] = {
+        "lare": source(),
+        "task": run.config.task.name,
+        "method": run.config.settings.method,
+        "algorithm": run.config.settings.algorithm,
+        "seed": run.seeds[place],
+        "step": host["step"],
+    }
+    for name, graph in graphs.items():
+        text[name] = described(graph)
+        if name in functions:
+            judges = ["before", "after"] if run.judges == "both" else [run.judges]
+            text[name] |= {"phi": functions[name], "judges": judges}
+        write_arrays(out / f"{name}.npz", graph)
+        if onnx.is_installed():
+            onnx.write(graph, out / f"{name}.onnx", name)
+    for name, function in zip(functions.values(), run.functions, strict=False):
+        function.save(out / name)
+    whole = json.dumps(text, indent=1).encode()
+    write_atomically(out / TEXT, lambda file: file.write(whole))
+    loader = Path(exported.__file__).read_bytes()
+    write_atomically(out / LOADER, lambda file: file.write(loader))
+    return Exported(out, tuple(graphs), left_out, onnx.is_installed())
+
+
+def described(graph: Graph) -> dict[str, Any]:
+    """A graph as JSON, without its constants."""
+    sides = {
+        side: {name: {"shape": [BATCH, *shape], "type": graph.kinds[name]} for name, shape in shapes.items()}
+        for side, shapes in (("inputs", graph.inputs), ("outputs", graph.outputs))
+    }
+    return sides | {"operations": graph.operations}
+
+
+def write_arrays(path: Path, graph: Graph) -> None:
+    """The constants of a graph."""
+    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **graph.constants))

@@ -1,0 +1,84 @@
+"""The policy and the rewards of a run of LaRe, in NumPy alone. This file needs the files beside it, and nothing else of LaRe.
+
+    import exported
+    action = exported.load("policy")(observation=observation)["action"]
+    r_hat = exported.reward(before, action, after)
+
+`export.json` says the inputs and outputs of each function, with their shapes. The first axis of all of them is the batch.
+"""
+
+import json
+from functools import cache
+from pathlib import Path
+from runpy import run_path
+
+import numpy as np
+
+HERE = Path(__file__).parent
+OPERATIONS = {
+    "Add": np.add,
+    "Sub": np.subtract,
+    "Mul": np.multiply,
+    "Div": np.divide,
+    "Max": np.maximum,
+    "Min": np.minimum,
+    "Cos": np.cos,
+    "Sin": np.sin,
+    "Tanh": np.tanh,
+    "Where": np.where,
+    "MatMul": np.matmul,
+    "Identity": lambda x: x,
+    "Relu": lambda x: np.maximum(x, 0),
+    "Sigmoid": lambda x: 1 / (1 + np.exp(-x)),
+    "ArgMax": lambda x: np.argmax(x, axis=-1),
+    "Concat": lambda *parts: np.concatenate(parts, axis=-1),
+    "Gather": lambda table, number: table[number],
+}
+
+
+@cache
+def described(name):
+    """What `export.json` says of a function."""
+    return json.loads((HERE / "export.json").read_text(encoding="utf-8"))[name]
+
+
+@cache
+def load(name):
+    """The function of NAME.npz: arrays by name in, a dictionary of arrays out."""
+    graph = described(name)
+    with np.load(HERE / f"{name}.npz", allow_pickle=False) as file:
+        constants = dict(file)
+
+    def function(**inputs):
+        values = constants | {key: np.asarray(inputs[key], graph["inputs"][key]["type"]) for key in graph["inputs"]}
+        for operation, arguments, result in graph["operations"]:
+            values[result] = OPERATIONS[operation](*(values[argument] for argument in arguments))
+        return {key: values[key] for key in graph["outputs"]}
+
+    return function
+
+
+def reward(before, action, after, name="reward", **more):
+    """r_hat of steps, (batch, ...): phi and the decoder as one function.
+
+    Observations and actions are (batch, ..., n), in the environment's units; a choice is a row with a single 1. `more` holds
+    `length` or `alive`, where `export.json` lists them among the inputs.
+    """
+    given = {"before": before, "action": action, "after": after, **more}
+    if "phi" in described(name):
+        given["factors"] = factors(before, action, after, name)
+    return load(name)(**{key: given[key] for key in described(name)["inputs"]})["r_hat"]
+
+
+def factors(before, action, after, name="reward"):
+    """The factors phi(s, a) of steps, (batch, ..., factors).
+
+    A language model has written phi, and it has passed LaRe's checks. Here it runs in this process, without LaRe's sandbox.
+    """
+    phi = run_path(str(HERE / described(name)["phi"]))["evaluation_func"]
+    rows = {"before": np.asarray(before, np.float32), "after": np.asarray(after, np.float32)}
+    action, found = np.asarray(action, np.float32), []
+    for judged in described(name)["judges"]:
+        shown = rows[judged]
+        found += phi(shown.reshape(-1, shown.shape[-1]), action.reshape(-1, action.shape[-1]))
+    return np.concatenate(found, axis=1).reshape(*action.shape[:-1], -1).astype(np.float32)

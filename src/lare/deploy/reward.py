@@ -1,0 +1,154 @@
+"""The proxy rewards of a team as a graph: from factors and steps to r_hat, in the unit of the true rewards.
+
+    factors [batch *agents factors]                 phi's, where the method has one
+    before, after [batch *agents observation]       what a step set out from, and what it led to
+    action [batch *agents action]                   in the environment's units; a choice is a row with a single 1
+    length [batch *one]                             T of the step's episode, where the score is an average over its steps
+    ->  r_hat [batch *agents]
+
+Only those inputs are there that the method looks at. Where credit is judged from the global state, `before` and `after` are states,
+`action` holds the actions of all agents side by side, and there is one r_hat for the team.
+"""
+
+import numpy as np
+
+from lare.credit.basis import FREQUENCIES, HALF_PERIOD, Basis
+from lare.credit.closed_form import LinearDecoder
+from lare.credit.decoders import Bottleneck, StepDecoder
+from lare.credit.decomposition import Decomposition, normalised, unit
+from lare.credit.methods import Encoder, Reward
+from lare.deploy.graph import Graph
+from lare.deploy.policy import first
+from lare.normalise import CLIP, deviation
+from lare.training.config import TrainConfig
+
+STEP_DECODERS = (StepDecoder, Bottleneck, LinearDecoder)
+"""They pay a step by what is seen of it alone. Others look at whole episodes."""
+
+
+def unexported(config: TrainConfig, decoder: object | None) -> str | None:
+    """Why a method's rewards are no function of a step; None where they are one."""
+    method = config.method
+    if not method.has_proxy:
+        return f"{method.name} trains on what the environment pays"
+    if method.reward is Reward.UNIFORM:
+        return f"{method.name} pays by the return of a step's episode"
+    if method.reward is Reward.PROXY and not isinstance(decoder, STEP_DECODERS):
+        return f"{method.name} looks at whole episodes, not at steps"
+    return None
+
+
+def reward(credit: Decomposition | None, config: TrainConfig, place: int) -> Graph:
+    """The graph of a team's proxy rewards, without optimism.
+
+    Args:
+        credit: the decoder of one seed; None where phi itself is the reward.
+        config: of its run.
+        place: of the team.
+    """
+    graph, team = Graph(), config.env.teams[place]
+    rows = () if config.of_state or team.size == 1 else (team.size,)
+    seen = [graph.input("factors", (*rows, config.factors[place]))] if config.method.latent else []
+    seen += raw(graph, config, rows, place)
+    x = graph.apply("Concat", *seen) if len(seen) > 1 else seen[0]
+    if credit is None:
+        said = graph.apply("MatMul", x, np.ones(1, np.float32))
+    else:
+        said = decoded(graph, x, credit, config)
+        if bool(credit.average):
+            said = graph.apply("Div", said, graph.input("length", (1,) if rows else ()))
+    if config.method.shared and rows:
+        said = shared(graph, said, rows, config)
+    graph.output("r_hat", said, rows)
+    return graph
+
+
+def raw(graph: Graph, config: TrainConfig, rows: tuple[int, ...], place: int) -> list[str]:
+    """The raw part of what a decoder sees: as `training/learner.py`."""
+    encoder, env = config.method.encoder, config.env
+    if encoder in (None, Encoder.LATENT):
+        return []
+    shown = (*rows, config.shown)
+    after = graph.input("after", shown) if encoder is not Encoder.STATE_ACTION else ""
+    if encoder is Encoder.RAW and not config.raw_differences:
+        return [after]
+    agents = env.agents if config.of_state else 1
+    action = graph.input("action", (*rows, agents * env.action_size))
+    if not env.discrete:
+        bounds = (
+            (env.low, env.high)
+            if config.of_state
+            else (env.low[env.teams[place].agents], env.high[env.teams[place].agents])
+        )
+        low, high = (bound.reshape((*rows, -1)) for bound in bounds)
+        action = graph.clip(graph.standardised(action, (low + high) / 2, (high - low) / 2), -1, 1)
+    match encoder:
+        case Encoder.RAW:
+            before = graph.input("before", shown)
+            return [before, action, graph.apply("Sub", before, after)]
+        case Encoder.STATE_ACTION:
+            return [graph.input("before", shown), action]
+        case _:
+            return [after, action]
+
+
+def decoded(graph: Graph, x: str, credit: Decomposition, config: TrainConfig) -> str:
+    """What the decoder says of a step, in the unit of the true rewards."""
+    decoder = credit.decoder
+    if isinstance(decoder, LinearDecoder):
+        return additive(graph, x, decoder)
+    if normalised(credit, config.credit):
+        x = graph.standardised(x, credit.statistics.mean, deviation(credit.statistics), CLIP)
+    if isinstance(decoder, Bottleneck):
+        x = graph.network(x, first(decoder.encoder, decoder.encoder.layers[-1].weight.shape[1] // 2), "Relu")
+        decoder = decoder.decoder
+    assert isinstance(decoder, StepDecoder)
+    size = np.float32(unit(credit, config.credit)) * np.float32(decoder.gain)
+    # The last axis has a single number, and goes.
+    return graph.apply("MatMul", graph.network(x, decoder.network, "Relu"), np.full(1, size, np.float32))
+
+
+def additive(graph: Graph, x: str, decoder: LinearDecoder) -> str:
+    """r_hat = b + w . f(u), each group of features by itself; the groups are those of `credit/basis.py`."""
+    basis, weights = decoder.basis, by_group(decoder)
+    u = graph.standardised(x, decoder.mean, decoder.deviation)
+    within = graph.clip(u, -HALF_PERIOD, HALF_PERIOD)
+    factors, entries = slice(0, basis.factors), slice(basis.factors, basis.factors + basis.used_entries)
+    linear = np.zeros(basis.inputs, np.float32)
+    linear[factors], linear[entries] = weights.get("factors", 0), weights.get("entries", 0)
+    said = graph.apply("Add", graph.apply("MatMul", u, linear), np.asarray(decoder.bias, np.float32))
+    waves = np.zeros((FREQUENCIES, 2, basis.inputs), np.float32)
+    for name, columns in (("shapes of factors", factors), ("shapes of entries", entries)):
+        if name in weights:
+            of_group = weights[name].reshape(-1, 2, columns.stop - columns.start)
+            waves[: len(of_group), :, columns] = of_group
+    for k, (cosine, sine) in enumerate(waves, start=1):
+        angle = graph.apply("Mul", within, np.float32(k * np.pi / HALF_PERIOD))
+        for wave, weight in (("Cos", cosine), ("Sin", sine)):
+            if weight.any():
+                said = graph.apply("Add", said, graph.apply("MatMul", graph.apply(wave, angle), weight / k))
+    if "pairs of factors" in weights:
+        pairs = np.zeros((basis.inputs, basis.inputs), np.float32)
+        pairs[np.triu_indices(basis.factors, 1)] = weights["pairs of factors"]
+        products = graph.apply("Mul", within, graph.apply("MatMul", within, pairs.T))
+        said = graph.apply("Add", said, graph.apply("MatMul", products, np.ones(basis.inputs, np.float32)))
+    return said
+
+
+def by_group(decoder: LinearDecoder) -> dict[str, np.ndarray]:
+    """The weights of each group of features."""
+    basis: Basis = decoder.basis
+    ends = np.cumsum(list(basis.sizes.values()))
+    return dict(zip(basis.sizes, np.split(np.asarray(decoder.weight, np.float32), ends[:-1]), strict=True))
+
+
+def shared(graph: Graph, said: str, rows: tuple[int, ...], config: TrainConfig) -> str:
+    """The mean over the agents, or over those that are alive where agents may leave; 0 for the others."""
+    (agents,) = rows
+    ones = np.ones((agents, agents), np.float32)
+    if not config.env.agents_leave:
+        return graph.apply("MatMul", said, ones / agents)
+    there = graph.input("alive", rows)
+    count = graph.apply("Max", graph.apply("MatMul", there, ones), np.float32(1))
+    mean = graph.apply("Div", graph.apply("MatMul", graph.apply("Mul", said, there), ones), count)
+    return graph.apply("Mul", mean, there)

@@ -1,0 +1,242 @@
+"""What a run exports agrees with JAX to the precision of float32, as ONNX and as NumPy arrays."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnxruntime
+import pytest
+
+import lare
+from lare.credit.methods import METHODS
+from lare.data import replay
+from lare.deploy import onnx
+from lare.latent.function import verified
+from lare.tasks.env import in_units
+from lare.tasks.spec import read_task
+from lare.training import learner as common
+from lare.training.compiled import compiled, new_memory
+from lare.training.learner import Paid
+from lare.training.seeds import of_seed
+from lare.training.session import load_learner
+from toys import pick_spec, toy_spec
+
+CASES = [
+    ("td3", "lare-bayes"),
+    ("ddpg", "rrdu"),
+    ("sac", "vib-rrdu"),
+    ("td3", "lare-signs"),
+    ("td3", "diaster"),
+    ("sac", "dense"),
+    ("ppo", "lare-linear"),
+    ("ppo", "llm-reward"),
+    ("ppo", "rrdu-next"),
+    ("ippo", "lare-bayes"),
+    ("ippo", "lare-rd-shared"),
+    ("ippo-teams", "lare-rd"),
+    ("ippo-state", "rrdu-next"),
+    ("qmix", "bayes"),
+    ("vdn", "ircr"),
+]
+"""Every kind of policy, and every kind of decoder and of what it is given."""
+
+LEFT_OUT = {
+    "dense": "dense trains on what the environment pays",
+    "ircr": "ircr pays by the return of a step's episode",
+    "diaster": "diaster looks at whole episodes, not at steps",
+}
+"""Why there is no reward."""
+
+
+def task_of(kind, method, echo):
+    match kind:
+        case "ppo":
+            return pick_spec(judges="after" if method == "llm-reward" else "both")
+        case "ippo" | "qmix" | "vdn":
+            return echo
+        case "ippo-state":
+            return echo.model_copy(update={"judged_from": "state", "observation_size": 9, "action_size": 9})
+        case "ippo-teams":
+            return read_task("CompetitivePP-6")
+        case _:
+            return toy_spec()
+
+
+def trained(kind, method, small, small_many, echo, out):
+    """A short run, of two seeds."""
+    row, task = METHODS[method], task_of(kind, method, echo)
+    source = "def evaluation_func(o, a):\n    return [o[:, 0:1] * np.sum(a, axis=1, keepdims=True)"
+    source = f"import numpy as np\n\n{source}{'' if row.kind == 'reward' else ', o[:, 1:2]'}]\n"
+    function = None
+    if row.latent:
+        made = [verified(source, role, row.kind) for role in task.roles]
+        function = made if len(made) > 1 else made[0]
+    one = kind in ("td3", "ddpg", "sac", "ppo")
+    algorithm = kind.partition("-")[0]
+    settings = (small if one else small_many)(method=method, algorithm=algorithm, steps=120 if one else 200)
+    return lare.train(task, settings, function=function, out=out, listeners=[])
+
+
+def loaded(directory):
+    """The file `exported.py` of a directory, as its users import it."""
+    spec = importlib.util.spec_from_file_location("exported", directory / "exported.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def same(exported, name, inputs, wanted):
+    """Both forms give what is wanted."""
+    described = json.loads((exported.HERE / "export.json").read_text())[name]
+    given = {key: np.asarray(inputs[key], one["type"]) for key, one in described["inputs"].items()}
+    for key, one in described["inputs"].items():
+        assert given[key].shape == (len(given[key]), *one["shape"][1:])
+    of_numpy = exported.load(name)(**given)
+    session = onnxruntime.InferenceSession(exported.HERE / f"{name}.onnx", providers=["CPUExecutionProvider"])
+    of_onnx = dict(zip(described["outputs"], session.run(None, given), strict=True))
+    for key, one in described["outputs"].items():
+        for found in (of_numpy[key], of_onnx[key]):
+            assert found.shape == (len(found), *one["shape"][1:])
+            assert found.dtype == one["type"]
+            np.testing.assert_allclose(found, wanted[key], rtol=2e-5, atol=2e-5)
+
+
+@pytest.mark.parametrize(("kind", "method"), CASES)
+def test_what_is_exported_agrees_with_jax(kind, method, small, small_many, echo, tmp_path):
+    run = trained(kind, method, small, small_many, echo, tmp_path / "run")
+    found = lare.export(run, tmp_path / "out", seed=1)
+    exported = loaded(tmp_path / "out")
+    config, learner, host, _ = load_learner(run)
+    one = of_seed(learner, 1)
+    check_policy(exported, config, jax.tree.map(lambda leaf: leaf[1:], compiled(config).actor(learner, host["step"])))
+    rewards = [name for name in found.functions if name != "policy"]
+    if found.left_out:
+        assert (found.left_out, rewards) == (LEFT_OUT[method], [])
+        return
+    steps = replay.read(one.replay, replay.newest(one.replay, 20))
+    steps = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), steps)
+    wanted = common.rewards(steps, Paid(one.credit, one.scale), config)
+    if config.scale_rewards:
+        scale = [np.full(team.size, common.magnitude(of)) for team, of in zip(config.env.teams, one.scale, strict=True)]
+        wanted = wanted * np.concatenate(scale)
+    for place, name in enumerate(rewards):
+        check_reward(exported, name, config, steps, np.asarray(wanted), place)
+
+
+def check_policy(exported, config, actor):
+    env, random = config.env, np.random.default_rng(0)
+    rows = (3, env.agents)
+    observation = random.normal(size=(*rows, env.observation_size)).astype(np.float32)
+    available = np.ones((*rows, env.action_size), bool)
+    if env.masks_actions:
+        available = random.uniform(size=available.shape) < 0.5
+        available[..., 0] = True
+    memory, wanted = new_memory(config, 1, 3), {}
+    inputs = {"observation": observation, "available": available}
+    if memory:
+        hidden = random.normal(size=memory.hidden.shape).astype(np.float32)
+        last = random.integers(env.action_size, size=rows)
+        last[0] = env.action_size  # nothing was done before
+        memory = memory._replace(
+            hidden=jnp.asarray(hidden),
+            last_action=jnp.asarray(np.eye(env.action_size + 1, env.action_size)[last])[None],
+        )
+        inputs |= {"hidden": hidden[0], "last_action": last}
+    new = jnp.zeros((1, 3), bool)
+    action, memory = compiled(config).act(actor, memory, observation[None], available[None], None, new)
+    if memory:
+        wanted["next_hidden"] = memory.hidden[0]
+    action = np.asarray(action)[0]
+    wanted["action"] = np.argmax(action, axis=-1) if env.discrete else in_units(action, env)
+    if env.agents == 1:
+        inputs = {name: rows[:, 0] for name, rows in inputs.items()}
+        wanted["action"] = wanted["action"][:, 0]
+    same(exported, "policy", inputs, wanted)
+
+
+def check_reward(exported, name, config, steps, wanted, place):
+    env, team = config.env, config.env.teams[place]
+    action = np.asarray(steps.before["action"]) if "action" in steps.before else None
+    inputs = {"length": np.asarray(steps.length, np.float32), "alive": np.asarray(common.alive(steps, config))}
+    if action is not None:
+        inputs["action"] = action if env.discrete else in_units(np.clip(action, -1, 1), env)
+    for side, columns in (("before", steps.before), ("after", steps.after)):
+        shown = columns.get("state" if config.of_state else "observation")
+        inputs |= {} if shown is None else {side: np.asarray(shown)}
+    if config.of_state:
+        inputs["action"] = inputs["action"].reshape(len(action), -1)
+        wanted = wanted[:, 0]
+    else:
+        inputs = {key: rows[:, team.agents] if rows.ndim > 1 else rows for key, rows in inputs.items()}
+        wanted = wanted[:, team.agents]
+        if "factors" in steps.before:
+            factors = steps.before["factors"][:, config.judged(place), : config.factors[place]]
+            inputs["factors"] = np.asarray(factors)
+        if team.size == 1:
+            inputs = {key: rows[:, 0] if rows.ndim > 1 else rows for key, rows in inputs.items()}
+            wanted = wanted[:, 0]
+        else:
+            inputs["length"] = inputs["length"][:, None]
+    if config.env.agents_leave and not config.of_state:  # the trainer pays those who have left nothing
+        given = {key: inputs[key] for key in exported.described(name)["inputs"]}
+        there = np.asarray(common.alive(steps, config))[:, team.agents]
+        wanted = np.where(there, wanted, exported.load(name)(**given)["r_hat"])
+    same(exported, name, inputs, {"r_hat": wanted})
+
+
+@pytest.fixture
+def run(small, tmp_path, phi):
+    return lare.train(
+        toy_spec(), small(method="lare-bayes", steps=120), function=phi, out=tmp_path / "run", listeners=[]
+    )
+
+
+WITHOUT_LARE = """
+import sys
+import numpy as np
+sys.modules |= {"lare": None, "jax": None}
+import exported
+steps = np.load("steps.npz")
+print(repr(exported.reward(**steps).tolist()))
+"""
+
+
+def test_phi_and_decoder_are_one_function_without_lare(run, tmp_path, phi):
+    lare.export(run, tmp_path / "out")
+    random = np.random.default_rng(0)
+    before, after = random.uniform(-1, 1, (2, 5, 2)).astype(np.float32)
+    action = random.uniform(-2, 2, (5, 1)).astype(np.float32)
+    np.savez(tmp_path / "out" / "steps.npz", before=before, action=action, after=after)
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_LARE], cwd=tmp_path / "out", capture_output=True, text=True, check=True
+    )
+    load = loaded(tmp_path / "out").load("reward")
+    wanted = load(factors=phi(before, action), after=after, action=action)["r_hat"]
+    np.testing.assert_allclose(json.loads(done.stdout), wanted, rtol=1e-5)
+    assert np.std(wanted) > 0
+
+
+def test_the_policy_is_that_of_policy_of(run, tmp_path):
+    lare.export(run, tmp_path / "out", seed=1)
+    observation = np.random.default_rng(0).uniform(-1, 1, (4, 2)).astype(np.float32)
+    act = lare.policy_of(run, seed=1)
+    found = loaded(tmp_path / "out").load("policy")(observation=observation)["action"]
+    np.testing.assert_allclose(found, [act(row) for row in observation], rtol=1e-5)
+
+
+def test_the_command_line(run, command, monkeypatch, tmp_path):
+    status, said, noted = command("export", run.directory, "--out", "first")
+    assert (status, noted) == (0, "")
+    assert said == "wrote policy, reward to first; exported.py there says how to call them\n"
+    monkeypatch.setattr(onnx, "is_installed", lambda: False)
+    status, _, noted = command("export", run.directory, "--out", "second")
+    assert noted == "without the package onnx, no .onnx files were written: pip install 'lare-rl[onnx]'\n"
+    assert not list((tmp_path / "second").glob("*.onnx"))
+    status, _, noted = command("export", run.directory, "--out", "second")
+    assert (status, noted) == (2, "lare: second exists, and is not overwritten; choose another --out\n")
+    status, _, noted = command("export", run.directory, "--out", "third", "--seed", "7")
+    assert (status, noted) == (2, f"lare: {run.directory} has no seed 7: there are 0, 1\n")
