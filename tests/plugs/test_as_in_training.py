@@ -67,13 +67,13 @@ CASES = [
 def test_the_same_steps_lead_to_the_same_credit(method, env, phi):
     learner, config, credit = both(method, env, phi if METHODS[method].latent else None)
     numbers = np.arange(credit.store.steps)
-    if credit.state is not None:
+    if credit.learner.state is not None:
         (own,) = learner.credit
-        same(credit.state.statistics, own.statistics)
-        same(credit.state.scale, own.scale)
-        same(credit.state.return_scale, own.return_scale)
-        assert int(credit.told) == int(learner.counted.sum())
-        assert bool(credit.state.average) == bool(own.average)
+        same(credit.learner.state.statistics, own.statistics)
+        same(credit.learner.state.scale, own.scale)
+        same(credit.learner.state.return_scale, own.return_scale)
+        assert int(credit.learner.told) == int(learner.counted.sum())
+        assert bool(credit.learner.state.average) == bool(own.average)
     if not METHODS[method].descends:  # whose weights are drawn
         want = np.asarray(common.rewards(every_step(learner), paid_by(learner), config))
         want = want if env.agents > 1 else want[..., 0]

@@ -10,7 +10,8 @@ import pytest
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import METHODS
 from lare.errors import LareError
-from lare.plugs import assigner as module
+from lare.plugs import assigner as assigners
+from lare.plugs import learner, payment
 from lare.plugs.assigner import CreditAssigner
 from shown import SMALL, TASK, Shown, assigner, episode, episodes, show
 from toys import pick_spec
@@ -171,7 +172,7 @@ def test_scores_may_come_late():
 @pytest.mark.parametrize(
     ("lane", "score", "message"),
     [
-        ("x", None, "no episode goes on in lane 'x'"),
+        ("x", None, "no episode goes on in lane 'x': it has ended, or is older than 1000 steps (capacity)"),
         (0, float("nan"), "score = nan of lane 0 is not finite"),
         (0, float("inf"), "score = inf of lane 0 is not finite"),
     ],
@@ -210,7 +211,8 @@ def test_an_episode_that_is_longer_than_all_that_is_kept_is_refused():
 def test_many_steps_at_once_are_looked_at_some_at_a_time(monkeypatch, phi):
     (long,) = episodes([700])
     alone = assigner("lare-linear", phi)
-    monkeypatch.setattr(module, "PIECE", 64)
+    for module in (assigners, learner, payment):
+        monkeypatch.setattr(module, "PIECE", 64)
     pieces = assigner("lare-linear", phi)
     for credit in (alone, pieces):
         lanes = np.arange(700) // 10
@@ -398,23 +400,23 @@ def test_updates_are_owed_for_steps_and_made_in_chunks():
     credit = assigner("rd", fits_per_step=2.0)
     show(credit, episodes([20])[0], end=False)
     credit.fit_owed()
-    assert credit.fits == 0
-    assert credit.owed == 40
+    assert credit.learner.fits == 0
+    assert credit.learner.owed == 40
     credit.end(0)
     credit.fit_owed()
-    assert credit.fits == 32
-    assert credit.owed == 8
+    assert credit.learner.fits == 32
+    assert credit.learner.owed == 8
     credit.fit_owed()
-    assert credit.fits == 32
+    assert credit.learner.fits == 32
     credit.fit(5)
-    assert credit.fits == 37
-    assert credit.owed == 0
+    assert credit.learner.fits == 37
+    assert credit.learner.owed == 0
 
 
 def test_no_more_is_owed_than_can_be_made_up_for():
     credit = assigner("rd", fits_per_step=100.0)
     show(credit, episodes([20])[0])
-    assert credit.owed == module.MOST_OWED
+    assert credit.learner.owed == learner.MOST_OWED
 
 
 @pytest.mark.parametrize("method", ["rd", "rd-linear", "ircr"])
@@ -422,7 +424,7 @@ def test_to_fit_nothing_is_no_fault(method):
     credit = assigner(method)
     credit.fit(3)
     credit.fit_owed()
-    assert credit.fits == 0
+    assert credit.learner.fits == 0
     assert credit.explanation() == []
 
 
@@ -567,5 +569,5 @@ def test_it_computes_on_the_host():
     for one in episodes([5] * 3):
         credit.add_episode(*one)
     credit.fit(4)
-    assert {device.platform for leaf in jax.tree.leaves(credit.state) for device in leaf.devices()} == {"cpu"}
+    assert {device.platform for leaf in jax.tree.leaves(credit.learner.state) for device in leaf.devices()} == {"cpu"}
     assert SMALL.hidden == (8,)

@@ -71,7 +71,7 @@ def test_what_is_no_episode_is_refused(changed, message):
 
 def test_an_episode_longer_than_what_is_kept_is_refused():
     credit = CreditAssigner("bayes", observation_space=2, action_space=1, capacity=4)
-    with pytest.raises(LareError, match=r"\Aan episode of 5 steps has ended, and its first ones are not stored"):
+    with pytest.raises(LareError, match=r"\A5 steps at once are more than the capacity of 4"):
         credit.add_episode(np.zeros((5, 2)), np.zeros((5, 1)), np.zeros((5, 2)), 1.0)
 
 
@@ -104,7 +104,7 @@ def test_what_is_not_to_be_forgotten_is_not():
             credit.fit_owed()
     for credit in (every, newest):
         credit.metrics()
-    known = [float(np.sum(credit.state.closed.summed.episodes)) for credit in (every, newest)]
+    known = [float(np.sum(credit.learner.state.closed.summed.episodes)) for credit in (every, newest)]
     assert known[0] == 400
     assert known[1] < 300
 

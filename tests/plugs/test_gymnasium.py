@@ -121,10 +121,10 @@ def test_what_is_paid_and_what_is_kept(mode):
 def test_a_network_is_fitted_as_steps_come_in():
     credit = assigner("rrdu")
     play(VectorCredit(vector()[0], credit), 40)
-    assert 0 < credit.fits <= credit.store.steps
+    assert 0 < credit.learner.fits <= credit.store.steps
     watched = assigner("rrdu")
     play(VectorCredit(vector()[0], watched, pay="environment"), 40)
-    assert watched.fits == 0
+    assert watched.learner.fits == 0
 
 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)

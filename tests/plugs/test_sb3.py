@@ -231,7 +231,7 @@ def test_nothing_but_returns_gets_through(algorithm):
         else:
             model = ppo(env)
             model.learn(192, callback=CreditCallback(credit, 5))
-        assert credit.fits > 0
+        assert credit.learner.fits > 0
         found.append(weights(model))
     for other in found[1:]:
         for name, values in other.items():
@@ -257,7 +257,7 @@ def test_updates_are_those_of_the_steps_whatever_the_algorithm_updates():
     env, _ = toys(2)
     credit = assigner("rrdu")
     td3(env, credit, gradient_steps=5).learn(200)
-    assert 150 < credit.fits <= 200
+    assert 150 < credit.learner.fits <= 200
 
 
 class Seen(BaseCallback):
@@ -447,7 +447,7 @@ def test_a_model_is_saved_without_episodes_and_a_buffer_with_them(tmp_path, phi)
     whole.learn(120, reset_num_timesteps=False)
     assert buffer.credit.metrics()["credit/episodes"] == 4 + 6
     assert buffer.credit.metrics()["credit/dropped"] == 1
-    assert buffer.credit.fits > credit.fits
+    assert buffer.credit.learner.fits > credit.learner.fits
     credit.close()
 
 

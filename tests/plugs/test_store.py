@@ -19,6 +19,13 @@ class Plain:
         self.running.setdefault(lane, []).append(self.steps)
         self.steps += 1
 
+    def forget(self):
+        """Lanes that have stood still for as many steps as are kept; how many they were."""
+        still = [lane for lane, steps in self.running.items() if steps[-1] < self.steps - self.capacity]
+        for lane in still:
+            del self.running[lane]
+        return len(still)
+
     def whole(self):
         oldest = self.steps - self.capacity
         return sorted((tuple(steps), score) for steps, score in self.ended if steps[0] >= oldest)
@@ -32,6 +39,8 @@ MOVES = st.lists(st.tuples(st.sampled_from(["add", "add", "add", "end", "drop"])
 def test_a_store_keeps_the_episodes_of_which_all_steps_are_there(moves, capacity):
     store, plain, dropped = Store(capacity, (1,)), Plain(capacity), 0
     for move, lane in moves:
+        if move == "add":
+            dropped += plain.forget()
         going = plain.running.get(lane)
         if move == "add":
             (number,) = store.add(1)
@@ -80,7 +89,8 @@ def test_a_step_that_sets_out_from_elsewhere_begins_an_episode():
 )
 def test_steps_that_are_not_there_are_refused(steps, message):
     store = Store(5, (1,))
-    store.add(8)
+    for _ in range(8):
+        store.add(1)
     with pytest.raises(LareError) as refused:
         store.rows(np.array(steps))
     assert str(refused.value) == message
@@ -102,3 +112,19 @@ def test_the_length_of_an_episode_that_goes_on_is_that_of_the_others():
         store.end(0, 1.0)
     store.add(1)
     assert store.lengths(np.arange(10)).tolist() == [3] * 3 + [6] * 6 + [4]
+
+
+def test_lanes_that_never_end_do_not_pile_up():
+    store = Store(10, (1,))
+    for lane in range(1000):
+        store.running_of(lane, np.zeros(1, np.float32)).steps.append(int(store.add(1)[0]))
+        assert len(store.running) <= 12
+    assert store.dropped >= 988
+
+
+def test_more_steps_at_once_than_are_kept_are_refused():
+    store = Store(10, (1,))
+    with pytest.raises(LareError) as refused:
+        store.add(11)
+    assert str(refused.value) == "11 steps at once are more than the capacity of 10: make capacity larger"
+    assert store.steps == 0

@@ -114,11 +114,11 @@ def test_updates_are_made_when_a_sample_is_drawn():
     credit = assigner("rrdu", capacity=500)
     buffer = buffer_of(credit)
     buffer.extend(GymWrapper(Logged()).rollout(40, break_when_any_done=False))
-    assert credit.fits == 0
+    assert credit.learner.fits == 0
     buffer.sample()
-    assert credit.fits == 32
+    assert credit.learner.fits == 32
     buffer.sample()
-    assert credit.fits == 32
+    assert credit.learner.fits == 32
 
 
 def test_other_transforms_go_with_it():

@@ -12,25 +12,20 @@ for anew whenever steps are sampled: rewards that were stored would be those of 
 
 import threading
 from collections.abc import Hashable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lare.credit import closed_form, decomposition, explanation, prediction, returns
-from lare.credit.decomposition import CreditSettings, Decomposition
-from lare.credit.methods import Encoder, Fit, Reward, find_method
-from lare.credit.words import entry_names, words
+from lare.credit.decomposition import CreditSettings
+from lare.credit.methods import Reward, find_method
 from lare.errors import LareError
 from lare.latent.function import LatentFunction
-from lare.normalise import new_scale, within_range
-from lare.plugs import draws, learning
 from lare.plugs.config import CreditConfig, Space, check, layouts
-from lare.plugs.store import Episode, Store
+from lare.plugs.learner import CHUNK, PIECE, Learner
+from lare.plugs.payment import payment
+from lare.plugs.store import Store
 from lare.run.usual import MANY_AGENTS
 from lare.tasks.spec import Judges, TaskSpec
 
@@ -38,12 +33,6 @@ WAITING = 256
 """Steps, at most, that wait for `phi` and for the running statistics: a call costs the same for one row as for hundreds."""
 SAMPLE = 256
 """Steps, about, that `phi` is tried on when it is read again."""
-PIECE = 8192
-"""Rows of features that are looked at at a time."""
-CHUNK = 16
-"""Updates of a decoder by a gradient in one call."""
-MOST_OWED = 256
-"""Updates that are made up for at once. Before the first episode has ended, steps owe nothing more than this."""
 
 
 class CreditAssigner:
@@ -110,36 +99,15 @@ class CreditAssigner:
             forget,
         )
         check(self.config)
-        self.state = self.new_state()
-        self.scale = new_scale()
         self.store = Store(capacity, (*self.config.axis, self.config.basis.inputs))
+        self.learner = Learner(self.config, self.store)
         self.waiting: list[tuple[np.ndarray, ...]] = []
         """Steps that have no features yet: number, before, action, after."""
-        self.pending: list[Episode] = []
-        """Episodes that the decoder has not been told of."""
-        self.returned: list[tuple[float, int]] = []
-        """R/T and T of episodes that the scales have not met."""
+        self.unseen = 0
+        """How many they are."""
         self.sample: list[tuple[np.ndarray, np.ndarray]] = []
         """The first observations and actions: a `phi` that is read from a file is tried on them again."""
-        self.unseen = self.untold = 0
-        """Steps that wait; steps of the episodes that are pending."""
-        self.told = self.fits = 0
-        """Episodes that it has been told of; updates by a gradient."""
-        self.owed = 0.0
-        """Updates that the steps so far still ask for."""
-        self.loss = float("nan")
         self.lock = threading.RLock()
-
-    def new_state(self) -> Decomposition | None:
-        """An untrained decoder; None for a method that has none."""
-        config = self.config
-        if config.method.reward is not Reward.PROXY:
-            return None
-        key, steps = jax.random.key(config.seed), config.max_steps or 1
-        with on_host():
-            return decomposition.init(
-                key, config.basis, config.method, config.settings, steps, config.agents, config.forms
-            )
 
     def add(
         self,
@@ -155,6 +123,8 @@ class CreditAssigner:
         alive: Any = None,
     ) -> Int[np.ndarray, " steps"]:
         """Show one step of each of some environments.
+
+        A lane that has shown no step while `capacity` others came is given up, as by `drop`.
 
         Args:
             before: the observations that the steps set out from: (n, ...), of many agents (n, agents, ...). Those that the
@@ -173,7 +143,7 @@ class CreditAssigner:
             A number for each step, for `rewards_at`; -1 where it is not valid.
 
         Raises:
-            LareError: shapes do not fit, a number is not finite, or an episode is longer than `capacity`.
+            LareError: shapes do not fit, a number is not finite, or the steps or an episode are more than `capacity`.
         """
         with self.lock:
             before, action, after = self.config.rows(before, action, after)
@@ -199,10 +169,10 @@ class CreditAssigner:
                 run.paid += float(paid[place])
                 run.last = after[place]
                 if ended[place]:
-                    self.finish(self.store.end(lanes[row], run.paid))
+                    self.learner.ended(self.store.end(lanes[row], run.paid))
             if self.unseen >= WAITING:
                 self.look()
-            if self.untold >= PIECE:
+            if self.learner.untold >= PIECE:
                 self.learn()
             return found
 
@@ -217,7 +187,7 @@ class CreditAssigner:
             self.store.alive[numbers % self.store.capacity] = True if alive is None else alive
         self.waiting.append((numbers, before, action, after))
         self.unseen += len(before)
-        self.owed = min(self.owed + self.config.fits_per_step * len(before), MOST_OWED)
+        self.learner.owe(len(before))
         return numbers
 
     def add_episode(
@@ -245,8 +215,8 @@ class CreditAssigner:
             for values, name in ((before, "before"), (action, "action"), (after, "after")):
                 check_finite(values, rows, name)
             numbers = self.keep(before, action, after, there)
-            self.finish(self.store.put_new(numbers, score))
-            if self.untold >= PIECE:
+            self.learner.ended(self.store.put_new(numbers, score))
+            if self.learner.untold >= PIECE:
                 self.learn()
             return numbers
 
@@ -261,35 +231,18 @@ class CreditAssigner:
         with self.lock:
             run = self.store.running.get(lane)
             if run is None:
-                raise LareError(f"no episode goes on in lane {lane!r}")
+                kept = self.store.capacity
+                raise LareError(
+                    f"no episode goes on in lane {lane!r}: it has ended, or is older than {kept} steps (capacity)"
+                )
             if score is not None and not np.isfinite(score):
                 raise LareError(f"score = {score} of lane {lane!r} is not finite")
-            self.finish(self.store.end(lane, run.paid if score is None else float(score)))
+            self.learner.ended(self.store.end(lane, run.paid if score is None else float(score)))
 
     def drop(self, lane: Hashable) -> None:
         """The episode of a lane will not end: it is never learned from. Its steps can still be paid."""
         with self.lock:
             self.store.drop(lane)
-
-    def finish(self, episode: Episode) -> None:
-        """An episode has ended."""
-        self.pending.append(episode)
-        self.untold += len(episode.steps)
-        self.returned.append((episode.score / len(episode.steps), len(episode.steps)))
-
-    def observe_returned(self) -> None:
-        """Add the episodes that have ended to the scales. Many at a time: a call costs the same for one as for hundreds."""
-        if not self.returned:
-            return
-        mean, length = np.array(self.returned).T
-        rows = padding(len(mean))
-        there = np.arange(rows) < len(mean)
-        mean, length = padded(mean.astype(np.float32), rows), padded(length.astype(np.int32), rows)
-        self.returned.clear()
-        with on_host():
-            if self.state is not None:
-                self.state = learning.observe_returns(self.state, mean, length, there)
-            self.scale = learning.observe_mean_rewards(self.scale, mean, there)
 
     def flags(self, values: Any, name: str, count: int) -> Bool[np.ndarray, " steps"]:
         """One for each step."""
@@ -299,8 +252,7 @@ class CreditAssigner:
         return flags
 
     def look(self) -> None:
-        """Give features to the steps that wait for them, and add them to the running statistics, and episodes to theirs."""
-        self.observe_returned()
+        """Give features to the steps that wait for them, and add these to the running statistics."""
         if not self.waiting:
             return
         number, *steps = (np.concatenate(part) for part in zip(*self.waiting, strict=True))
@@ -311,62 +263,27 @@ class CreditAssigner:
             part = slice(start, start + PIECE)
             found, places = self.config.features(*(each[part] for each in steps)), number[part] % self.store.capacity
             self.store.features[places] = found
-            if self.state is None:
-                continue
             alive = np.ones(found.shape[:-1], bool) if self.store.alive is None else self.store.alive[places]
-            rows = padding(len(found))
-            with on_host():
-                self.state = learning.observe_steps(self.state, padded(found, rows), padded(alive, rows))
+            self.learner.observe_steps(found, alive)
         self.waiting.clear()  # not before phi has answered
         self.unseen = 0
 
     def catch_up(self) -> None:
         """What follows from the episodes that have ended, where there are enough new ones."""
-        self.observe_returned()
-        if len(self.pending) >= max(returns.GROWTH * self.told, 1):
+        self.learner.observe_returned()
+        if self.learner.is_due:
             self.learn()
 
     def learn(self) -> None:
         """Tell the decoder of the episodes that have ended."""
         self.look()
-        new = [episode for episode in self.pending if episode.steps[0] >= self.store.steps - self.store.capacity]
-        self.pending.clear()
-        self.untold = 0
-        self.told += len(new)
-        if self.state is None or not new:
-            return
-        with on_host(), jax.enable_x64(True):
-            for piece in self.pieces(new):
-                self.state = learning.tell(self.state, piece, self.config.settings)
-            if self.state.closed is None:
-                return
-            whole = self.config.forget or self.store.steps <= self.store.capacity
-            if self.config.method.fit is not Fit.SIGNS and whole and learning.is_stale(self.state):
-                self.state = learning.begin_again(self.state)
-                for piece in self.pieces(list(self.store.episodes.values())):
-                    self.state = learning.add(self.state, piece)
-            if learning.is_due(self.state):
-                self.state = learning.fit_in_closed_form(self.state, self.config.method.name, self.config.forms)
-
-    def pieces(self, episodes: Sequence[Episode]) -> Any:
-        """Whole episodes, some at a time, in arrays of few shapes."""
-        total, longest = sum(len(one.steps) for one in episodes), max(len(one.steps) for one in episodes)
-        rows = padding(max(longest, min(total, PIECE // self.config.agents, prediction.LAST * longest)))
-        return draws.pieces(self.store, episodes, prediction.LAST, rows)
+        self.learner.learn()
 
     def fit(self, updates: int = 500) -> None:
         """Fit now: so many updates of a decoder that descends a gradient; once in closed form, however many are asked for."""
         with self.lock:
             self.learn()
-            if self.state is None or not self.store.episodes:
-                return
-            if not self.config.method.descends:
-                with on_host(), jax.enable_x64(True):
-                    self.state = learning.fit_in_closed_form(self.state, self.config.method.name, self.config.forms)
-                return
-            self.owed = 0.0
-            for start in range(0, updates, CHUNK):
-                self.descend(min(CHUNK, updates - start))
+            self.learner.fit(updates)
 
     def fit_owed(self) -> None:
         """Make the updates that the steps added since the last call are worth; nothing where they are still few.
@@ -375,32 +292,9 @@ class CreditAssigner:
         """
         with self.lock:
             self.catch_up()
-            if not self.config.method.descends or not self.store.episodes:
-                return
-            if self.owed >= CHUNK:
+            if self.learner.descends and self.learner.owed >= CHUNK:
                 self.look()
-            while self.owed >= CHUNK:
-                self.owed -= CHUNK
-                self.descend(CHUNK)
-
-    def descend(self, updates: int) -> None:
-        """Updates by a gradient, of batches that are drawn by their numbers."""
-        assert self.state is not None
-        assert self.config.method.fit is not None
-        random = np.random.default_rng([self.config.seed, self.fits])
-        longest = padding(max(len(episode.steps) for episode in self.store.episodes.values()))
-        batches = [
-            draws.batch(self.store, self.config.method.fit, self.config.settings, random, longest)
-            for _ in range(updates)
-        ]
-        together = jax.tree.map(lambda *parts: np.stack(parts), *batches)
-        with on_host():
-            keys = jax.random.split(jax.random.fold_in(jax.random.key(self.config.seed), self.fits), updates)
-            self.state, loss = learning.descend(
-                self.state, together, keys, self.config.method.name, self.config.settings
-            )
-        self.fits += updates
-        self.loss = float(loss)
+                self.learner.fit_owed()
 
     def rewards_at(self, steps: Any) -> Float[np.ndarray, "*shape"]:
         """r_hat of stored steps, by the newest decoder: an array of the shape of `steps`, of many agents with an axis more.
@@ -420,7 +314,8 @@ class CreditAssigner:
                 self.look()
             found = np.zeros((len(flat), *self.config.axis), np.float32)
             alive = None if self.store.alive is None else self.store.alive[rows]
-            found[known] = self.paid(self.store.features[rows], self.store.lengths(rows), alive, rows)
+            features, long = self.store.features[rows], self.store.lengths(rows)
+            found[known] = payment(self.learner, features, long, alive, rows)
             return found.reshape(*steps.shape, *self.config.axis)
 
     def rewards(self, before: Any, action: Any, after: Any, *, length: Any = None) -> Float[np.ndarray, "n *agents"]:
@@ -443,54 +338,7 @@ class CreditAssigner:
                 raise LareError(
                     f"length must be one number for each of {len(found)} steps, and its shape is {long.shape}"
                 )
-            return self.paid(found, long, None, None)
-
-    def paid(
-        self, features: np.ndarray, length: np.ndarray, alive: np.ndarray | None, rows: np.ndarray | None
-    ) -> Float[np.ndarray, "n *agents"]:
-        """What the method pays for steps with these features."""
-        shape = features.shape[:-1]
-        if not len(features):
-            return np.zeros(shape, np.float32)
-        with on_host():
-            match self.config.method.reward:
-                case Reward.DESIGNED:
-                    found = features[..., 0]
-                case Reward.UNIFORM:
-                    assert rows is not None
-                    share = np.asarray(within_range(self.scale, jnp.asarray(self.store.mean_reward[rows])))
-                    share = np.where(self.store.length[rows] > 0, share, 0.5)
-                    found = np.broadcast_to(share.reshape(-1, *[1] * len(self.config.axis)), shape)
-                case _ if not self.fitted:
-                    return np.zeros(shape, np.float32)
-                case _:
-                    size = padding(len(features))
-                    long = np.pad(length, (0, size - len(length)), constant_values=1)
-                    name, settings = self.config.method.name, self.config.settings
-                    found = learning.rewards(self.paying, padded(features, size), long, name, settings)
-                    found = learning.divided(found, self.scale) if self.config.scale_rewards else found
-                    found = np.asarray(found)[: len(features)]
-        found = np.array(found, np.float32)
-        there = np.ones(shape, bool) if alive is None else alive
-        if self.config.method.shared:
-            mean = (found * there).sum(axis=-1, keepdims=True) / np.maximum(there.sum(axis=-1, keepdims=True), 1)
-            found = np.repeat(mean, self.config.agents, axis=-1)
-        return np.where(there, found, 0).astype(np.float32)
-
-    @property
-    def fitted(self) -> bool:
-        """Whether the decoder has learned anything yet."""
-        if self.state is None or self.config.method.descends:
-            return self.fits > 0
-        return bool(returns.is_fitted(self.state))
-
-    @property
-    def paying(self) -> Decomposition:
-        """The decoder, with what it needs to pay: a call with all that it has learned from would take twice as long."""
-        assert self.state is not None
-        optimistic = decomposition.optimistic(self.config.method, self.config.settings)
-        light = self.state._replace(optimizer=(), rivals=None)
-        return light if optimistic else light._replace(closed=None)
+            return payment(self.learner, found, long)
 
     def metrics(self) -> dict[str, float]:
         """How it goes, without a true reward.
@@ -500,16 +348,12 @@ class CreditAssigner:
         """
         with self.lock:
             self.learn()
-            r2 = float("nan")
-            if self.state is not None:
-                with on_host():
-                    r2 = float(prediction.r2(self.state.predictions)[0])
             return {
-                "credit/return_r2": r2,
+                "credit/return_r2": self.learner.return_r2(),
                 "credit/episodes": float(self.store.ended),
                 "credit/dropped": float(self.store.dropped),
-                "credit/fits": float(self.fits),
-                "credit/loss": self.loss,
+                "credit/fits": float(self.learner.fits),
+                "credit/loss": self.learner.loss,
             }
 
     def explanation(self) -> list[str]:
@@ -519,32 +363,13 @@ class CreditAssigner:
         """
         with self.lock:
             self.learn()
-            basis = replace(self.config.basis, extended=True)
-            if self.state is None or not self.store.episodes or not basis.size:
-                return []
-            with on_host(), jax.enable_x64(True):
-                judge = self.state._replace(closed=closed_form.init(basis, 1))
-                judge = learning.begin_again(judge)
-                for piece in self.pieces(list(self.store.episodes.values())):
-                    judge = learning.add(judge, piece)
-                assert judge.closed is not None
-                sums = closed_form.whole(judge.closed.summed)
-                found = explanation.explain(sums, int(self.state.average), basis)
-                found = jax.tree.map(np.asarray, found)
-            names = [] if self.config.phi is None else self.config.phi.columns_by(self.config.judges)
-            return words(found, returns.form_found(self.state), names, self.entry_names(len(found.left)))
-
-    def entry_names(self, entries: int) -> list[str]:
-        """What the entries of [s', a] are called; nothing where the decoder sees other ones."""
-        if self.config.method.encoder not in (Encoder.NEXT, Encoder.LATENT_AND_NEXT):
-            return []
-        texts = ("", "") if self.config.task is None else (self.config.task.observation, self.config.task.action)
-        return entry_names(*texts, entries, self.config.action.size)
+            return self.learner.explanation()
 
     @property
     def form(self) -> str:
         """What the score is taken for: `sum` or `average`."""
-        return "average" if self.state is not None and bool(self.state.average) else "sum"
+        state = self.learner.state
+        return "average" if state is not None and bool(state.average) else "sum"
 
     def save(self, directory: str | Path, episodes: bool = True) -> None:
         """Write everything to a directory: settings, decoder, `phi` and, unless they are left out, steps and episodes.
@@ -587,21 +412,6 @@ class CreditAssigner:
         """End the worker of `phi`. It starts again when it is needed."""
         if self.config.phi is not None:
             self.config.phi.close()
-
-
-def on_host() -> Any:
-    """Decoders of steps are small, and a graphics card may be another library's."""
-    return jax.default_device("cpu")
-
-
-def padding(rows: int) -> int:
-    """So many rows or more: a power of two, so that few shapes are compiled."""
-    return 1 << max(0, rows - 1).bit_length()
-
-
-def padded(rows: np.ndarray, count: int) -> np.ndarray:
-    """With rows of zeros behind them."""
-    return np.pad(rows, ((0, count - len(rows)), *[(0, 0)] * (rows.ndim - 1)))
 
 
 def check_finite(values: np.ndarray, rows: np.ndarray, name: str) -> None:

@@ -50,14 +50,14 @@ def text_of(credit: CreditAssigner) -> dict[str, Any]:
         "scale_rewards": credit.config.scale_rewards,
         "forget": credit.config.forget,
         "phi": credit.config.phi is not None,
-        "told": credit.told,
-        "fits": credit.fits,
+        "told": credit.learner.told,
+        "fits": credit.learner.fits,
     }
 
 
 def leaves(credit: CreditAssigner) -> dict[str, Any]:
     """The decoder and the statistics, by their places."""
-    found, _ = jax.tree_util.tree_flatten_with_path((credit.state, credit.scale))
+    found, _ = jax.tree_util.tree_flatten_with_path((credit.learner.state, credit.learner.scale))
     return {f"learned{jax.tree_util.keystr(path)}": leaf for path, leaf in found}
 
 
@@ -130,14 +130,15 @@ def restore(
         **{name: text[name] for name in ("judges", "agents", "max_steps", "capacity", "seed")},
         **{name: text[name] for name in ("fits_per_step", "scale_rewards", "forget")},
     )
-    credit.told, credit.fits = text["told"], text["fits"]
+    credit.learner.told, credit.learner.fits = text["told"], text["fits"]
     if set(TRIED) <= set(arrays):
         credit.sample.append((arrays[TRIED[0]], arrays[TRIED[1]]))
     for name, leaf in leaves(credit).items():
         if arrays[name].shape != leaf.shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {leaf.shape}")
-    structure = jax.tree.structure((credit.state, credit.scale))
-    credit.state, credit.scale = jax.tree.unflatten(structure, [jnp.asarray(arrays[name]) for name in leaves(credit)])
+    learner, learned = credit.learner, [jnp.asarray(arrays[name]) for name in leaves(credit)]
+    structure = jax.tree.structure((learner.state, learner.scale))
+    learner.state, learner.scale = jax.tree.unflatten(structure, learned)
     store = credit.store
     store.ended, store.ended_steps, store.dropped = map(int, arrays["counts"])
     if "steps" in arrays:

@@ -6,6 +6,7 @@ they are of.
 """
 
 import heapq
+import sys
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -35,6 +36,11 @@ class Running:
     last: Float[np.ndarray, "*agents observation"] | None = None
     """What its last step led to."""
 
+    @property
+    def newest(self) -> int:
+        """The number of its last step; of one that has none, a number that is never reached."""
+        return self.steps[-1] if self.steps else sys.maxsize
+
 
 class Store:
     """Features of steps, and the episodes that they make up."""
@@ -60,12 +66,22 @@ class Store:
         self.oldest: list[tuple[int, int]] = []
         """A heap of the stored episodes: first step, and number."""
         self.running: dict[Hashable, Running] = {}
-        """By lane."""
+        """By lane; those that have stood still the longest first."""
         self.dropped = 0
         """Episodes that were given up."""
 
     def add(self, count: int) -> Int[np.ndarray, " count"]:
-        """Numbers for new steps. The oldest episodes go if their places are needed."""
+        """Numbers for new steps. The oldest episodes go if their places are needed, and lanes that have stood still for so long.
+
+        Raises:
+            LareError: they are more than can be stored.
+        """
+        if count > self.capacity:
+            raise LareError(
+                f"{count} steps at once are more than the capacity of {self.capacity}: make capacity larger"
+            )
+        while self.running and next(iter(self.running.values())).newest < self.steps - self.capacity:
+            self.drop(next(iter(self.running)))
         numbers = np.arange(self.steps, self.steps + count)
         self.steps += count
         while self.oldest and self.oldest[0][0] < self.steps - self.capacity:
@@ -111,9 +127,8 @@ class Store:
         run = self.running.get(lane)
         if run is not None and run.last is not None and not np.array_equal(run.last, before):
             self.drop(lane)
-            run = None
-        if run is None:
-            run = self.running[lane] = Running()
+        run = self.running.pop(lane, None) or Running()
+        self.running[lane] = run  # behind all others
         return run
 
     def drop(self, lane: Hashable) -> None:

@@ -3,10 +3,12 @@
 The order is that of `training/episodes.py`: returns are predicted, then added to sums, then fitted to.
 """
 
+from contextlib import AbstractContextManager
 from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from lare.credit import closed_form, decomposition, descent, returns
@@ -105,3 +107,18 @@ def rewards(
 def divided(r_hat: Float[Array, "*batch"], scale: Scale) -> Float[Array, "*batch"]:
     """In units of the running root mean square of R/T."""
     return r_hat / magnitude(scale)
+
+
+def on_host() -> AbstractContextManager:
+    """Decoders of steps are small, and a graphics card may be another library's."""
+    return jax.default_device("cpu")
+
+
+def padding(rows: int) -> int:
+    """So many rows or more: a power of two, so that few shapes are compiled."""
+    return 1 << max(0, rows - 1).bit_length()
+
+
+def padded(rows: np.ndarray, count: int) -> np.ndarray:
+    """With rows of zeros behind them."""
+    return np.pad(rows, ((0, count - len(rows)), *[(0, 0)] * (rows.ndim - 1)))

@@ -1,0 +1,204 @@
+"""The decoder of a `CreditAssigner`: what it is told of, when it is fitted, and what returns say of it."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lare.credit import closed_form, decomposition, explanation, prediction, returns
+from lare.credit.decomposition import Decomposition, Episodes
+from lare.credit.methods import Encoder, Fit, Reward
+from lare.credit.words import entry_names, words
+from lare.normalise import Scale, new_scale
+from lare.plugs import compiled, draws
+from lare.plugs.compiled import on_host, padded, padding
+from lare.plugs.config import CreditConfig
+from lare.plugs.store import Episode, Store
+
+PIECE = 8192
+"""Rows of features that are looked at at a time."""
+CHUNK = 16
+"""Updates of a decoder by a gradient in one call."""
+MOST_OWED = 256
+"""Updates that are made up for at once. Before the first episode has ended, steps owe nothing more than this."""
+
+
+class Learner:
+    """A decoder, and how far it has come with the episodes of a store."""
+
+    def __init__(self, config: CreditConfig, store: Store):
+        self.config, self.store = config, store
+        self.state = untrained(config)
+        """None for a method that has no decoder."""
+        self.scale: Scale = new_scale()
+        """Of R/T."""
+        self.pending: list[Episode] = []
+        """Episodes that the decoder has not been told of."""
+        self.returned: list[tuple[float, int]] = []
+        """R/T and T of episodes that the scales have not met."""
+        self.untold = 0
+        """Steps of the episodes that are pending."""
+        self.told = self.fits = 0
+        """Episodes that it has been told of; updates by a gradient."""
+        self.owed = 0.0
+        """Updates that the steps so far still ask for."""
+        self.loss = float("nan")
+        """The mean of the last updates by a gradient."""
+
+    @property
+    def descends(self) -> bool:
+        """Whether it is fitted by a gradient, and there is an episode to fit it to."""
+        return self.config.method.descends and bool(self.store.episodes)
+
+    @property
+    def fitted(self) -> bool:
+        """Whether it has learned anything yet."""
+        if self.state is None or self.config.method.descends:
+            return self.fits > 0
+        return bool(returns.is_fitted(self.state))
+
+    @property
+    def is_due(self) -> bool:
+        """Whether enough new episodes have ended to be told of."""
+        return len(self.pending) >= max(returns.GROWTH * self.told, 1)
+
+    def owe(self, steps: int) -> None:
+        """New steps ask for updates."""
+        self.owed = min(self.owed + self.config.fits_per_step * steps, MOST_OWED)
+
+    def ended(self, episode: Episode) -> None:
+        """An episode has ended."""
+        self.pending.append(episode)
+        self.untold += len(episode.steps)
+        self.returned.append((episode.score / len(episode.steps), len(episode.steps)))
+
+    def observe_steps(
+        self, features: Float[np.ndarray, "n *agents features"], alive: Bool[np.ndarray, "n *agents"]
+    ) -> None:
+        """Add new steps to the running statistics."""
+        if self.state is None:
+            return
+        rows = padding(len(features))
+        with on_host():
+            self.state = compiled.observe_steps(self.state, padded(features, rows), padded(alive, rows))
+
+    def observe_returned(self) -> None:
+        """Add the episodes that have ended to the scales. Many at a time: a call costs the same for one as for hundreds."""
+        if not self.returned:
+            return
+        mean, length = np.array(self.returned).T
+        rows = padding(len(mean))
+        there = np.arange(rows) < len(mean)
+        mean, length = padded(mean.astype(np.float32), rows), padded(length.astype(np.int32), rows)
+        self.returned.clear()
+        with on_host():
+            if self.state is not None:
+                self.state = compiled.observe_returns(self.state, mean, length, there)
+            self.scale = compiled.observe_mean_rewards(self.scale, mean, there)
+
+    def learn(self) -> None:
+        """Tell the decoder of the episodes that have ended. All steps must have their features."""
+        self.observe_returned()
+        new = [episode for episode in self.pending if episode.steps[0] >= self.store.steps - self.store.capacity]
+        self.pending.clear()
+        self.untold = 0
+        self.told += len(new)
+        if self.state is None or not new:
+            return
+        with on_host(), jax.enable_x64(True):
+            for piece in self.pieces(new):
+                self.state = compiled.tell(self.state, piece, self.config.settings)
+            if self.state.closed is None:
+                return
+            whole = self.config.forget or self.store.steps <= self.store.capacity
+            if self.config.method.fit is not Fit.SIGNS and whole and compiled.is_stale(self.state):
+                self.state = compiled.begin_again(self.state)
+                for piece in self.pieces(list(self.store.episodes.values())):
+                    self.state = compiled.add(self.state, piece)
+            if compiled.is_due(self.state):
+                self.state = compiled.fit_in_closed_form(self.state, self.config.method.name, self.config.forms)
+
+    def pieces(self, episodes: Sequence[Episode]) -> Iterator[Episodes]:
+        """Whole episodes, some at a time, in arrays of few shapes."""
+        total, longest = sum(len(one.steps) for one in episodes), max(len(one.steps) for one in episodes)
+        rows = padding(max(longest, min(total, PIECE // self.config.agents, prediction.LAST * longest)))
+        return draws.pieces(self.store, episodes, prediction.LAST, rows)
+
+    def fit(self, updates: int) -> None:
+        """Fit now: so many updates of a decoder that descends a gradient; once in closed form, however many are asked for."""
+        if self.state is None or not self.store.episodes:
+            return
+        if not self.config.method.descends:
+            with on_host(), jax.enable_x64(True):
+                self.state = compiled.fit_in_closed_form(self.state, self.config.method.name, self.config.forms)
+            return
+        self.owed = 0.0
+        for start in range(0, updates, CHUNK):
+            self.descend(min(CHUNK, updates - start))
+
+    def fit_owed(self) -> None:
+        """Make the updates that are owed, in whole chunks."""
+        while self.owed >= CHUNK:
+            self.owed -= CHUNK
+            self.descend(CHUNK)
+
+    def descend(self, updates: int) -> None:
+        """Updates by a gradient, of batches that are drawn by their numbers."""
+        assert self.state is not None
+        assert self.config.method.fit is not None
+        random = np.random.default_rng([self.config.seed, self.fits])
+        longest = padding(max(len(episode.steps) for episode in self.store.episodes.values()))
+        batches = [
+            draws.batch(self.store, self.config.method.fit, self.config.settings, random, longest)
+            for _ in range(updates)
+        ]
+        together = jax.tree.map(lambda *parts: np.stack(parts), *batches)
+        with on_host():
+            keys = jax.random.split(jax.random.fold_in(jax.random.key(self.config.seed), self.fits), updates)
+            self.state, loss = compiled.descend(
+                self.state, together, keys, self.config.method.name, self.config.settings
+            )
+        self.fits += updates
+        self.loss = float(loss)
+
+    def return_r2(self) -> float:
+        """R^2 of the last returns, each predicted before it was learned from; NaN while there are few, or all are the same."""
+        if self.state is None:
+            return float("nan")
+        with on_host():
+            return float(prediction.r2(self.state.predictions)[0])
+
+    def explanation(self) -> list[str]:
+        """What the stored returns say of the factors: `CreditAssigner.explanation`."""
+        basis = replace(self.config.basis, extended=True)
+        if self.state is None or not self.store.episodes or not basis.size:
+            return []
+        with on_host(), jax.enable_x64(True):
+            judge = self.state._replace(closed=closed_form.init(basis, 1))
+            judge = compiled.begin_again(judge)
+            for piece in self.pieces(list(self.store.episodes.values())):
+                judge = compiled.add(judge, piece)
+            assert judge.closed is not None
+            sums = closed_form.whole(judge.closed.summed)
+            found = explanation.explain(sums, int(self.state.average), basis)
+            found = jax.tree.map(np.asarray, found)
+        names = [] if self.config.phi is None else self.config.phi.columns_by(self.config.judges)
+        return words(found, returns.form_found(self.state), names, self.entry_names(len(found.left)))
+
+    def entry_names(self, entries: int) -> list[str]:
+        """What the entries of [s', a] are called; nothing where the decoder sees other ones."""
+        if self.config.method.encoder not in (Encoder.NEXT, Encoder.LATENT_AND_NEXT):
+            return []
+        texts = ("", "") if self.config.task is None else (self.config.task.observation, self.config.task.action)
+        return entry_names(*texts, entries, self.config.action.size)
+
+
+def untrained(config: CreditConfig) -> Decomposition | None:
+    """A decoder that has learned nothing; None for a method that has none."""
+    if config.method.reward is not Reward.PROXY:
+        return None
+    key, steps = jax.random.key(config.seed), config.max_steps or 1
+    with on_host():
+        return decomposition.init(key, config.basis, config.method, config.settings, steps, config.agents, config.forms)

@@ -1,0 +1,77 @@
+"""What a `CreditAssigner` pays for steps, by the decoder as it stands."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from lare.credit import decomposition
+from lare.credit.decomposition import Decomposition
+from lare.credit.methods import Reward
+from lare.normalise import within_range
+from lare.plugs import compiled
+from lare.plugs.compiled import on_host, padded, padding
+from lare.plugs.learner import PIECE, Learner
+
+
+def payment(
+    learner: Learner,
+    features: Float[np.ndarray, "n *agents features"],
+    length: Int[np.ndarray, " n"],
+    alive: Bool[np.ndarray, "n *agents"] | None = None,
+    rows: Int[np.ndarray, " n"] | None = None,
+) -> Float[np.ndarray, "n *agents"]:
+    """What the method pays for steps with these features.
+
+    Args:
+        learner: with the decoder, and the store that `rows` are places in.
+        features: what it sees of the steps.
+        length: T of each step's episode.
+        alive: which agents acted; all, unless given.
+        rows: where the steps are stored, for a method that pays by the return of a step's episode.
+    """
+    config, shape = learner.config, features.shape[:-1]
+    match config.method.reward:
+        case Reward.DESIGNED:
+            found = features[..., 0]
+        case Reward.UNIFORM:
+            assert rows is not None
+            found = np.broadcast_to(uniform(learner, rows).reshape(-1, *[1] * len(config.axis)), shape)
+        case _ if learner.fitted:
+            starts = range(0, len(features), PIECE)
+            parts = [decoded(learner, features[one : one + PIECE], length[one : one + PIECE]) for one in starts]
+            found = np.concatenate([np.zeros((0, *shape[1:]), np.float32), *parts])
+        case _:
+            return np.zeros(shape, np.float32)
+    there = np.ones(shape, bool) if alive is None else alive
+    if config.method.shared:
+        mean = (found * there).sum(axis=-1, keepdims=True) / np.maximum(there.sum(axis=-1, keepdims=True), 1)
+        found = np.broadcast_to(mean, shape)
+    return np.where(there, found, 0).astype(np.float32)
+
+
+def uniform(learner: Learner, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """The mean reward of each step's episode, between the lowest and the highest so far; 0.5 while it goes on."""
+    store = learner.store
+    with on_host():
+        share = np.asarray(within_range(learner.scale, jnp.asarray(store.mean_reward[rows])))
+    return np.where(store.length[rows] > 0, share, 0.5)
+
+
+def decoded(
+    learner: Learner, features: Float[np.ndarray, "n *agents features"], length: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n *agents"]:
+    """What the decoder says."""
+    config, size = learner.config, padding(len(features))
+    long = np.pad(length, (0, size - len(length)), constant_values=1)
+    with on_host():
+        found = compiled.rewards(paying(learner), padded(features, size), long, config.method.name, config.settings)
+        found = compiled.divided(found, learner.scale) if config.scale_rewards else found
+        return np.asarray(found)[: len(features)]
+
+
+def paying(learner: Learner) -> Decomposition:
+    """The decoder, with what it needs to pay: a call with all that it has learned from would take twice as long."""
+    assert learner.state is not None
+    optimistic = decomposition.optimistic(learner.config.method, learner.config.settings)
+    light = learner.state._replace(optimizer=(), rivals=None)
+    return light if optimistic else light._replace(closed=None)
