@@ -21,6 +21,11 @@ class LareError(Exception):
     """What the command line exits with."""
 
 
+def needs_extra(what: str, extra: str) -> LareError:
+    """What to say where a library that only some users have is not installed."""
+    return LareError(f"{what} needs an extra: pip install 'lare-rl[{extra}]'")
+
+
 class Checked(BaseModel):
     """Values that came from outside. Frozen; what does not fit is a `LareError` of one line."""
 

@@ -7,7 +7,7 @@ import pytest
 
 import lare
 from lare import LareError
-from lare.logs import parquet
+from lare.logs import tables
 from lare.logs.source import open_logs
 from logged import logged
 
@@ -45,7 +45,7 @@ def test_round_trip(tmp_path):
 
 def test_a_directory_of_files_is_one_log(tmp_path, monkeypatch):
     """Episodes may go on from one file to the next, and from one batch to the next."""
-    monkeypatch.setattr(parquet, "ROWS", 7)
+    monkeypatch.setattr(tables, "ROWS", 7)
     rows = table(logged(8))
     (tmp_path / "log").mkdir()
     for number, start in enumerate(range(0, len(rows), 50)):
@@ -57,6 +57,23 @@ def test_a_directory_of_files_is_one_log(tmp_path, monkeypatch):
         np.testing.assert_array_equal(one.paid, wanted["rewards"])
     lare.relabel(tmp_path / "log", tmp_path / "new.parquet", method="rd-linear")
     assert pq.read_table(tmp_path / "new.parquet")["episode"].to_pylist() == rows["episode"].to_pylist()
+
+
+def test_a_row_for_each_episode(tmp_path):
+    """Lists for columns, as offline data sets often have them; nothing says what the last step led to but the observations."""
+    rows = pa.table({key: [one[key].tolist() for one in logged(12)] for key in ("observations", "actions", "rewards")})
+    pq.write_table(rows, tmp_path / "log.parquet")
+    found = list(open_logs(tmp_path / "log.parquet").episodes())
+    for one, wanted in zip(found, logged(12), strict=True):
+        np.testing.assert_array_equal(one.after, wanted["observations"][1:])
+        np.testing.assert_array_equal(one.paid, wanted["rewards"])
+    lare.relabel(tmp_path / "log.parquet", tmp_path / "new.parquet", method="rd-linear")
+    new = pq.read_table(tmp_path / "new.parquet")
+    assert new.column_names == ["observations", "actions", "rewards", "paid"]
+    assert new["paid"].to_pylist() == rows["rewards"].to_pylist()
+    assert list(map(len, new["rewards"].to_pylist())) == [len(one["rewards"]) for one in logged(12)]
+    again = list(open_logs(tmp_path / "new.parquet").episodes())
+    np.testing.assert_array_equal(again[3].paid, found[3].paid)
 
 
 def test_a_score_in_every_row(tmp_path):

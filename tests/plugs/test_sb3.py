@@ -591,7 +591,7 @@ def test_a_number_that_is_not_finite():
     [
         (
             "sys.modules['stable_baselines3'] = None",
-            "lare.plugs.sb3 needs stable-baselines3: pip install 'lare-rl[sb3]'",
+            "lare.plugs.sb3 needs an extra: pip install 'lare-rl[sb3]'",
         ),
         (
             "import stable_baselines3; stable_baselines3.__version__ = '2.8.0'",

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Generator, Sequence
 
-from lare.errors import LareError
+from lare.errors import LareError, needs_extra
 from lare.experiments.jobs import Job, as_json, train_one
 
 
@@ -13,7 +13,7 @@ def on_ray(jobs: Sequence[Job], cores: int, address: str) -> Generator[tuple[Job
         import ray
         from ray.exceptions import RayError
     except ImportError:
-        raise LareError("a Ray cluster needs an extra: pip install 'lare-rl[ray]'") from None
+        raise needs_extra("a Ray cluster", "ray") from None
     try:
         ray.init(
             None if address == "local" else address,

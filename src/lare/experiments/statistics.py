@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import trim_mean
 
-from lare.errors import LareError
+from lare.errors import needs_extra
 from lare.experiments.scores import RETURN, Group, grouped
 from lare.run.directory import Run
 
@@ -224,5 +224,5 @@ def rliable():
             warnings.simplefilter("ignore")
             from rliable import library, metrics
     except ImportError:
-        raise LareError("comparisons need an extra: pip install 'lare-rl[statistics]'") from None
+        raise needs_extra("a comparison", "statistics") from None
     return library, metrics

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lare.errors import LareError, shortened
+from lare.errors import LareError, needs_extra, shortened
 from lare.logs.episode import Form, Logged, checked
 from lare.logs.output import check_free, whole
 from lare.logs.source import Hints, Paid
@@ -21,7 +21,7 @@ try:
     from minari.namespace import create_namespace, list_local_namespaces
     from minari.storage.datasets_root_dir import get_dataset_path
 except ImportError as missing:
-    raise LareError("Minari data sets need the extra lare-rl[minari]: pip install 'lare-rl[minari]'") from missing
+    raise needs_extra("a Minari data set", "minari") from missing
 
 COPIED = (
     *("author", "author_email", "code_permalink", "algorithm_name", "requirements", "eval_env_spec"),

@@ -1,4 +1,4 @@
-"""Where logs come from: a Minari data set, a directory of .npz files, Parquet, or arrays."""
+"""Where logs come from: a Minari or Hugging Face data set, a directory of .npz files, Parquet, or arrays."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -70,8 +70,8 @@ def open_logs(source: Any, task: TaskSpec | None = None) -> Source:
     """A log by its path, its Minari id, or itself.
 
     Args:
-        source: a directory of .npz or Parquet files, a Parquet file, a Minari id or data set, flat arrays by name (as D4RL has
-            them), or a list of episodes, each a mapping of arrays.
+        source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
+            flat arrays by name (as D4RL has them), or a list of episodes, each a mapping of arrays.
         task: says of how many choices whole numbers are, and the time limit.
 
     Raises:
@@ -99,9 +99,15 @@ def open_path(source: str | Path, hints: Hints) -> Source:
     """A log by its path, or a Minari id."""
     path = Path(source)
     if path.is_file() or any(path.glob("*.parquet")):
-        from lare.logs.parquet import ParquetLogs
+        from lare.logs.parquet import PARQUET
+        from lare.logs.tables import TableLogs
 
-        return ParquetLogs(path, hints)
+        return TableLogs(path, hints, PARQUET)
+    if any((path / name).exists() for name in ("state.json", "dataset_dict.json")):
+        from lare.logs.huggingface import HUGGING_FACE
+        from lare.logs.tables import TableLogs
+
+        return TableLogs(path, hints, HUGGING_FACE)
     if path.is_dir():
         from lare.logs.npz import NpzLogs
 

@@ -6,17 +6,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lare.errors import LareError
+from lare.errors import LareError, needs_extra
 from lare.plugs.assigner import CreditAssigner
 from lare.plugs.gymnasium import CREDIT_STEP, Pay, batch_of_one, check_pay
 from lare.plugs.layout import layout_of
-from lare.plugs.optional import missing
 from lare.tasks.episodic import TRUE_REWARD
 
 try:
     from pettingzoo.utils.wrappers import BaseParallelWrapper
 except ModuleNotFoundError as error:
-    raise missing("pettingzoo") from error
+    raise needs_extra("lare.plugs.pettingzoo", "pettingzoo") from error
 
 
 class CreditParallel(BaseParallelWrapper):

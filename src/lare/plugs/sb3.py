@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float, Int
 
-from lare.errors import LareError
+from lare.errors import LareError, needs_extra
 from lare.plugs import saving
 from lare.plugs.assigner import CreditAssigner
 from lare.plugs.layout import layout_of
@@ -24,7 +24,7 @@ from lare.plugs.layout import layout_of
 try:
     import stable_baselines3
 except ImportError:
-    raise LareError("lare.plugs.sb3 needs stable-baselines3: pip install 'lare-rl[sb3]'") from None
+    raise needs_extra("lare.plugs.sb3", "sb3") from None
 if [int(part) for part in re.findall(r"\d+", stable_baselines3.__version__)[:2]] < [2, 9]:
     raise LareError(
         f"lare.plugs.sb3 needs stable-baselines3 2.9 or later, and {stable_baselines3.__version__} is installed: "

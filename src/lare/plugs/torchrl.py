@@ -11,17 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from lare.errors import LareError
+from lare.errors import LareError, needs_extra
 from lare.plugs.assigner import CreditAssigner
 from lare.plugs.layout import Layout
-from lare.plugs.optional import missing
 
 try:
     import torch
     from tensordict import TensorDictBase
     from torchrl.envs.transforms import Transform
 except ModuleNotFoundError as error:
-    raise missing("torchrl") from error
+    raise needs_extra("lare.plugs.torchrl", "torchrl") from error
 
 CREDIT_STEP = "credit_step"
 """Where the buffer keeps the numbers of steps."""

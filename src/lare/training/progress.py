@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from lare.errors import LareError
+from lare.errors import needs_extra
 
 Metrics = Sequence[Mapping[str, Any]]
 """One mapping a seed, as in metrics.jsonl."""
@@ -111,7 +111,7 @@ def summary_writer() -> Any:
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
-        raise LareError("TensorBoard events need an extra: pip install 'lare-rl[tensorboard]'") from None
+        raise needs_extra("TensorBoard", "tensorboard") from None
     return SummaryWriter
 
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from lare.errors import LareError
+from lare.errors import LareError, needs_extra
 from lare.training.progress import Metrics
 
 
@@ -22,7 +22,7 @@ class WeightsAndBiases:
         try:
             import wandb
         except ImportError:
-            raise LareError("Weights & Biases needs an extra: pip install 'lare-rl[wandb]'") from None
+            raise needs_extra("Weights & Biases", "wandb") from None
         self.init, self.arguments, self.name = wandb.init, arguments, ""
         self.runs: dict[int, Any] = {}
         """By seed."""
@@ -67,7 +67,7 @@ class MLflow:
             from mlflow.entities import Metric, Param
             from mlflow.exceptions import MlflowException
         except ImportError:
-            raise LareError("MLflow needs an extra: pip install 'lare-rl[mlflow]'") from None
+            raise needs_extra("MLflow", "mlflow") from None
         self.metric = Metric
         self.parameters = [Param(key, str(value)) for key, value in (parameters or {}).items()]
         try:

@@ -93,4 +93,4 @@ except lare.LareError as error:
     print(error)
 """
     printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert printed == "PettingZoo environments need an extra: pip install 'lare-rl[particles]'\n"
+    assert printed == "lare.tasks.particles.pettingzoo needs an extra: pip install 'lare-rl[particles]'\n"

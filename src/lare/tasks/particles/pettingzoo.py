@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete, Space
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lare.errors import LareError
+from lare.errors import LareError, needs_extra
 from lare.tasks.particles.drawing import draw, pixels
 from lare.tasks.particles.table import find_particle_task
 from lare.tasks.particles.task import ACTIONS, STEPS, ParticleTask
@@ -19,7 +19,7 @@ from lare.tasks.particles.world import State
 try:
     from pettingzoo import ParallelEnv
 except ImportError:
-    raise LareError("PettingZoo environments need an extra: pip install 'lare-rl[particles]'") from None
+    raise needs_extra("lare.tasks.particles.pettingzoo", "particles") from None
 
 
 @partial(jax.jit, static_argnums=0)
