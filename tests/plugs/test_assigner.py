@@ -194,7 +194,7 @@ def test_the_oldest_steps_go():
     assert np.isfinite(credit.rewards_at(numbers[2:])).all()
     with pytest.raises(LareError) as refused:
         credit.rewards_at(numbers[1])
-    assert str(refused.value) == "step 6 is not stored: those there are are 10 to 29 (capacity = 20)"
+    assert str(refused.value) == "step 6 is not stored, only 10 to 29 is (capacity = 20)"
     with pytest.raises(LareError, match="step 30 is not stored"):
         credit.rewards_at([30])
 

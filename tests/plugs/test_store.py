@@ -82,9 +82,9 @@ def test_a_step_that_sets_out_from_elsewhere_begins_an_episode():
 @pytest.mark.parametrize(
     ("steps", "message"),
     [
-        ([8], "step 8 is not stored: those there are are 3 to 7 (capacity = 5)"),
-        ([7, 2], "step 2 is not stored: those there are are 3 to 7 (capacity = 5)"),
-        ([-1], "step -1 is not stored: those there are are 3 to 7 (capacity = 5)"),
+        ([8], "step 8 is not stored, only 3 to 7 is (capacity = 5)"),
+        ([7, 2], "step 2 is not stored, only 3 to 7 is (capacity = 5)"),
+        ([-1], "step -1 is not stored, only 3 to 7 is (capacity = 5)"),
     ],
 )
 def test_steps_that_are_not_there_are_refused(steps, message):
@@ -99,7 +99,7 @@ def test_steps_that_are_not_there_are_refused(steps, message):
 
 
 def test_an_empty_store_has_none():
-    with pytest.raises(LareError, match=r"step 0 is not stored: those there are are none \(capacity = 5\)"):
+    with pytest.raises(LareError, match=r"step 0 is not stored, nothing is \(capacity = 5\)"):
         Store(5, (1,)).rows(np.array([0]))
 
 

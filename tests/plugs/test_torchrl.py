@@ -168,7 +168,7 @@ def test_a_ring_that_is_too_small_says_so():
     buffer = buffer_of(credit)
     for _ in range(4):
         buffer.extend(GymWrapper(Logged()).rollout(10, break_when_any_done=False))
-    with pytest.raises(LareError, match=r"step 0 is not stored: those there are are 20 to 39 \(capacity = 20\)"):
+    with pytest.raises(LareError, match=r"step 0 is not stored, only 20 to 39 is \(capacity = 20\)"):
         buffer[:]
 
 

@@ -29,8 +29,8 @@ def relabel(
     Writes the same data with the new rewards; what was paid is kept beside them, as `paid`. No simulator is needed (docs/logs.md).
 
     Args:
-        dataset: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, or the id of a local data set
-            of Minari's.
+        dataset: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, or the id of a local
+            data set of Minari's.
         out: the path or, for a data set of Minari's, the id to write. It is written whole or not at all.
         task: a shipped name (see `lare tasks`), or the path of a task file: what --function was designed for, the time limit, and
             of how many choices actions are. Its environment is not made.

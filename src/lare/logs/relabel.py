@@ -129,8 +129,8 @@ def relabel(
     """Give the steps of logged episodes rewards that add up to what the episodes returned.
 
     Args:
-        source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set, flat arrays by name, or a list of
-            mappings of arrays (docs/logs.md).
+        source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
+            flat arrays by name, or a list of mappings of arrays (docs/logs.md).
         out: a path or, for a data set of Minari's, an id. It is written whole or not at all.
         method: how credit is assigned; unless given, `lare-bayes` with a `phi`, and `bayes` without.
         phi: a function that judges the steps; it needs its `task`.

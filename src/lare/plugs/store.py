@@ -144,8 +144,8 @@ class Store:
         """
         if steps.size and (steps.max() >= self.steps or steps.min() < max(0, self.steps - self.capacity)):
             wrong = steps.max() if steps.max() >= self.steps else steps.min()
-            there = f"{max(0, self.steps - self.capacity)} to {self.steps - 1}" if self.steps else "none"
-            raise LareError(f"step {wrong} is not stored: those there are are {there} (capacity = {self.capacity})")
+            there = f"only {max(0, self.steps - self.capacity)} to {self.steps - 1}" if self.steps else "nothing"
+            raise LareError(f"step {wrong} is not stored, {there} is (capacity = {self.capacity})")
         return steps % self.capacity
 
     def lengths(self, rows: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
