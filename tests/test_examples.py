@@ -3,6 +3,7 @@
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import lare
@@ -24,3 +25,20 @@ def test_td3_bc_trains_on_a_relabelled_log(tmp_path):
     main = runpy.run_path(str(EXAMPLES / "offline_td3_bc.py"))["main"]
     for rewards in ("rewards", "paid", "end"):
         assert main(str(tmp_path / "new"), rewards, steps=3) == []
+
+
+@pytest.mark.filterwarnings("ignore")  # those libraries' own
+@pytest.mark.parametrize(
+    ("name", "library", "short"),
+    [
+        ("tianshou_td3.py", "tianshou", {"steps": 20}),
+        ("skrl_td3.py", "skrl", {"steps": 1200}),
+        ("rllib_ppo.py", "ray.rllib.algorithms.ppo", {"iterations": 1}),
+    ],
+)
+def test_a_library_that_is_there_trains(name, library, short):
+    """For a moment. Where the library is missing, the file must be Python."""
+    path = EXAMPLES / name
+    compile(path.read_text(encoding="utf-8"), name, "exec")
+    pytest.importorskip(library)
+    assert np.isfinite(runpy.run_path(str(path))["main"](**short)).all()
