@@ -107,6 +107,8 @@ class CreditAssigner:
         """How many they are."""
         self.sample: list[tuple[np.ndarray, np.ndarray]] = []
         """The first observations and actions: a `phi` that is read from a file is tried on them again."""
+        self.sampled = 0
+        """How many they are."""
         self.lock = threading.RLock()
 
     def add(
@@ -256,9 +258,10 @@ class CreditAssigner:
         if not self.waiting:
             return
         number, *steps = (np.concatenate(part) for part in zip(*self.waiting, strict=True))
-        if self.config.phi is not None and sum(len(rows) for rows, _ in self.sample) < SAMPLE:
+        if self.config.phi is not None and self.sampled < SAMPLE:
             _, action, after = (part.reshape(-1, part.shape[-1])[:SAMPLE].copy() for part in steps)
             self.sample.append((after, action))
+            self.sampled += len(after)
         for start in range(0, len(number), PIECE):
             part = slice(start, start + PIECE)
             found, places = self.config.features(*(each[part] for each in steps)), number[part] % self.store.capacity

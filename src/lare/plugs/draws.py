@@ -77,9 +77,10 @@ def episodes_of(
     places: int,
 ) -> Episodes:
     """The features of some steps, with what their episodes returned."""
-    rows, empty = steps % store.capacity, places - len(episodes)
-    length = np.pad([len(episode.steps) for episode in episodes], (0, empty), constant_values=1)
-    score = np.pad([episode.score for episode in episodes], (0, empty))
+    rows, count = steps % store.capacity, len(episodes)
+    length, score = np.ones(places, np.int32), np.zeros(places)
+    length[:count] = [len(episode.steps) for episode in episodes]
+    score[:count] = [episode.score for episode in episodes]
     share = None
     if store.alive is not None:
         alive = store.alive[rows]
@@ -88,9 +89,9 @@ def episodes_of(
     return Episodes(
         features=features,  # pyright: ignore[reportArgumentType]
         episode=number.astype(np.int32),  # pyright: ignore[reportArgumentType]
-        length=length.astype(np.int32),  # pyright: ignore[reportArgumentType]
+        length=length,  # pyright: ignore[reportArgumentType]
         mean_reward=(score / length).astype(np.float32),  # pyright: ignore[reportArgumentType]
-        mask=(np.arange(places) < len(episodes)).astype(np.float32),  # pyright: ignore[reportArgumentType]
+        mask=(np.arange(places) < count).astype(np.float32),  # pyright: ignore[reportArgumentType]
         share=share,  # pyright: ignore[reportArgumentType]
     )
 

@@ -13,7 +13,7 @@ from lare.credit.methods import Encoder, Fit, Reward
 from lare.credit.words import entry_names, words
 from lare.normalise import Scale, new_scale
 from lare.plugs import compiled, draws
-from lare.plugs.compiled import on_host, padded, padding
+from lare.plugs.compiled import Flat, on_host, padded, padding
 from lare.plugs.config import CreditConfig
 from lare.plugs.store import Episode, Store
 
@@ -46,6 +46,9 @@ class Learner:
         """Updates that the steps so far still ask for."""
         self.loss = float("nan")
         """The mean of the last updates by a gradient."""
+        self.has_learned = False
+        self.flat: tuple[Decomposition | None, Flat | None] = None, None
+        """What pays, and the state that it was made of."""
 
     @property
     def descends(self) -> bool:
@@ -55,9 +58,25 @@ class Learner:
     @property
     def fitted(self) -> bool:
         """Whether it has learned anything yet."""
-        if self.state is None or self.config.method.descends:
-            return self.fits > 0
-        return bool(returns.is_fitted(self.state))
+        if not self.has_learned:  # once it has, there is no need to ask the device again
+            if self.state is None or self.config.method.descends:
+                self.has_learned = self.fits > 0
+            else:
+                self.has_learned = bool(returns.is_fitted(self.state))
+        return self.has_learned
+
+    @property
+    def paying(self) -> Flat:
+        """The decoder with what it needs to pay, without what it has learned from."""
+        assert self.state is not None
+        of, flat = self.flat
+        if of is not self.state or flat is None:
+            light = self.state._replace(optimizer=(), rivals=None)
+            if not decomposition.optimistic(self.config.method, self.config.settings):
+                light = light._replace(closed=None)
+            flat = Flat(*jax.tree.flatten(light))
+            self.flat = self.state, flat
+        return flat
 
     @property
     def is_due(self) -> bool:

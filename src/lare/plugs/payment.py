@@ -4,8 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lare.credit import decomposition
-from lare.credit.decomposition import Decomposition
 from lare.credit.methods import Reward
 from lare.normalise import within_range
 from lare.plugs import compiled
@@ -61,17 +59,11 @@ def decoded(
     learner: Learner, features: Float[np.ndarray, "n *agents features"], length: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n *agents"]:
     """What the decoder says."""
-    config, size = learner.config, padding(len(features))
-    long = np.pad(length, (0, size - len(length)), constant_values=1)
+    config, size, flat = learner.config, padding(len(features)), learner.paying
+    long = padded(length, size)
+    long[len(length) :] = 1
     with on_host():
-        found = compiled.rewards(paying(learner), padded(features, size), long, config.method.name, config.settings)
+        of_method = flat.structure, config.method.name, config.settings
+        found = compiled.rewards(flat.leaves, padded(features, size), long, *of_method)
         found = compiled.divided(found, learner.scale) if config.scale_rewards else found
         return np.asarray(found)[: len(features)]
-
-
-def paying(learner: Learner) -> Decomposition:
-    """The decoder, with what it needs to pay: a call with all that it has learned from would take twice as long."""
-    assert learner.state is not None
-    optimistic = decomposition.optimistic(learner.config.method, learner.config.settings)
-    light = learner.state._replace(optimizer=(), rivals=None)
-    return light if optimistic else light._replace(closed=None)

@@ -133,6 +133,7 @@ def restore(
     credit.learner.told, credit.learner.fits = text["told"], text["fits"]
     if set(TRIED) <= set(arrays):
         credit.sample.append((arrays[TRIED[0]], arrays[TRIED[1]]))
+        credit.sampled = len(arrays[TRIED[0]])
     for name, leaf in leaves(credit).items():
         if arrays[name].shape != leaf.shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {leaf.shape}")
