@@ -23,14 +23,12 @@ from lare.credit.methods import Reward, find_method
 from lare.errors import LareError
 from lare.latent.function import LatentFunction
 from lare.plugs.config import CreditConfig, Space, check, layouts
-from lare.plugs.learner import CHUNK, PIECE, Learner
+from lare.plugs.learner import CHUNK, PIECE, WAITING, Learner
 from lare.plugs.payment import payment
 from lare.plugs.store import Store
 from lare.run.usual import MANY_AGENTS
 from lare.tasks.spec import Judges, TaskSpec
 
-WAITING = 256
-"""Steps, at most, that wait for `phi` and for the running statistics: a call costs the same for one row as for hundreds."""
 SAMPLE = 256
 """Steps, about, that `phi` is tried on when it is read again."""
 

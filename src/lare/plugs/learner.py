@@ -17,6 +17,8 @@ from lare.plugs.compiled import Flat, on_host, padded, padding
 from lare.plugs.config import CreditConfig
 from lare.plugs.store import Episode, Store
 
+WAITING = 256
+"""Steps, at most, that wait for `phi` and for the running statistics."""
 PIECE = 8192
 """Rows of features that are looked at at a time."""
 CHUNK = 16
@@ -34,6 +36,8 @@ class Learner:
         """None for a method that has no decoder."""
         self.scale: Scale = new_scale()
         """Of R/T."""
+        self.unobserved: list[tuple[np.ndarray, np.ndarray]] = []
+        """Features of steps that the running statistics have not met, and which agents acted."""
         self.pending: list[Episode] = []
         """Episodes that the decoder has not been told of."""
         self.returned: list[tuple[float, int]] = []
@@ -96,15 +100,28 @@ class Learner:
     def observe_steps(
         self, features: Float[np.ndarray, "n *agents features"], alive: Bool[np.ndarray, "n *agents"]
     ) -> None:
-        """Add new steps to the running statistics."""
+        """Add new steps to the running statistics, many at a time: a call costs the same for one as for hundreds."""
         if self.state is None:
             return
-        rows = padding(len(features))
-        with on_host():
-            self.state = compiled.observe_steps(self.state, padded(features, rows), padded(alive, rows))
+        self.unobserved.append((features, alive))
+        if sum(len(rows) for rows, _ in self.unobserved) >= WAITING:
+            self.observe()
+
+    def observe(self) -> None:
+        """Add the steps and episodes that wait for it to the running statistics."""
+        self.observe_returned()
+        if self.state is None or not self.unobserved:
+            return
+        features, alive = (np.concatenate(part) for part in zip(*self.unobserved, strict=True))
+        self.unobserved.clear()
+        for start in range(0, len(features), PIECE):
+            part = slice(start, start + PIECE)
+            rows = padding(len(features[part]))
+            with on_host():
+                self.state = compiled.observe_steps(self.state, padded(features[part], rows), padded(alive[part], rows))
 
     def observe_returned(self) -> None:
-        """Add the episodes that have ended to the scales. Many at a time: a call costs the same for one as for hundreds."""
+        """Add the episodes that have ended to the scales, many at a time as well."""
         if not self.returned:
             return
         mean, length = np.array(self.returned).T
@@ -119,7 +136,7 @@ class Learner:
 
     def learn(self) -> None:
         """Tell the decoder of the episodes that have ended. All steps must have their features."""
-        self.observe_returned()
+        self.observe()
         new = [episode for episode in self.pending if episode.steps[0] >= self.store.steps - self.store.capacity]
         self.pending.clear()
         self.untold = 0
@@ -140,9 +157,11 @@ class Learner:
                 self.state = compiled.fit_in_closed_form(self.state, self.config.method.name, self.config.forms)
 
     def pieces(self, episodes: Sequence[Episode]) -> Iterator[Episodes]:
-        """Whole episodes, some at a time, in arrays of few shapes."""
+        """Whole episodes, some at a time, in arrays of two shapes: as long as one episode, or as many as are looked at at once."""
         total, longest = sum(len(one.steps) for one in episodes), max(len(one.steps) for one in episodes)
-        rows = padding(max(longest, min(total, PIECE // self.config.agents, prediction.LAST * longest)))
+        rows = padding(longest)
+        if total > rows:
+            rows = padding(max(longest, min(PIECE // self.config.agents, prediction.LAST * longest)))
         return draws.pieces(self.store, episodes, prediction.LAST, rows)
 
     def fit(self, updates: int) -> None:
@@ -159,6 +178,7 @@ class Learner:
 
     def fit_owed(self) -> None:
         """Make the updates that are owed, in whole chunks."""
+        self.observe()
         while self.owed >= CHUNK:
             self.owed -= CHUNK
             self.descend(CHUNK)
