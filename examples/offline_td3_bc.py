@@ -101,8 +101,10 @@ def evaluate(agent: TD3BC, environment: gymnasium.Env, mean: torch.Tensor, devia
     return total / 5
 
 
-def main(dataset: str, rewards: str = "rewards", steps: int = 100_000, environment: str | None = None) -> list[float]:
-    torch.manual_seed(0)
+def main(
+    dataset: str, rewards: str = "rewards", steps: int = 100_000, environment: str | None = None, seed: int = 0
+) -> list[float]:
+    torch.manual_seed(seed)
     data = transitions(dataset, rewards)
     mean, deviation = data["before"].mean(dim=0), data["before"].std(dim=0) + 1e-3
     for key in ("before", "after"):
@@ -125,4 +127,5 @@ if __name__ == "__main__":
     parser.add_argument("--rewards", choices=["rewards", "paid", "end"], default="rewards")
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--environment")
+    parser.add_argument("--seed", type=int, default=0)
     main(**vars(parser.parse_args()))

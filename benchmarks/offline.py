@@ -1,0 +1,89 @@
+"""An offline learner on logged episodes: trained on true rewards, on the return at the end, and on what `lare relabel` pays.
+
+    lare train HalfCheetah-v4 --method dense --steps 60000 --evaluate-every 20000 --out RUN
+    python benchmarks/offline.py RUN
+
+The log is all that the run met while it learned: 60 episodes, from random play on. `lare relabel` sees the return of each
+episode only. The learner is TD3+BC, `examples/offline_td3_bc.py`, with seeds 0 to 2 for each kind of rewards. The return of the
+last evaluation, and how well the proxy rewards agree with the true ones, go to results/offline.json.
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from measure import write
+
+import lare
+from lare.data import replay
+from lare.logs.source import open_logs
+from lare.training.seeds import of_seed
+from lare.training.session import load_learner
+
+sys.path.append(str(Path(__file__).parents[1] / "examples"))
+from offline_td3_bc import main as td3_bc
+
+UPDATES, SEEDS = 50_000, (0, 1, 2)
+METHODS = ("lare-bayes", "bayes")
+
+
+def write_log(run: lare.Run, out: Path) -> list[float]:
+    """The episodes that the first seed of a run has met, as .npz files with their scores; what they returned."""
+    _, learner, host, _ = load_learner(run)
+    buffer = of_seed(learner).replay
+    steps = replay.read(buffer, replay.newest(buffer, host["step"]))
+    shown, led_to = (np.asarray(part["observation"])[0, :, 0] for part in (steps.before, steps.after))
+    action, reward = np.asarray(steps.before["action"])[0, :, 0], np.asarray(steps.before["reward"])[0, :, 0]
+    length = int(np.asarray(steps.length).max())
+    out.mkdir()
+    for number, start in enumerate(range(0, len(shown), length)):
+        rows = slice(start, start + length)
+        np.savez(
+            out / f"{number:03d}.npz",
+            observations=np.concatenate([shown[rows], led_to[rows][-1:]]),
+            actions=action[rows],
+            true_rewards=reward[rows],
+            score=reward[rows].sum(dtype=np.float64),
+        )
+    return [float(reward[start : start + length].sum()) for start in range(0, len(shown), length)]
+
+
+def agreement(log: Path) -> float:
+    """The correlation of r_hat with the true rewards, over all steps."""
+    kept = [episode.kept[1] for episode in open_logs(log).episodes()]
+    r_hat, true = (np.concatenate([one[key] for one in kept]) for key in ("rewards", "true_rewards"))
+    return float(np.corrcoef(r_hat, true)[0, 1])
+
+
+def scores(log: Path, rewards: str, environment: str) -> list[float]:
+    """The last return of each seed."""
+    return [td3_bc(str(log), rewards, UPDATES, environment, seed)[-1] for seed in SEEDS]
+
+
+def main(run: str) -> None:
+    opened = lare.open_run(run)
+    task = opened.config.task
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "log"
+        returns = write_log(opened, log)
+        found = {}
+        for method in METHODS:
+            out = Path(folder) / method
+            phi = lare.design(task) if method.startswith("lare-") else None
+            told = lare.relabel(log, out, method=method, phi=phi, task=task)
+            found[method] = {"held-out R^2": told.return_r2, "correlation with true rewards": agreement(out)}
+            found[method]["returns"] = scores(out, "rewards", task.environment)
+        found["return at the end"] = {"returns": scores(log, "end", task.environment)}
+        for file in log.glob("*.npz"):
+            values = dict(np.load(file))
+            np.savez(file, **{key: values[key] for key in ("observations", "actions")}, rewards=values["true_rewards"])
+        found["true rewards"] = {"returns": scores(log, "paid", task.environment)}
+    figures = {"task": task.name, "seeds": list(SEEDS), "updates": UPDATES, "returns of the log": returns}
+    write("offline", {**figures, "rewards": found})
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main(sys.argv[1])
