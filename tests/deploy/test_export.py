@@ -12,6 +12,7 @@ import onnxruntime
 import pytest
 
 import lare
+from lare.credit import decomposition
 from lare.credit.methods import METHODS
 from lare.data import replay
 from lare.deploy import onnx
@@ -39,7 +40,7 @@ CASES = [
     ("ippo", "lare-rd-shared"),
     ("ippo-teams", "lare-rd"),
     ("ippo-state", "rrdu-next"),
-    ("qmix", "bayes"),
+    ("qmix", "lare-bayes"),
     ("vdn", "ircr"),
 ]
 """Every kind of policy, and every kind of decoder and of what it is given."""
@@ -63,19 +64,26 @@ def task_of(kind, method, echo):
         case "ippo-teams":
             return read_task("CompetitivePP-6")
         case _:
-            return toy_spec()
+            return toy_spec(judges="both" if method == "lare-signs" else "before")
+
+
+PHI = """import numpy as np
+
+def evaluation_func(o, a):
+    return [o[:, 0:1] * np.sum(a, axis=1, keepdims=True), o[:, 1:2]]
+"""
+NO_TRANSLATION = PHI.replace("np.sum(a", "np.median(a")
 
 
 def trained(kind, method, small, small_many, echo, out):
-    """A short run, of two seeds."""
-    row, task = METHODS[method], task_of(kind, method, echo)
-    source = "def evaluation_func(o, a):\n    return [o[:, 0:1] * np.sum(a, axis=1, keepdims=True)"
-    source = f"import numpy as np\n\n{source}{'' if row.kind == 'reward' else ', o[:, 1:2]'}]\n"
+    """A short run, of two seeds. PPO and IPPO store factors, not what they are of: there phi is one that has no translation."""
+    row, task, one = METHODS[method], task_of(kind, method, echo), kind in ("td3", "ddpg", "sac", "ppo")
+    source = NO_TRANSLATION if "ppo" in kind else PHI
+    source = source.replace(", o[:, 1:2]", "") if row.kind == "reward" else source
     function = None
     if row.latent:
         made = [verified(source, role, row.kind) for role in task.roles]
         function = made if len(made) > 1 else made[0]
-    one = kind in ("td3", "ddpg", "sac", "ppo")
     algorithm = kind.partition("-")[0]
     settings = (small if one else small_many)(method=method, algorithm=algorithm, steps=120 if one else 200)
     return lare.train(task, settings, function=function, out=out, listeners=[])
@@ -114,6 +122,7 @@ def test_what_is_exported_agrees_with_jax(kind, method, small, small_many, echo,
     one = of_seed(learner, 1)
     check_policy(exported, config, jax.tree.map(lambda leaf: leaf[1:], compiled(config).actor(learner, host["step"])))
     rewards = [name for name in found.functions if name != "policy"]
+    assert bool(found.apart) == (config.method.latent and "ppo" in kind)
     if found.left_out:
         assert (found.left_out, rewards) == (LEFT_OUT[method], [])
         return
@@ -214,10 +223,29 @@ def test_phi_and_decoder_are_one_function_without_lare(run, tmp_path, phi):
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_LARE], cwd=tmp_path / "out", capture_output=True, text=True, check=True
     )
-    load = loaded(tmp_path / "out").load("reward")
-    wanted = load(factors=phi(before, action), after=after, action=action)["r_hat"]
-    np.testing.assert_allclose(json.loads(done.stdout), wanted, rtol=1e-5)
+    config, learner, _, _ = load_learner(run)
+    # What the decoder sees: the toy's actions are from -2 to 2, the trainer's from -1 to 1.
+    rows = np.concatenate([phi(before, action), after, action / 2], axis=1)
+    wanted = decomposition.proxy_rewards(of_seed(learner).credit[0], jnp.asarray(rows), config.credit)
+    np.testing.assert_allclose(json.loads(done.stdout), wanted, rtol=1e-4, atol=1e-6)
     assert np.std(wanted) > 0
+    assert set(loaded(tmp_path / "out").described("reward")["inputs"]) == {"before", "action", "after"}
+
+
+def test_a_phi_without_translation_runs_beside_the_decoder(small, command, tmp_path):
+    function = verified(NO_TRANSLATION, toy_spec())
+    settings = small(method="lare-linear", steps=120)
+    run = lare.train(toy_spec(), settings, function=function, out=tmp_path / "run", listeners=[])
+    _, _, noted = command("export", run.directory, "--out", "out")
+    assert noted == (
+        "reward takes the factors of phi as an input, for phi has no translation: it has a call of np.median\n"
+    )
+    exported, random = loaded(tmp_path / "out"), np.random.default_rng(0)
+    before, after = random.uniform(-1, 1, (2, 5, 2)).astype(np.float32)
+    action = random.uniform(-2, 2, (5, 1)).astype(np.float32)
+    np.testing.assert_allclose(exported.factors(before, action, after), function(before, action), rtol=1e-6)
+    wanted = exported.load("reward")(factors=function(before, action))["r_hat"]
+    np.testing.assert_allclose(exported.reward(before, action, after), wanted, rtol=1e-6)
 
 
 def test_the_policy_is_that_of_policy_of(run, tmp_path):

@@ -177,6 +177,8 @@ def export(run: RunDirectory, out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
 
     found = lare.export(open_run(run), out, seed)
     say(f"wrote {', '.join(found.functions)} to {found.directory}; exported.py there says how to call them")
+    for name, why in found.apart.items():
+        progress(f"{name} takes the factors of phi as an input, for phi has no translation: it has {why}")
     if found.left_out:
         progress(f"there is no reward function: {found.left_out}")
     if not found.onnx:

@@ -3,9 +3,9 @@
 DIRECTORY/
   export.json              what is there: task, seed, step; inputs, outputs and operations of each function
   policy.npz, .onnx        observation -> action
-  reward.npz, .onnx        factors, steps -> r_hat; where teams learn, reward_TEAM
-  latent_function.py       phi, where the method has one
-  exported.py              the ten lines of NumPy that run the .npz files
+  reward.npz, .onnx        steps -> r_hat, phi and decoder as one function; where teams learn, reward_TEAM
+  latent_function.py       phi, to be read
+  exported.py              the lines of NumPy that run the .npz files
 """
 
 import json
@@ -19,6 +19,7 @@ from lare.deploy import exported, onnx
 from lare.deploy.graph import BATCH, Graph
 from lare.deploy.policy import policy
 from lare.deploy.reward import reward, unexported
+from lare.deploy.rows import Untranslatable
 from lare.errors import LareError
 from lare.experiments.evaluation import choices
 from lare.files import write_atomically
@@ -39,6 +40,8 @@ class Exported(NamedTuple):
     """`policy`, and `reward` or one for each team."""
     left_out: str | None
     """Why there is no reward; None where there is one."""
+    apart: dict[str, str]
+    """Rewards that take the factors of phi as an input, and what in phi has no translation."""
     onnx: bool
     """Whether there are ONNX files: the package `onnx` is installed."""
 
@@ -59,13 +62,16 @@ def export(run: Run, out: str | Path, seed: int | None = None) -> Exported:
     graphs = {"policy": policy(actor, config, start)}
     credit = of_seed(learner, place).credit
     left_out = unexported(config, credit[0].decoder if credit else None)
-    functions: dict[str, str] = {}
-    if left_out is None:
-        for team, role in enumerate(run.config.task.roles):
-            name = "reward" if role is run.config.task else f"reward_{role.team}"
-            graphs[name] = reward(credit[team] if credit else None, config, team)
-            if run.functions:
-                functions[name] = function_file(run.config.task, role)
+    files, apart = [], {}
+    for team, role in enumerate(run.config.task.roles if left_out is None else ()):
+        name = "reward" if role is run.config.task else f"reward_{role.team}"
+        phi, decoder = run.functions[team] if run.functions else None, credit[team] if credit else None
+        files.append(function_file(run.config.task, role))
+        try:
+            graphs[name] = reward(decoder, config, team, phi, run.judges)
+        except Untranslatable as error:
+            apart[name] = str(error)
+            graphs[name] = reward(decoder, config, team)
     try:
         out.mkdir(parents=True)
     except FileExistsError:
@@ -82,19 +88,19 @@ def export(run: Run, out: str | Path, seed: int | None = None) -> Exported:
     }
     for name, graph in graphs.items():
         text[name] = described(graph)
-        if name in functions:
+        if name in apart:
             judges = ["before", "after"] if run.judges == "both" else [run.judges]
-            text[name] |= {"phi": functions[name], "judges": judges}
+            text[name] |= {"phi": files[list(graphs).index(name) - 1], "judges": judges}
         write_arrays(out / f"{name}.npz", graph)
         if onnx.is_installed():
             onnx.write(graph, out / f"{name}.onnx", name)
-    for name, function in zip(functions.values(), run.functions, strict=False):
-        function.save(out / name)
+    for file, function in zip(files, run.functions, strict=False):
+        function.save(out / file)
     whole = json.dumps(text, indent=1).encode()
     write_atomically(out / TEXT, lambda file: file.write(whole))
     loader = Path(exported.__file__).read_bytes()
     write_atomically(out / LOADER, lambda file: file.write(loader))
-    return Exported(out, tuple(graphs), left_out, onnx.is_installed())
+    return Exported(out, tuple(graphs), left_out, apart, onnx.is_installed())
 
 
 def described(graph: Graph) -> dict[str, Any]:

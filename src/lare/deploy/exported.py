@@ -20,19 +20,50 @@ OPERATIONS = {
     "Sub": np.subtract,
     "Mul": np.multiply,
     "Div": np.divide,
+    "Pow": np.power,
     "Max": np.maximum,
     "Min": np.minimum,
+    "Neg": np.negative,
+    "Abs": np.abs,
+    "Sign": np.sign,
+    "Floor": np.floor,
+    "Ceil": np.ceil,
+    "Sqrt": np.sqrt,
+    "Reciprocal": np.reciprocal,
+    "Exp": np.exp,
+    "Log": np.log,
     "Cos": np.cos,
     "Sin": np.sin,
     "Tanh": np.tanh,
+    "Less": np.less,
+    "LessOrEqual": np.less_equal,
+    "Greater": np.greater,
+    "GreaterOrEqual": np.greater_equal,
+    "Equal": np.equal,
+    "And": np.logical_and,
+    "Or": np.logical_or,
+    "Not": np.logical_not,
     "Where": np.where,
     "MatMul": np.matmul,
+    "Reshape": np.reshape,
     "Identity": lambda x: x,
+    "Cast": lambda x: x.astype(np.float32),
     "Relu": lambda x: np.maximum(x, 0),
     "Sigmoid": lambda x: 1 / (1 + np.exp(-x)),
-    "ArgMax": lambda x: np.argmax(x, axis=-1),
-    "Concat": lambda *parts: np.concatenate(parts, axis=-1),
+    "ArgMax": np.argmax,
+    "ArgMin": np.argmin,
+    "Concat": lambda *parts, axis: np.concatenate(parts, axis=axis),
     "Gather": lambda table, number: table[number],
+    "Squeeze": lambda x, axes: np.squeeze(x, tuple(axes)),
+    "Unsqueeze": lambda x, axes: np.expand_dims(x, tuple(axes)),
+    "Slice": lambda x, start, end, axis, step: np.moveaxis(
+        np.moveaxis(x, axis[0], 0)[start[0] : end[0] : step[0]], 0, axis[0]
+    ),
+    "ReduceSum": lambda x, axes: np.sum(x, tuple(axes), keepdims=True),
+    "ReduceMean": lambda x, axes: np.mean(x, tuple(axes), keepdims=True),
+    "ReduceMax": lambda x, axes: np.max(x, tuple(axes), keepdims=True),
+    "ReduceMin": lambda x, axes: np.min(x, tuple(axes), keepdims=True),
+    "ReduceProd": lambda x, axes: np.prod(x, tuple(axes), keepdims=True),
 }
 
 
@@ -51,8 +82,9 @@ def load(name):
 
     def function(**inputs):
         values = constants | {key: np.asarray(inputs[key], graph["inputs"][key]["type"]) for key in graph["inputs"]}
-        for operation, arguments, result in graph["operations"]:
-            values[result] = OPERATIONS[operation](*(values[argument] for argument in arguments))
+        for operation, arguments, result, axis in graph["operations"]:
+            more = {} if axis is None else {"axis": axis}
+            values[result] = OPERATIONS[operation](*(values[argument] for argument in arguments), **more)
         return {key: values[key] for key in graph["outputs"]}
 
     return function
@@ -65,13 +97,13 @@ def reward(before, action, after, name="reward", **more):
     `length` or `alive`, where `export.json` lists them among the inputs.
     """
     given = {"before": before, "action": action, "after": after, **more}
-    if "phi" in described(name):
+    if "factors" in described(name)["inputs"]:
         given["factors"] = factors(before, action, after, name)
     return load(name)(**{key: given[key] for key in described(name)["inputs"]})["r_hat"]
 
 
 def factors(before, action, after, name="reward"):
-    """The factors phi(s, a) of steps, (batch, ..., factors).
+    """The factors phi(s, a) of steps, (batch, ..., factors), where phi could not be made a part of NAME.npz.
 
     A language model has written phi, and it has passed LaRe's checks. Here it runs in this process, without LaRe's sandbox.
     """

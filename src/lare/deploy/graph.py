@@ -20,6 +20,8 @@ class Operation(NamedTuple):
     name: str
     arguments: tuple[str, ...]
     result: str
+    axis: int | None = None
+    """For an operation that needs to know one."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +49,11 @@ class Graph:
         self.constants[name] = array.astype(np.float32) if array.dtype.kind == "f" else array
         return name
 
-    def apply(self, operation: str, *arguments: object, result: str | None = None) -> str:
+    def apply(self, operation: str, *arguments: object, result: str | None = None, axis: int | None = None) -> str:
         """Add an operation. Arguments that are not names become constants."""
         names = tuple(one if isinstance(one, str) else self.constant(one) for one in arguments)
         name = result or f"value_{len(self.operations)}"
-        self.operations.append(Operation(operation, names, name))
+        self.operations.append(Operation(operation, names, name, axis))
         return name
 
     def output(self, name: str, value: str, shape: tuple[int, ...], kind: str = "float32") -> None:

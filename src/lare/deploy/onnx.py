@@ -7,17 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from lare.deploy.graph import BATCH, Graph
+from lare.deploy.graph import BATCH, Graph, Operation
 from lare.files import write_atomically
 
-OPSET = 17
-"""Version of ONNX's operations. Runtimes of 2022 and later know it."""
-ATTRIBUTES: dict[str, dict[str, Any]] = {"ArgMax": {"axis": -1, "keepdims": 0}, "Concat": {"axis": -1}}
+OPSET = 18
+"""Version of ONNX's operations. Runtimes of 2023 and later know it."""
+ATTRIBUTES: dict[str, dict[str, Any]] = {"ArgMax": {"keepdims": 0}, "ArgMin": {"keepdims": 0}, "Cast": {"to": 1}}
+"""1 is float32."""
 
 
 def is_installed() -> bool:
     """Whether the package `onnx` is there."""
     return find_spec("onnx") is not None
+
+
+def attributes_of(operation: Operation) -> dict[str, Any]:
+    """What ONNX does not take as an array."""
+    found = ATTRIBUTES.get(operation.name, {})
+    return found if operation.axis is None else found | {"axis": operation.axis}
 
 
 def write(graph: Graph, path: Path, name: str) -> None:
@@ -35,10 +42,7 @@ def model(graph: Graph, name: str) -> Any:
         kinds = {key: helper.np_dtype_to_tensor_dtype(np.dtype(graph.kinds[key])) for key in shapes}
         return [helper.make_tensor_value_info(key, kinds[key], (BATCH, *shape)) for key, shape in shapes.items()]
 
-    nodes = [
-        helper.make_node(one.name, one.arguments, [one.result], **ATTRIBUTES.get(one.name, {}))
-        for one in graph.operations
-    ]
+    nodes = [helper.make_node(one.name, one.arguments, [one.result], **attributes_of(one)) for one in graph.operations]
     made = helper.make_graph(
         nodes,
         name,

@@ -48,7 +48,7 @@ def policy(actor: Any, config: TrainConfig, start: int) -> Graph:
         return graph
     if available is not None:
         values = graph.apply("Where", available, values, np.float32(UNAVAILABLE))
-    chosen = graph.apply("ArgMax", values)
+    chosen = graph.apply("ArgMax", values, axis=-1)
     graph.output("action", graph.apply("Add", chosen, np.int64(start)) if start else chosen, agents, "int64")
     return graph
 
@@ -95,7 +95,7 @@ def recurrent(graph: Graph, x: str, agent: Recurrent, env: EnvSpec) -> str:
     hidden = graph.input("hidden", (env.agents, width))
     last = graph.input("last_action", (env.agents,), "int64")
     table = np.eye(choices + 1, choices, dtype=np.float32)  # its last row stands for no action
-    x = graph.apply("Concat", x, graph.apply("Gather", table, last))
+    x = graph.apply("Concat", x, graph.apply("Gather", table, last), axis=-1)
     encoder = of_agents(agent.encoder, observed + choices, np.eye(env.agents, dtype=np.float32))
     x = graph.apply("Relu", graph.linear(x, encoder))
 

@@ -1,13 +1,13 @@
-"""The proxy rewards of a team as a graph: from factors and steps to r_hat, in the unit of the true rewards.
+"""The proxy rewards of a team as a graph: from steps to r_hat, in the unit of the true rewards.
 
-    factors [batch *agents factors]                 phi's, where the method has one
     before, after [batch *agents observation]       what a step set out from, and what it led to
     action [batch *agents action]                   in the environment's units; a choice is a row with a single 1
     length [batch *one]                             T of the step's episode, where the score is an average over its steps
     ->  r_hat [batch *agents]
 
-Only those inputs are there that the method looks at. Where credit is judged from the global state, `before` and `after` are states,
-`action` holds the actions of all agents side by side, and there is one r_hat for the team.
+Only those inputs are there that the method looks at. `phi` is a part of the graph. Where it has no translation (`phi.py`), what it
+says is an input instead: factors [batch *agents factors]. Where credit is judged from the global state, `before` and `after` are
+states, `action` holds the actions of all agents side by side, and there is one r_hat for the team.
 """
 
 import numpy as np
@@ -18,8 +18,12 @@ from lare.credit.decoders import Bottleneck, StepDecoder
 from lare.credit.decomposition import Decomposition, normalised, unit
 from lare.credit.methods import Encoder, Reward
 from lare.deploy.graph import Graph
+from lare.deploy.phi import factors
 from lare.deploy.policy import first
+from lare.deploy.rows import Rows, joined
+from lare.latent.function import LatentFunction
 from lare.normalise import CLIP, deviation
+from lare.tasks.spec import Judges
 from lare.training.config import TrainConfig
 
 STEP_DECODERS = (StepDecoder, Bottleneck, LinearDecoder)
@@ -38,19 +42,34 @@ def unexported(config: TrainConfig, decoder: object | None) -> str | None:
     return None
 
 
-def reward(credit: Decomposition | None, config: TrainConfig, place: int) -> Graph:
+def reward(
+    credit: Decomposition | None,
+    config: TrainConfig,
+    place: int,
+    phi: LatentFunction | None = None,
+    judges: Judges = "after",
+) -> Graph:
     """The graph of a team's proxy rewards, without optimism.
 
     Args:
         credit: the decoder of one seed; None where phi itself is the reward.
         config: of its run.
         place: of the team.
+        phi: to be a part of the graph. Without it, the graph takes factors, if the method needs any.
+        judges: which observations phi judges.
+
+    Raises:
+        Untranslatable: phi does something that has no translation.
     """
     graph, team = Graph(), config.env.teams[place]
     rows = () if config.of_state or team.size == 1 else (team.size,)
-    seen = [graph.input("factors", (*rows, config.factors[place]))] if config.method.latent else []
+    seen = []
+    if phi is not None:
+        seen.append(of_phi(graph, phi, judges, rows, config))
+    elif config.method.latent:
+        seen.append(graph.input("factors", (*rows, config.factors[place])))
     seen += raw(graph, config, rows, place)
-    x = graph.apply("Concat", *seen) if len(seen) > 1 else seen[0]
+    x = graph.apply("Concat", *seen, axis=-1) if len(seen) > 1 else seen[0]
     if credit is None:
         said = graph.apply("MatMul", x, np.ones(1, np.float32))
     else:
@@ -63,6 +82,26 @@ def reward(credit: Decomposition | None, config: TrainConfig, place: int) -> Gra
     return graph
 
 
+def of_phi(graph: Graph, phi: LatentFunction, judges: Judges, rows: tuple[int, ...], config: TrainConfig) -> str:
+    """What phi says of steps: of each agent by itself."""
+    width, parts = action_width(config), []
+    for which in ("before", "after") if judges == "both" else (judges,):
+        shown = graph.input(which, (*rows, config.shown))
+        action = graph.input("action", (*rows, width))
+        if rows:
+            shown = graph.apply("Reshape", shown, np.array([-1, config.shown]))
+            action = graph.apply("Reshape", action, np.array([-1, width]))
+        given = Rows(graph, shown, (config.shown,)), Rows(graph, action, (width,))
+        parts.append(factors(graph, phi.readable, *given))
+    z = joined(parts, axis=1)
+    return graph.apply("Reshape", z.name, np.array([-1, *rows, *z.shape])) if rows else z.name
+
+
+def action_width(config: TrainConfig) -> int:
+    """Numbers in the actions of a judged row."""
+    return config.env.action_size * (config.env.agents if config.of_state else 1)
+
+
 def raw(graph: Graph, config: TrainConfig, rows: tuple[int, ...], place: int) -> list[str]:
     """The raw part of what a decoder sees: as `training/learner.py`."""
     encoder, env = config.method.encoder, config.env
@@ -72,8 +111,7 @@ def raw(graph: Graph, config: TrainConfig, rows: tuple[int, ...], place: int) ->
     after = graph.input("after", shown) if encoder is not Encoder.STATE_ACTION else ""
     if encoder is Encoder.RAW and not config.raw_differences:
         return [after]
-    agents = env.agents if config.of_state else 1
-    action = graph.input("action", (*rows, agents * env.action_size))
+    action = graph.input("action", (*rows, action_width(config)))
     if not env.discrete:
         bounds = (
             (env.low, env.high)
