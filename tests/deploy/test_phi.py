@@ -127,3 +127,8 @@ def test_recorded_functions_have_a_translation(task, draw):
 def test_what_has_no_translation_is_named(body, message):
     with pytest.raises(Untranslatable, match=message):
         graph_of(program(body))
+
+
+def test_a_source_that_was_not_checked_is_not_read():
+    with pytest.raises(Untranslatable, match="a source that the gate has not passed"):
+        graph_of("")

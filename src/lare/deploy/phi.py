@@ -51,6 +51,8 @@ def factors(graph: Graph, source: str, observation: Rows, action: Rows) -> Rows:
     Raises:
         Untranslatable: it does something that has no translation.
     """
+    if not source:
+        raise Untranslatable("a source that the gate has not passed")
     try:
         walk = Walk(source)
         found = walk.call(walk.names[NAME], [observation, action])
