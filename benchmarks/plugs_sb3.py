@@ -1,13 +1,14 @@
 """What `lare.plugs.sb3` costs Stable-Baselines3, and what it gives.
 
     python benchmarks/plugs_sb3.py cost                                      results/plugs/sb3_cost.json
-    python benchmarks/plugs_sb3.py learn --algorithm td3 --rewards lare-bayes   results/plugs/sb3-td3-lare-bayes.jsonl
+    python benchmarks/plugs_sb3.py learn --algorithm td3 --rewards lare-bayes   results/plugs/td3-lare-bayes.jsonl
 
 `cost`: processor time of a whole step of TD3 on HalfCheetah-v4 with networks of 256-256, plain and with the plug, by turns within
 one process. A turn is one episode, so that a decoder in closed form is fitted in it. One core does.
 
 `learn`: true returns of the deterministic policy. `episodic` and `dense` are Stable-Baselines3 alone; everything else is a method,
-with the plug, and sees the return of whole episodes only. Hyperparameters of TD3 are the paper's; PPO's those of `sbx_learning.py`.
+with the plug, and sees the return of whole episodes only. Hyperparameters of TD3 are the paper's; those of PPO and of SBX's SAC are
+those of `sbx_learning.py`.
 """
 
 import json
@@ -48,13 +49,17 @@ def environment_of(task: lare.TaskSpec, dense: bool) -> gymnasium.Env:
     return made if dense else lare.EpisodicReward(made)
 
 
+def plug_of(task: lare.TaskSpec, rewards: str, seed: int) -> dict[str, Any]:
+    """What an algorithm with a replay buffer is given; nothing where it learns from what its environment pays."""
+    if rewards in ("dense", "episodic"):
+        return {}
+    credit = assigner(rewards, task, seed, capacity=TD3_SETTINGS["buffer_size"])
+    return {"replay_buffer_class": CreditReplayBuffer, "replay_buffer_kwargs": {"credit": credit}}
+
+
 def td3(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> TD3:
     """TD3 on the true rewards (`dense`), on the return (`episodic`), or on those of a method."""
-    environment = environment_of(task, rewards == "dense")
-    plug = {}
-    if rewards not in ("dense", "episodic"):
-        credit = assigner(rewards, task, seed, capacity=TD3_SETTINGS["buffer_size"])
-        plug = {"replay_buffer_class": CreditReplayBuffer, "replay_buffer_kwargs": {"credit": credit}}
+    environment, plug = environment_of(task, rewards == "dense"), plug_of(task, rewards, seed)
     noise = NormalActionNoise(np.zeros(task.action_size), 0.1 * np.ones(task.action_size))
     settings: Any = TD3_SETTINGS | {"policy_kwargs": dict(TD3_SETTINGS["policy_kwargs"])}  # SB3 writes into it
     return TD3(
@@ -67,6 +72,15 @@ def td3(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> TD3:
         **settings,
         **plug,
     )
+
+
+def sbx_sac(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> Any:
+    """SBX's SAC, likewise. SBX is imported here: it is not needed for the others."""
+    from sbx import SAC
+    from sbx_learning import OFF_POLICY
+
+    settings = {"learning_starts": warmup, "seed": seed, **OFF_POLICY, **plug_of(task, rewards, seed)}
+    return SAC("MlpPolicy", environment_of(task, rewards == "dense"), **settings)
 
 
 def ppo(task: lare.TaskSpec, rewards: str, seed: int) -> tuple[PPO, list[CreditCallback]]:
@@ -104,7 +118,7 @@ def cost(rounds: int = 4, steps: int = 1000, methods: tuple[str, ...] = ("lare-b
 
 
 def learn(
-    algorithm: Literal["td3", "ppo"] = "td3",
+    algorithm: Literal["td3", "ppo", "sbx-sac"] = "td3",
     rewards: str = "lare-bayes",
     task: str = TASK,
     seeds: int = 3,
@@ -113,7 +127,7 @@ def learn(
     episodes: int = 10,
     warmup: int = 10_000,
 ) -> None:
-    """Train, and append a line of JSON for each evaluation to results/plugs/sb3-ALGORITHM-REWARDS.jsonl.
+    """Train, and append a line of JSON for each evaluation to results/plugs/ALGORITHM-REWARDS.jsonl.
 
     Args:
         algorithm: whose learning curve.
@@ -127,12 +141,16 @@ def learn(
     """
     spec = lare.load_task(task)
     RESULTS.mkdir(parents=True, exist_ok=True)
-    out = RESULTS / f"sb3-{algorithm}-{rewards}.jsonl"
+    out = RESULTS / f"{algorithm}-{rewards}.jsonl"
     with out.open("a") as file:
         print(json.dumps({"task": task, "steps": steps, **provenance()}), file=file)
     true = gymnasium.make(spec.environment)
     for seed in range(seeds):
-        model, callbacks = ppo(spec, rewards, seed) if algorithm == "ppo" else (td3(spec, rewards, seed, warmup), [])
+        callbacks: list[Any] = []
+        if algorithm == "ppo":
+            model, callbacks = ppo(spec, rewards, seed)
+        else:
+            model = {"td3": td3, "sbx-sac": sbx_sac}[algorithm](spec, rewards, seed, warmup)
 
         def report(step: int, model: Any = model, seed: int = seed) -> None:
             line = {"step": step, "seed": seed, "evaluation/return": evaluate(model, true, seed, episodes)}
