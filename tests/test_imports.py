@@ -18,6 +18,8 @@ MODULES = {
 
 MUST_NOT_KNOW = {
     "errors": "tasks llm latent credit networks algorithms run training plugs logs experiments cli",
+    "foreign": "tasks llm latent credit networks algorithms run training plugs logs experiments cli",
+    "legible": "tasks llm latent credit networks algorithms run training plugs logs experiments cli",
     "files": "tasks llm latent credit networks algorithms run training plugs logs experiments cli",
     "source": "tasks llm latent credit networks algorithms run training plugs logs experiments cli",
     "networks": "tasks llm latent credit algorithms run training plugs logs experiments cli",

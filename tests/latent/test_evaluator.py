@@ -7,6 +7,7 @@ import pytest
 
 from lare.errors import LareError
 from lare.latent.evaluator import Evaluator, LatentRewardError
+from lare.latent.isolation import around
 from lare.latent.jailed import ROWS, WorkerFailed
 from lare.latent.program import Program
 from toys import PHI, phi
@@ -168,7 +169,7 @@ def test_what_the_gate_refuses_is_never_at_work():
 
 
 def test_isolation(near, layers):
-    assert near.isolation == f"a process of its own ({', '.join(layers) or 'without limits'})"
+    assert near.isolation == around(layers)
 
 
 def test_closed_it_does_not_work(evaluator):

@@ -7,6 +7,7 @@ from lare.errors import LareError
 from lare.latent import verify as verification
 from lare.latent.checks import CHECKS, Check
 from lare.latent.gate import inspect
+from lare.latent.isolation import around
 from lare.latent.jailed import JailedProgram, Returned, WorkerFailed
 from lare.latent.verify import random_steps, verify
 from lare.llm.recording import SHIPPED, read_recording
@@ -84,7 +85,7 @@ def test_a_sound_function_passes_every_check(chase, layers):
     assert verdict.passed
     assert verdict.checks == tuple(Check(name, True, "") for name in ORDER)
     assert (verdict.size, verdict.advice) == (2, ())
-    assert verdict.isolation == f"a process of its own ({', '.join(layers) or 'without limits'})"
+    assert verdict.isolation == around(layers)
 
 
 def test_advice_is_no_error(chase):

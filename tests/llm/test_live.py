@@ -117,7 +117,7 @@ def test_a_connection_that_breaks_is_tried_again(served, answer):
         (b'{"choices": [{}]}', "KeyError: 'message'"),
         (b'{"choices": [{"message": null}]}', "AttributeError"),
         (b'{"choices": [{"message": {"content": ["x"]}}]}', "TypeError: the content is not a text"),
-        (b"[" * 5_000, "RecursionError"),
+        (b"[" * 5_000, "ValueError: it is nested more than 64 deep"),
     ],
 )
 def test_an_answer_that_is_none_is_tried_again_and_then_named(served, body, said):

@@ -9,6 +9,7 @@ import tyro
 from tyro.conf import Positional
 
 from lare.errors import LareError
+from lare.legible import legible
 
 if TYPE_CHECKING:
     from lare.latent.verify import Steps
@@ -22,11 +23,6 @@ Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET")]
 
 WIDTH = 200
 """Characters in a line of a file."""
-
-
-def legible(text: str) -> str:
-    """A text that does not steer the terminal: some of what is printed a stranger has said."""
-    return "".join(letter if letter.isprintable() or letter in "\n\t" else "?" for letter in text)
 
 
 def say(text: str) -> None:

@@ -13,12 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError, shortened
+from lare.foreign import read_json, read_text
 from lare.latent.checks import Check
 from lare.latent.evaluator import Evaluator
 from lare.latent.names import factor_meanings, names_of
 from lare.latent.verify import Steps, verify
 from lare.llm.prompts import Kind
-from lare.tasks.spec import Judges, TaskSpec, read_text
+from lare.tasks.spec import Judges, TaskSpec
 
 LARGEST_FILE = 1 << 20
 """Bytes of a function file."""
@@ -250,12 +251,12 @@ def with_provenance(function: LatentFunction, record: Path) -> LatentFunction:
     if not record.is_file():
         return function
     try:
-        saved = json.loads(read_text(record))
+        saved = read_json(read_text(record))
         json.dumps(saved, ensure_ascii=False).encode()  # half a character can be read, and not be written again
         same = saved["source"] == function.source
         model, exchanges = saved["model"], tuple(saved["exchanges"])
         if not isinstance(model, str) or not all(isinstance(exchange, dict) for exchange in exchanges):
             raise TypeError("model or exchanges")
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise LareError(f"{record} is not the record of a latent function: {shortened(error)}") from error
     return replace(function, model=model if same else model + CHANGED, exchanges=exchanges)

@@ -9,7 +9,6 @@
 What a reply says is read by `reply`, whatever way it was asked for.
 """
 
-import json
 import os
 import re
 import time
@@ -18,6 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from lare.errors import LareError
+from lare.foreign import read_json
 from lare.llm.bounded import LARGEST_BODY, TIMEOUT, TooMuch, bound, in_time
 from lare.llm.budget import Budget, BudgetSpent
 from lare.llm.prompts import Message
@@ -191,14 +191,14 @@ class LiveModel:
     def read(self, body: bytes, messages: Sequence[Message], allowed: int) -> "str | Failure":
         """The text of a chat completion. An answer that is none is tried again: something is wrong on the way."""
         try:
-            answer = json.loads(body)
+            answer = read_json(body)
             choice = answer["choices"][0]
             message = choice["message"]
             text = message.get("content") or message.get("refusal") or ""
             if not isinstance(text, str):
                 raise TypeError("the content is not a text")
             text = text.encode(errors="replace").decode()  # half a character is none
-        except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+        except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
             self.budget.count(None, messages, body.decode(errors="replace"))
             return Failure(
                 self.scrubbed(f"the answer is not a chat completion ({type(error).__name__}: {error})"), again=True

@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import ConfigDict, Field
 
 from lare.errors import Checked, LareError
+from lare.foreign import integer, read_json, shallow
 
 LONGEST = 200_000
 """Characters of a reply."""
@@ -54,8 +55,8 @@ def parse(text: str) -> Reply:
         raise MalformedReply(f"the reply has {len(text)} characters; at most {LONGEST} are read")
     check_characters(text)
     try:
-        values = json.loads(text, strict=False)  # lines may end within a string
-    except (ValueError, RecursionError) as error:
+        values = read_json(text, strict=False)
+    except ValueError as error:
         values = embedded(text)
         if values is None:
             raise MalformedReply(f"the reply is not one JSON object: {error}") from error
@@ -85,11 +86,11 @@ def check_characters(text: str) -> None:
 
 def embedded(text: str) -> dict[str, Any] | None:
     """The last whole object that stands somewhere in a text, or the function that stands in a fence."""
-    decoder, partial = json.JSONDecoder(strict=False), None
+    decoder, partial = json.JSONDecoder(strict=False, parse_int=integer), None
     text = THOUGHT.split(text)[-1]
     for start in [match.start() for match in START.finditer(text)][: -MOST_STARTS - 1 : -1]:
         try:
-            value, _ = decoder.raw_decode(text, start)
+            value = shallow(decoder.raw_decode(text, start)[0])
         except (ValueError, RecursionError):
             continue
         if value.keys() >= KEYS:

@@ -26,6 +26,7 @@ from jaxtyping import Float
 
 from lare.errors import Checked, LareError
 from lare.files import write_atomically
+from lare.foreign import read_json, read_text
 from lare.latent.evaluator import LatentRewardError
 from lare.latent.function import LatentFunction, load, per_role
 from lare.run.checkpoint import STATE, saved_host
@@ -227,7 +228,7 @@ def read_config(directory: Path) -> Config:
     if not path.is_file():
         raise LareError(f"{directory} is not a run: there is no {CONFIG} in it")
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = read_json(read_text(path))
         if not isinstance(values, dict):
             raise LareError("it is JSON, but not an object")
         if values.get("format") != FORMAT:
