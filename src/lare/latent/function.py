@@ -18,6 +18,7 @@ from lare.latent.checks import Check
 from lare.latent.evaluator import Evaluator
 from lare.latent.names import factor_meanings, names_of
 from lare.latent.verify import Steps, verify
+from lare.llm.key import without_key
 from lare.llm.prompts import Kind
 from lare.tasks.spec import Judges, TaskSpec
 
@@ -154,8 +155,12 @@ class LatentFunction:
         )
         top = (" ".join(line.split()) for line in top)  # a name may be anybody's: nothing of it becomes a line of code
         try:
-            path.write_text("".join(f"{HEADER}{line}\n" for line in top) + self.source + "\n", encoding="utf-8")
-            path.with_suffix(".json").write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+            path.write_text(
+                without_key("".join(f"{HEADER}{line}\n" for line in top) + self.source + "\n"), encoding="utf-8"
+            )
+            path.with_suffix(".json").write_text(
+                without_key(json.dumps(asdict(self), indent=1)) + "\n", encoding="utf-8"
+            )
         except OSError as error:
             raise LareError(f"{path} cannot be written: {error.strerror}") from error
 

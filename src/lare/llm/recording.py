@@ -10,6 +10,7 @@ from pathlib import Path
 from lare.errors import Checked, LareError
 from lare.files import replace
 from lare.foreign import read_json
+from lare.llm.key import without_key
 from lare.llm.prompts import Kind, Message, Stage
 
 SHIPPED = files("lare.llm") / "recordings"
@@ -158,4 +159,4 @@ class Recorder:
             temperature=self.temperature,
             exchanges=self.exchanges,
         )
-        return recording.model_dump_json(indent=1) + "\n"
+        return without_key(recording.model_dump_json(indent=1)) + "\n"

@@ -8,6 +8,7 @@ from pydantic import ConfigDict, Field
 
 from lare.errors import Checked, LareError
 from lare.foreign import integer, read_json, shallow
+from lare.llm.key import without_key
 
 LONGEST = 200_000
 """Characters of a reply."""
@@ -69,9 +70,9 @@ def parse(text: str) -> Reply:
     for part in (reply.understand, reply.analyze, reply.functions):
         check_characters(part)
     inner = FENCE.search(reply.functions)
-    if inner is None or "def " in reply.functions[: inner.start()]:
-        return reply
-    return reply.model_copy(update={"functions": inner[2]})
+    functions = reply.functions if inner is None or "def " in reply.functions[: inner.start()] else inner[2]
+    texts = {"understand": reply.understand, "analyze": reply.analyze, "functions": functions}
+    return reply.model_copy(update={name: without_key(text) for name, text in texts.items()})
 
 
 def check_characters(text: str) -> None:
