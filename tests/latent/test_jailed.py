@@ -226,7 +226,6 @@ def test_the_gate_stands_in_the_worker(worker):
     program = worker(phi("x = open('a')\nreturn [np.load(x)]"))
     assert [str(problem) for problem in program.problems] == [
         "E-CALL line 2: open is not a function that is available",
-        "E-STRING line 2: the string 'a' is not available here",
         "E-NUMPY line 3: np.load is not available: it reads or writes files",
     ]
 
