@@ -12,7 +12,7 @@ import pytest
 
 from lare.latent import checks
 from lare.latent.checks import CHECKS, Check, Failed, Trial, advice, examine
-from lare.latent.jailed import ROWS, JailedProgram, Returned
+from lare.latent.jailed import ROWS, SIZES, JailedProgram, Returned
 
 STEPS = 256
 
@@ -265,6 +265,9 @@ ROWS_APART = "E-ROWS: factor {} of a row depends on the other rows: compute alon
         (lambda o, a: [a, a, np.argsort(a, axis=0)], 3),
         (lambda o, a: [a * (1 + 1e-7 * (a.max() > 1))], 1),
         (lambda o, a: [a + 1e-12 * a.astype(np.float64).sum()], 1),
+        *[(lambda o, a, by=by: [np.roll(a, by, axis=0)], 1) for by in (2, 4, 64, 128, 255)],
+        (lambda o, a: [1e4 + 0.4 * np.roll(np.tanh(a), 2, axis=0)], 1),
+        (lambda o, a: [np.where(np.arange(len(a))[:, None] == 17, np.roll(a, 5, axis=0), a)], 1),
     ],
 )
 def test_rows_apart(function, number):
@@ -285,6 +288,13 @@ def test_rows_apart_cannot_see_the_size_of_the_batch():
             (lambda o, a, rows=rows: [a + (len(a) == rows)], f"in a batch of {rows} than in one of 256")
             for rows in (1, 3, 16, ROWS)
         ],
+        *[
+            (lambda o, a, rows=rows: [a - a.mean() * (len(a) == rows)], f"in a batch of {rows} than in one of 256")
+            for rows in SIZES[1:]
+            if rows != 256
+        ],
+        (lambda o, a: [1e4 + 0.4 * np.roll(np.tanh(a), 2, axis=0)], "when the batch is in another order"),
+        (lambda o, a: [1e4 + 0.4 * np.sign(np.arange(len(a)) % 2)[:, None]], "when the batch is in another order"),
         (lambda o, a: [a, a / len(a)], "in a batch of 1 than in one of 256"),
         (lambda o, a: [a * (1 + 1e-3 * (len(a) == 3))], "in a batch of 3 than in one of 256"),
     ],

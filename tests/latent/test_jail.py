@@ -434,6 +434,7 @@ def forge(line):
         ("os._exit(7)", "it ended (exit status 7)"),
         ("os._exit(0)", "it ended (exit status 0)"),
         ("os.write(2, b'one\\nhelp!\\n')\nos._exit(7)", "it ended (exit status 7: help!)"),
+        ("os.write(2, '\\x1b[2J\\u202eno\\n'.encode())\nos._exit(7)", "it ended (exit status 7: ?[2J?no)"),
         ("ctypes.string_at(0)", f"it ended (signal {signal.SIGSEGV})"),
         ("ctypes.memset(observation.ctypes.data, 1, 4)", f"it ended (signal {signal.SIGSEGV})"),
         # Says something else than an answer

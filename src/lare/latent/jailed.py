@@ -38,6 +38,9 @@ from lare.legible import in_a_line
 ROWS = 4096
 """Rows of one call; a larger batch takes several."""
 
+SIZES = tuple(1 << power for power in range(ROWS.bit_length()))
+"""Rows that a call has in training. A program that does something else with some number of rows is met in verification."""
+
 TIME_LIMIT = 30.0
 """Seconds for one answer."""
 
