@@ -20,8 +20,15 @@ def test_what_is_nested_too_deep_is_refused(begin, end, read, deep):
 
 
 def test_dots_nest_tables_without_a_bracket():
-    with pytest.raises(ValueError, match=f"^{DEEP}$"):
-        read_toml(f"{'a.' * 5000}a = 1")
+    for dotted in (
+        "a." * 200_000 + "a = 1",
+        f"[{'a . ' * 5000}a]",
+        "x = {" + '"a".' * 5000 + "a = 1}",
+        "'a'." * 64 + "a = 1",
+    ):
+        with pytest.raises(ValueError, match=f"^{DEEP}$"):
+            read_toml(dotted)
+    assert read_toml("a" * 900_000 + " = 1\nb = 'One. Two. Three.'\n" + "c." * 60 + "c = 1")["b"] == "One. Two. Three."
 
 
 def test_what_is_nested_less_is_read():

@@ -4,6 +4,7 @@ Everything that is read back goes through here, our own files too: they may be d
 """
 
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,9 @@ DEEPEST = 64
 
 MOST_DIGITS = 1000
 """Of a whole number. Python itself gives up at 4300, with advice that is for programmers."""
+
+DOTS = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{DEEPEST}}}""")
+"""A name of a table within tables, for which the parser takes quadratic time."""
 
 LARGEST_TEXT = 64 << 20
 """Bytes of a file that holds texts: a recording of a hundred long replies has as many."""
@@ -51,6 +55,8 @@ def read_json(text: str | bytes, strict: bool = True) -> Any:
 
 def read_toml(text: str) -> dict[str, Any]:
     """What a text says in TOML. Raises `ValueError` as `read_json`."""
+    if DOTS.search(text):
+        raise ValueError(TOO_DEEP)
     try:
         return shallow(tomllib.loads(text))
     except RecursionError:

@@ -37,8 +37,8 @@ def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     table = Table(*head, box=None, pad_edge=False)
     table.columns[0].no_wrap = True
     for row in rows:
-        table.add_row(*row)
-    Console(width=None if sys.stdout.isatty() else WIDTH).print(table)
+        table.add_row(*map(legible, row))
+    Console(width=None if sys.stdout.isatty() else WIDTH, markup=False).print(table)
 
 
 def progress(text: str) -> None:

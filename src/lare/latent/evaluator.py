@@ -67,7 +67,8 @@ class Evaluator:
         for start in range(0, max(1, len(observation)), ROWS):
             part = observation[start : start + ROWS], action[start : start + ROWS]
             size = verified_size(len(part[0]))
-            found = factors_of(self.program.call(*(padded(array, size) for array in part)), size, "factors")
+            returned = self.program.call(padded(part[0], size), padded(part[1], size))
+            found = factors_of(returned, size, "factors")
             parts.append(found[: len(part[0])])
         sizes = {part.shape[1] for part in parts}
         if sizes != {len(self.names)}:

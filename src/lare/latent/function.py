@@ -20,6 +20,7 @@ from lare.latent.names import factor_meanings, names_of
 from lare.latent.verify import Steps, verify
 from lare.llm.key import without_key
 from lare.llm.prompts import Kind
+from lare.llm.recording import Exchange
 from lare.tasks.spec import Judges, TaskSpec
 
 LARGEST_FILE = 1 << 20
@@ -259,9 +260,9 @@ def with_provenance(function: LatentFunction, record: Path) -> LatentFunction:
         saved = read_json(read_text(record))
         json.dumps(saved, ensure_ascii=False).encode()  # half a character can be read, and not be written again
         same = saved["source"] == function.source
-        model, exchanges = saved["model"], tuple(saved["exchanges"])
-        if not isinstance(model, str) or not all(isinstance(exchange, dict) for exchange in exchanges):
-            raise TypeError("model or exchanges")
-    except (ValueError, KeyError, TypeError) as error:
+        model, exchanges = saved["model"], tuple(Exchange(**one).model_dump() for one in saved["exchanges"])
+        if not isinstance(model, str):
+            raise TypeError("model")
+    except (LareError, ValueError, KeyError, TypeError) as error:
         raise LareError(f"{record} is not the record of a latent function: {shortened(error)}") from error
     return replace(function, model=model if same else model + CHANGED, exchanges=exchanges)

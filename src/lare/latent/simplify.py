@@ -120,7 +120,7 @@ class Simplify(ast.NodeTransformer):
         name = node.func.id if isinstance(node.func, ast.Name) else ""
         simple = not starred(node.args) and all(one.arg for one in node.keywords)
         if name == "dict" and simple and node.keywords and not node.args:
-            keys = [ast.Constant(one.arg) for one in node.keywords]
+            keys: list[ast.expr | None] = [ast.Constant(one.arg) for one in node.keywords]
             return ast.copy_location(ast.Dict(keys, [one.value for one in node.keywords]), node)
         if name == "float" and len(node.args) == 1 and is_infinity(node.args[0]):
             return ast.copy_location(full_name("math.inf"), node)
@@ -148,7 +148,7 @@ def comprehension(name: str, function: ast.expr, *values: ast.expr) -> ast.ListC
     else:
         names = [f"$item{number}" for number in range(len(values))]  # which no source can spell
         body = ast.Call(function, [ast.Name(one, ast.Load()) for one in names], [])
-    targets = [ast.Name(one, ast.Store()) for one in names]
+    targets: list[ast.expr] = [ast.Name(one, ast.Store()) for one in names]
     target = targets[0] if len(targets) == 1 else ast.Tuple(targets, ast.Store())
     gone_through = values[0] if len(values) == 1 else call("zip", *values)
     if name == "map":
