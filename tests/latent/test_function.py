@@ -306,3 +306,9 @@ def test_save_nowhere(sound, tmp_path):
 def test_headers_beneath_headers_cost_no_time():
     """In a square of them a function file would take minutes."""
     assert normal("# lare: \n\n" * 60_000 + "\nx\n\n") == "x"
+
+
+def test_a_warning_sign_in_a_comment_is_welcome(chase):
+    function = verified(phi("# \u26a0\ufe0f mind the sign\nreturn [-action]"), chase)
+    assert "# \u26a0 mind" in function.source
+    assert "\ufe0f" not in function.source

@@ -844,6 +844,12 @@ def test_letters_of_other_scripts_are_for_comments(code, letter, line):
     ]
 
 
+@pytest.mark.parametrize("end", ["\r", "\r\n", "\f\n"])
+def test_lines_may_end_as_they_like(end):
+    source = "def evaluation_func(o, a):\n    # ü\n    return [o]\n"
+    assert inspect(source.replace("\n", end)) == []
+
+
 @pytest.mark.parametrize("letter", ["\t", "\r\n", "ü", "→", "─", "π", "🙂"])
 def test_letters_that_are_welcome_in_comments(letter):
     assert inspect(f"def evaluation_func(o, a):\n    # upright {letter}# and calm\n    return [o]\n") == []

@@ -29,6 +29,8 @@ LARGEST_FILE = 1 << 20
 CHANGED = "; changed by hand since"
 """Stands behind the model's name where a source is not the one that was saved."""
 
+VARIATION = "\ufe0f"
+
 HEADER = "# lare: "
 """Marks the lines that `save` puts on top of the source."""
 
@@ -167,8 +169,12 @@ class LatentFunction:
 
 
 def normal(source: str) -> str:
-    """The source as it is kept: line ends of one kind, no blank lines around it, and no header but that of `save`."""
-    lines = itertools.dropwhile(lambda line: not line or line.startswith(HEADER), source.splitlines())
+    """The source as it is kept: line ends of one kind, no blank lines around it, and no header but that of `save`.
+
+    What makes a sign a coloured picture is left out: models write warning signs into comments, and nobody sees it alone.
+    """
+    text = source.replace(VARIATION, "")
+    lines = itertools.dropwhile(lambda line: not line or line.startswith(HEADER), text.splitlines())
     return "\n".join(lines).rstrip("\n")
 
 

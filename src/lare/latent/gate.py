@@ -49,7 +49,10 @@ def inspect(source: str) -> list[Problem]:
         return [Problem("E-NUMBER" if said == HUGE else "E-SYNTAX", error.lineno or 1, said)]
     except (ValueError, MemoryError, RecursionError) as error:
         return [Problem("E-SYNTAX", 1, f"this cannot be parsed: {str(error) or type(error).__name__}")]
-    foreign = list(other_letters(source))
+    try:
+        foreign = list(other_letters(source))
+    except (tokenize.TokenError, SyntaxError):  # the parser's own eyes are others
+        foreign = [Problem("E-SYNTAX", 1, "this cannot be taken apart: write it in ASCII")]
     if foreign:
         return foreign
     # What is written in other words may go deeper in those of the language.
@@ -64,7 +67,7 @@ def other_letters(source: str) -> Iterator[Problem]:
     """Letters that are not ASCII, outside of comments and strings. The source has been parsed."""
     if source.isascii():
         return
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+    for token in tokenize.generate_tokens(io.StringIO(source, newline=None).readline):
         if token.type not in LETTERS and not token.string.isascii():
             letter = next(one for one in token.string if not one.isascii())
             said = f"{letter!a} is no letter of a program: only ASCII stands outside of comments"
