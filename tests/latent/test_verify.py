@@ -67,7 +67,7 @@ ORDER = ["gate", *CHECKS]
             [
                 "E-FLOW line 4: a decision depends on values of the batch: use np.where instead of if, and, or, max, min",
                 "E-LOOP: it makes 65 turns for 64 rows and 1032 for 1031: no loop over the batch, use whole arrays",
-                "E-ROWS: factor 1 of a row depends on the other rows: compute along axis=1, never over the batch",
+                "E-ROWS line 3: numbers of two rows meet: compute along axis=1, never over the batch",
                 "E-BATCH: a step has other factors when the batch is in another order",
                 "E-EMPTY: a batch without rows: "
                 "E-RUN line 3: IndexError: index 0 is out of bounds for axis 0 with size 0",
@@ -99,6 +99,12 @@ def test_advice_is_no_error(chase):
         "factor 'still' never varies on the recorded steps",
         "factor 'again' repeats 'action' on the recorded steps",
     )
+
+
+def test_what_is_not_proved_is_said(chase):
+    verdict = verify(phi("return [np.outer(action[:, 0], np.ones(1))]"), chase)
+    assert verdict.passed
+    assert verdict.advice == ("that rows do not touch was tried, not proved: np.outer in line 2",)
 
 
 def test_a_reward_is_exactly_one(chase):

@@ -74,6 +74,8 @@ class Trial:
     size: int | None = None
     """Number of factors, when it is known."""
     random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    unproved: str = ""
+    """Why it is not proved that rows do not touch; empty where it is."""
 
     def steps(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
         """The recorded steps, as often as it takes."""
@@ -233,11 +235,28 @@ def deterministic(trial: Trial) -> None:
             raise failed("E-CHANCE", f"the same steps have other factors {where}: a factor must not depend on chance")
 
 
+def prove_rows_apart(trial: Trial) -> None:
+    """No number of one row goes into another, in a batch of any size that training has, whatever the values are.
+
+    Where an operation is not known for that, nothing is proved: that rows are apart is only tried then.
+    """
+    for rows in SIZES[1:]:  # one row is alone
+        returned = trial.program.call(*trial.steps(rows), "rows")
+        kind, _, said = (returned.error or "").partition(": ")
+        if kind == "Mixed":
+            where = f", in a batch of {rows}" if rows > SIZES[1] else ""
+            raise failed("E-ROWS", f"{said}{where}: compute along axis=1, never over the batch", returned.line)
+        if returned.error is not None:
+            trial.unproved = f"{said or kind}{f' in line {returned.line}' if returned.line else ''}"
+            return
+
+
 def rows_apart(trial: Trial) -> None:
-    """A row's factors stay the same, bit for bit, whatever stands in the other rows.
+    """A row's factors are its own: proved, where that can be; and the same, bit for bit, whatever stands in the other rows.
 
     Halves by chance: of any two rows, some half keeps one and changes the other.
     """
+    prove_rows_apart(trial)
     known = trial.known
     halves = trial.random.random((HALVES, len(known))) < 0.5
     for kept, strength in zip((*halves, *~halves), itertools.cycle((1, 3, 1000)), strict=False):

@@ -47,8 +47,9 @@ TIME_LIMIT = 30.0
 LONGEST_ANSWER = 1 << 16
 """Bytes."""
 
-Mode = Literal["plain", "oblivious", "strict", "traced"]
-"""A plain call; on arrays that refuse to be looked into; with floating-point errors raised; with memory traced."""
+Mode = Literal["plain", "oblivious", "rows", "strict", "traced"]
+"""A plain call; on arrays that refuse to be looked into; on arrays that know which row each number depends on; with floating-point
+errors raised; with memory traced."""
 
 START = "import sys; sys.path[:] = {path!r}; from lare.latent.worker import main; main({argument!r})"
 

@@ -85,7 +85,9 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | N
                 return Verdict(checks, 0, isolation=program.isolation)
             factors = trial.known
             size = factors.shape[1]
-            return Verdict(checks, size, tuple(advice(factors, names_of(source, size))), program.isolation)
+            said = advice(factors, names_of(source, size))
+            said += [f"that rows do not touch was tried, not proved: {trial.unproved}"] if trial.unproved else []
+            return Verdict(checks, size, tuple(said), program.isolation)
     except (WorkerFailed, Failed) as error:
         return Verdict((Check("runs", False, f"E-RUN: {error}"),), 0)
 

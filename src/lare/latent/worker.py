@@ -6,6 +6,7 @@ returns: whoever is in jail is no witness. It says what came back, and the paren
 """
 
 import builtins
+import contextlib
 import faulthandler
 import functools
 import gc
@@ -27,6 +28,7 @@ from lare.latent import gate, jail
 from lare.latent.language import NAME
 from lare.latent.oblivious import careful_functions, hidden
 from lare.latent.program import FILE, Program
+from lare.latent.rows import FUNCTIONS, Mixed, Unproved, check_own, labelled
 
 MOST_FACTORS = 32
 MOST_PROBLEMS = 30
@@ -107,7 +109,8 @@ def load(source: str, functions: Any, gated: bool) -> dict[str, Function]:
     """The program, as it is called in each mode."""
     if gated:
         program, watched = Program(source), Program(source, functions)
-        return {"plain": program, "strict": program, "traced": program, "oblivious": watched}
+        modes = {"plain": program, "strict": program, "traced": program}
+        return modes | {"oblivious": watched, "rows": Program(source, FUNCTIONS)}
     names: dict[str, Any] = {"__builtins__": builtins, "np": np}
     exec(compile(source, FILE, "exec", dont_inherit=True), names)
     return dict.fromkeys(("plain", "strict", "traced"), names[NAME])
@@ -129,6 +132,8 @@ def warm(functions: Any) -> None:
     with np.errstate(all="ignore"):
         np.concatenate(Program(source)(x, x), axis=1)
         Program(source, functions)(hidden(x), hidden(x))
+        with contextlib.suppress(Unproved, Mixed):
+            Program(source, FUNCTIONS)(labelled(x), labelled(x))
     tracemalloc.start()
     tracemalloc.stop()
     gc.collect()
@@ -146,6 +151,8 @@ def serve(
     inputs = arrays(memory[0], rows, sizes, request["type"])
     if mode == "oblivious":
         inputs = hidden(inputs)
+    if mode == "rows":
+        inputs = labelled(inputs[0]), labelled(inputs[1])
     if mode == "traced":
         tracemalloc.start()
     try:
@@ -153,6 +160,8 @@ def serve(
             values = function(*inputs)
             answer = {"values": describe(values)}
             if fits(values, rows):
+                if mode == "rows":
+                    check_own(values, rows)
                 out = np.frombuffer(memory[1], np.float64, rows * len(values))
                 np.concatenate(values, axis=1, out=out.reshape(rows, len(values)), casting="unsafe")
     except BaseException as error:  # the same
