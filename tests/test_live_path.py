@@ -137,7 +137,7 @@ def test_a_design_that_fails_says_so_in_one_line(serve, command):
     assert status == 1
     assert said == [
         "lare: task 'Reacher-v4': none of 5 attempts passed; the last one failed: E-CALL line 1: open is not a function that is "
-        "available (and 4 more)"
+        "available (and 2 more)"
     ]
 
 
