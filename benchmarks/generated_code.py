@@ -108,7 +108,7 @@ HOSTILE = """
 __import__('os') open('/etc/passwd') eval('1') exec('1') globals() getattr(np,'load') type(observation) np.load('x')
 np.__dict__ len.__self__ observation.ctypes observation.base observation.tofile('x') np.random.rand() (lambda:0).__globals__
 f'{observation.__class__}' '{0.__class__}'.format(1) [].__class__ np.f2py np.ndarray((3,)) np.empty(3) observation.view('O')
-np.array([1],'O') observation.astype('O') (x:=1) np.frompyfunc(len,1,1) observation.flags np.save('x',1) print(1) vars()
+np.array([1],'O') observation.astype('O') (np:=1) np.frompyfunc(len,1,1) observation.flags np.save('x',1) print(1) vars()
 np.add.at(observation,0,1) np.add(observation,1,observation) np.fromfile('x') np.linalg np math __builtins__ breakpoint()
 (yield) (await x) np.apply_along_axis(len,1,observation) np.errstate(call=print) float('nan') id(observation) hash('x')
 """.split()

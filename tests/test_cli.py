@@ -157,7 +157,6 @@ def test_verify_prints_every_error(command, spec_file, tmp_path):
         "        E-IMPORT line 1: import os: only `import numpy as np` and `import math` are available",
         "        E-CALL line 3: open is not a function that is available",
         "        E-NUMPY line 3: np.clamp is not available: there is no such function; write np.clip",
-        "        E-STRING line 3: the string 'x' is not available here",
     ]
 
 

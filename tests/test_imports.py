@@ -18,6 +18,8 @@ MODULES = {
 
 MUST_NOT_KNOW = {
     "errors": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
+    "foreign": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
+    "legible": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
     "files": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
     "source": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
     "networks": "tasks llm latent credit algorithms run training plugs logs experiments deploy cli",

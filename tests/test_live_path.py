@@ -96,6 +96,9 @@ def test_when_nothing_passes_every_attempt_is_kept(serve, command, tmp_path):
         status, out, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1)
         assert (status, out) == (1, "")
         assert "none of 5 attempts passed; the last one failed: the reply is not one JSON object" in err
+        assert err.count("none of 5 attempts passed") == len(
+            [line for line in err.splitlines() if "lare: task" in line]
+        )
         assert f"every attempt is kept in {name}" in err
         kept = read_recording((tmp_path / name).read_text(), name)
         assert [exchange.stage for exchange in kept.exchanges] == ["candidate", *["correct"] * 4]
@@ -126,6 +129,35 @@ def test_what_was_said_is_kept_when_the_budget_ends(serve, command, tmp_path):
     assert [exchange.stage for exchange in kept.exchanges] == ["candidate", "correct"]
 
 
+def test_a_design_that_fails_says_so_in_one_line(serve, command):
+    wrong = json.dumps({"Understand": "", "Analyze": "", "Functions": "x = open('a')\ny = eval('b')"})
+    server = serve(says(wrong))
+    status, _, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1)
+    said = [line for line in err.splitlines() if line.startswith("lare: ")]
+    assert status == 1
+    assert said == [
+        "lare: task 'Reacher-v4': none of 5 attempts passed; the last one failed: E-CALL line 1: open is not a function that is "
+        "available (and 2 more)"
+    ]
+
+
+def test_a_server_that_fails_does_not_steer_the_terminal(serve, command):
+    server = serve(refuses(401, "\x1b[2J\u202eno\U000e0041"))
+    status, _, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url)
+    assert status == 2
+    assert err.splitlines()[-1] == "lare: m did not answer: HTTP 401: Error code: 401 - ?[2J?no?"
+    assert err.isascii()
+
+
+def test_the_minutes_of_a_design_are_a_setting(serve, command):
+    server = serve(refuses(503))
+    asked = ("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--minutes", 0.02)
+    status, _, err = command(*asked)
+    assert status == 2
+    assert err.startswith("m: waiting for a reply, 1 s at most (1 s are left for all)\n")
+    assert "lare: the 1 s of waiting for the model are over (" in err
+
+
 def test_what_a_model_says_does_not_steer_the_terminal(serve, command):
     server = serve(says('{"Functions": 1, "\x1b]0;gone\x07": 2}'), says("\x1b[31mno"))
     asked = ("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1, "--requests", 2)
@@ -142,10 +174,11 @@ def test_what_a_model_says_does_not_steer_the_terminal(serve, command):
         ),
         (["--model", "m", "--budget", -5], "budget = -5: at least one is needed"),
         (["--model", "m", "--requests", 0], "requests = 0: at least one is needed"),
+        (["--model", "m", "--minutes", 0], "minutes = 0.0: a number above 0"),
         (["--model", "m", "--temperature", "nan"], "temperature = nan: a number from 0 on"),
         (
             ["--temperature", 1],
-            "--budget, --requests, --price and --temperature are for a live model: say which one with --model NAME",
+            "--budget, --requests, --minutes, --price and --temperature are for a live model: say which one with --model NAME",
         ),
         (["--policy", "runs/x"], "--policy plays episodes for --reflect: say how many rounds"),
         (["--reflect", -1], "reflect = -1: there can be no fewer rounds than none"),

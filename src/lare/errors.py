@@ -64,7 +64,10 @@ def completed(default: Any, given: Any) -> Any:
 
 def shortened(value: Any) -> str:
     """How a value is written, as far as it fits into a line."""
-    text = " ".join(map(str.strip, repr(value).splitlines()))  # arrays take several
+    try:
+        text = " ".join(map(str.strip, repr(value).splitlines()))  # arrays take several
+    except Exception:  # it may be anybody's: nested too deep, or of a class that cannot be shown
+        return f"a {type(value).__name__} that cannot be shown"
     return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]}..."
 
 

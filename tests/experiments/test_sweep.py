@@ -361,14 +361,14 @@ def test_metrics_that_make_no_sense(file, in_this_process):
     run_sweep(wanted, jobs[:1], lambda _: None)
     path = jobs[0].directory / "metrics.jsonl"
     path.write_text('{"step": 1\n')
-    with pytest.raises(LareError, match=r"metrics\.jsonl is damaged: Expecting ',' delimiter"):
+    with pytest.raises(LareError, match=r"metrics\.jsonl is damaged: Expecting ',' delimiter: .* in line 1$"):
         jobs[0].step()
     for line in ("5", "{}", "null", '{"step": 1}', '{"step": "1", "seed": 0}'):
         path.write_text(f'{{"step": 1, "seed": 0}}\n{line}\n')
         with pytest.raises(LareError, match=r"metrics\.jsonl is damaged: line 2 is no evaluation"):
             jobs[0].step()
     path.write_bytes(b"\xff\n")
-    with pytest.raises(LareError, match=r"metrics\.jsonl is damaged: 'utf-8' codec can't decode byte 0xff"):
+    with pytest.raises(LareError, match=r"metrics\.jsonl cannot be read: 'utf-8' codec can't decode byte 0xff"):
         jobs[0].step()
 
 

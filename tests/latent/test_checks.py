@@ -3,6 +3,7 @@
 Most of them are plain functions in this process, which take the place of a worker; what comes at the end runs in one.
 """
 
+import dataclasses
 import itertools
 import json
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from lare.latent import checks
 from lare.latent.checks import CHECKS, Check, Failed, Trial, advice, examine
-from lare.latent.jailed import ROWS, JailedProgram, Returned
+from lare.latent.jailed import ROWS, SIZES, JailedProgram, Returned
 
 STEPS = 256
 
@@ -251,7 +252,8 @@ def test_deterministic():
     assert message("deterministic", nearly) == OTHER.format("in another process")
 
 
-ROWS_APART = "E-ROWS: factor {} of a row depends on the other rows: compute along axis=1, never over the batch"
+ALONG = "compute along axis=1, never over the batch"
+ROWS_APART = f"E-ROWS: factor {{}} of a row depends on the other rows: {ALONG}"
 
 
 @pytest.mark.parametrize(
@@ -265,6 +267,9 @@ ROWS_APART = "E-ROWS: factor {} of a row depends on the other rows: compute alon
         (lambda o, a: [a, a, np.argsort(a, axis=0)], 3),
         (lambda o, a: [a * (1 + 1e-7 * (a.max() > 1))], 1),
         (lambda o, a: [a + 1e-12 * a.astype(np.float64).sum()], 1),
+        *[(lambda o, a, by=by: [np.roll(a, by, axis=0)], 1) for by in (2, 4, 64, 128, 255)],
+        (lambda o, a: [1e4 + 0.4 * np.roll(np.tanh(a), 2, axis=0)], 1),
+        (lambda o, a: [np.where(np.arange(len(a))[:, None] == 17, np.roll(a, 5, axis=0), a)], 1),
     ],
 )
 def test_rows_apart(function, number):
@@ -285,6 +290,13 @@ def test_rows_apart_cannot_see_the_size_of_the_batch():
             (lambda o, a, rows=rows: [a + (len(a) == rows)], f"in a batch of {rows} than in one of 256")
             for rows in (1, 3, 16, ROWS)
         ],
+        *[
+            (lambda o, a, rows=rows: [a - a.mean() * (len(a) == rows)], f"in a batch of {rows} than in one of 256")
+            for rows in SIZES[1:]
+            if rows != 256
+        ],
+        (lambda o, a: [1e4 + 0.4 * np.roll(np.tanh(a), 2, axis=0)], "when the batch is in another order"),
+        (lambda o, a: [1e4 + 0.4 * np.sign(np.arange(len(a)) % 2)[:, None]], "when the batch is in another order"),
         (lambda o, a: [a, a / len(a)], "in a batch of 1 than in one of 256"),
         (lambda o, a: [a * (1 + 1e-3 * (len(a) == 3))], "in a batch of 3 than in one of 256"),
     ],
@@ -410,10 +422,10 @@ FIRST_MESSAGE = {
         "E-RUN line 3: MemoryError: "
         "Unable to allocate 7.28 TiB for an array with shape (1000000, 1000000) and data type float64"
     ),
-    "batch_max_scale": ROWS_APART.format(1),
-    "forgot_axis": ROWS_APART.format(1),
-    "neighbour_roll": ROWS_APART.format(1),
-    "cumsum_batch": ROWS_APART.format(1),
+    "batch_max_scale": f"E-ROWS line 4: this goes over the batch: {ALONG}",
+    "forgot_axis": f"E-ROWS line 4: this goes over the batch: {ALONG}",
+    "neighbour_roll": f"E-ROWS line 3: numbers of two rows meet: {ALONG}",
+    "cumsum_batch": f"E-ROWS line 3: this goes over the batch: {ALONG}",
     "batch_size_value": "E-BATCH: a step has other factors in a batch of 1 than in one of 256",
     "branch_on_first_row": f"E-FLOW line 2: {FLOW}",
     "branch_on_any": f"E-FLOW line 3: {FLOW}",
@@ -490,3 +502,27 @@ def test_the_benign_programs_pass_and_ask_the_system_for_nothing(seccomp, name):
     assert [check.message for check in found if not check.passed] == []
     assert len(found) == len(CHECKS)
     assert watched.events == set()
+
+
+@pytest.mark.parametrize(
+    ("error", "said", "unproved"),
+    [
+        (None, "", ""),
+        ("Mixed: numbers of two rows meet", f"E-ROWS line 7: numbers of two rows meet: {ALONG}", ""),
+        ("Unproved: np.outer", "", "np.outer in line 7"),
+        ("TypeError: who knows", "", "who knows in line 7"),
+    ],
+)
+def test_rows_are_proved_apart_where_that_can_be(error, said, unproved):
+    one = trial()
+    call = one.program.call
+
+    def in_rows(observation, action, mode="plain"):
+        returned = call(observation, action, mode)
+        return dataclasses.replace(returned, error=error, line=7 if error else None) if mode == "rows" else returned
+
+    one.program.call = in_rows
+    assert message("rows apart", one) == said
+    assert one.unproved == unproved
+    sizes = [rows for rows, _, mode in one.program.asked if mode == "rows"]
+    assert sizes == (list(SIZES[1:]) if error is None else [2])

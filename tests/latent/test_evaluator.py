@@ -7,7 +7,8 @@ import pytest
 
 from lare.errors import LareError
 from lare.latent.evaluator import Evaluator, LatentRewardError
-from lare.latent.jailed import ROWS, WorkerFailed
+from lare.latent.isolation import around
+from lare.latent.jailed import ROWS, SIZES, WorkerFailed
 from lare.latent.program import Program
 from toys import PHI, phi
 
@@ -72,8 +73,8 @@ def test_three_rows_are_computed_again_at_calls_1_2_4_8(evaluator):
     sizes = asked(one)
     for _ in range(9):
         one(*batch(10))
-    again = [10, 3]
-    assert sizes == [*again, *again, 10, *again, 10, 10, 10, *again, 10]
+    again = [16, 4]  # rows of the sizes that programs are verified with
+    assert sizes == [*again, *again, 16, *again, 16, 16, 16, *again, 16]
 
 
 def test_a_call_without_rows_has_none_to_compute_again(evaluator):
@@ -91,7 +92,7 @@ SENTINEL = (
 @pytest.mark.parametrize(
     "body",
     [
-        "return [action + (len(action) == 3)]",
+        "return [action + (len(action) == 4)]",
         "return [action - action.mean()]",
         "return [action * (1 + 1e-3 * (len(action) > 4))]",
         "return [np.where(np.arange(len(action))[:, None] == len(action) - 1, action + 1, action) * (len(action) > 4)]",
@@ -103,9 +104,34 @@ def test_who_depends_on_the_batch_is_found_by_it(evaluator, body):
     assert str(error.value) == SENTINEL
 
 
+@pytest.mark.parametrize("rows", [512, 3000])
+def test_rows_are_witnesses_by_chance(evaluator, rows):
+    # Nobody can leave just those rows alone that will be computed again.
+    body = "rows = np.arange(len(action))[:, None]\nalone = (rows == 0) | (rows == 255) | (rows == 511) | (len(action) < 9)"
+    one = evaluator(phi(f"{body}\nreturn [np.where(alone, action, action - np.mean(action))]"), ("a",))
+    with pytest.raises(LatentRewardError) as error:
+        one(*batch(rows))
+    assert str(error.value) == SENTINEL
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 5, 255, 256, 257, ROWS, ROWS + 1])
+def test_a_program_meets_only_sizes_that_it_was_verified_with(evaluator, rows):
+    one = evaluator()
+    sizes = asked(one)
+    factors = one(*batch(rows))
+    assert {*sizes} <= {*SIZES}
+    assert len(factors) == rows
+
+
+def test_an_offset_hides_no_other_rows(evaluator):
+    body = "return [1e4 + 0.4 * np.roll(np.tanh(observation[:, 0:1]), 2, axis=0)]"
+    with pytest.raises(LatentRewardError, match="have other factors when they are judged again"):
+        evaluator(phi(body), ("a",))(*batch(50))
+
+
 def test_a_large_factor_hides_no_small_one(evaluator):
     with pytest.raises(LatentRewardError, match="have other factors when they are judged again"):
-        evaluator(phi("return [1e7 * observation[:, 0:1], action + (len(action) == 3)]"), ("a", "b"))(*batch(50))
+        evaluator(phi("return [1e7 * observation[:, 0:1], action + (len(action) == 4)]"), ("a", "b"))(*batch(50))
 
 
 def test_the_last_digits_may_differ(evaluator):
@@ -117,10 +143,10 @@ def test_the_last_digits_may_differ(evaluator):
     ("body", "names", "message"),
     [
         ("return [action[0:3]]", "a", "E-FORM: factor 1 must be an array of shape "
-         "(batch_size, 1) = (7, 1), but is an array of shape (3, 1) and type float32"),
+         "(batch_size, 1) = (8, 1), but is an array of shape (3, 1) and type float32"),
         ("x = 1\nreturn [[action][x]]", "a", "E-RUN line 3: IndexError: list index out of range"),
         ("return action", "a", "E-FORM: evaluation_func must return a list of arrays, "
-         "but returned an array of shape (7, 1) and type float32"),
+         "but returned an array of shape (8, 1) and type float32"),
         ("return []", "a", "E-FORM: evaluation_func must return 1 to 32 factors, but returned 0"),
         ("return [action, action]", "a", "it gave 2 factors, not 1"),
         ("return [action]", "ab", "it gave 1 factors, not 2"),
@@ -168,7 +194,7 @@ def test_what_the_gate_refuses_is_never_at_work():
 
 
 def test_isolation(near, layers):
-    assert near.isolation == f"a process of its own ({', '.join(layers) or 'without limits'})"
+    assert near.isolation == around(layers)
 
 
 def test_closed_it_does_not_work(evaluator):

@@ -28,6 +28,7 @@ DTYPES = "a dtype must be one of np.bool_, np.float32, np.float64, np.int32, np.
 WITH = "with is available only as `with np.errstate(divide='ignore')` and the like"
 IMPORTS = "only `import numpy as np` and `import math` are available"
 LONG_NAME = "write `import numpy as np` and the function's full name"
+PLAIN_WORD = "is no plain word: letters, digits, spaces, _ and - only"
 IDENTITY = "is and is not stand beside None, True or False only: use =="
 NAMED_LAMBDA = "a lambda must be given a name, and be called by it: name = lambda ..."
 
@@ -129,14 +130,12 @@ def said(source: str) -> list[str]:
                 ("while True: pass", "while"),
                 ("try: pass\nfinally: pass", "try"),
                 ("raise ValueError", "raise"),
-                ("assert x", "assert"),
-                ("class A: pass", "class"),
+                                ("class A: pass", "class"),
                 ("global y", "global"),
                 ("nonlocal y", "nonlocal"),
                 ("del x", "del"),
                 ("y = f'{x}'", "an f-string"),
-                ("y = (z := 1)", "the operator :="),
-                ("match x:\n    case _: pass", "match"),
+                                ("match x:\n    case _: pass", "match"),
                 ("yield x", "yield"),
                 ("yield from x", "yield"),
                 ("await x", "await"),
@@ -146,8 +145,6 @@ def said(source: str) -> list[str]:
                 ("y = [z async for z in x]", "async"),
                 ("y = {1}", "a set"),
                 ("y = {z for z in x}", "a set"),
-                ("y = [*x]", "* in a call"),
-                ("y, *z = x", "* in a call"),
                 ("y = x[0] << 2", "the operator LShift"),
                 ("x[0] >>= 2", "the operator RShift"),
             )
@@ -205,13 +202,12 @@ def said(source: str) -> list[str]:
         (phi("x = action.sum\nreturn [action]"), ["E-VALUE line 2: .sum is a method, and can only be called"]),
         (phi("x = np.finfo(np.float32).sum\nreturn [x]"), ["E-VALUE line 2: .sum is a method, and can only be called"]),
         # Constants
-        (phi("x = 'abc'\nreturn [action]"), ["E-STRING line 2: the string 'abc' is not available here"]),
-        (phi(f"x = '{'a' * 99}'\nreturn [action]"), [f"E-STRING line 2: the string '{'a' * 30}' is not available here"]),
+        (phi(f"x = '{'a' * 99}'\nreturn [action]"), [f"E-STRING line 2: the string '{'a' * 30}' {PLAIN_WORD}"]),
         (
             phi("x = {'a{}': 1}\nreturn [action]"),
-            ["E-STRING line 2: the string 'a{}' is not available here"],
+            [f"E-STRING line 2: the string 'a{{}}' {PLAIN_WORD}"],
         ),
-        (phi("x = np.einsum('i->j;', action)\nreturn [x]"), ["E-STRING line 2: the string 'i->j;' is not available here"]),
+        (phi("x = np.einsum('i->j;', action)\nreturn [x]"), ["E-STRING line 2: np.einsum takes no string here: 'i->j;'"]),
         (phi("x = np.einsum(action, action)\nreturn [x]"), ["E-STRING line 2: the pattern of np.einsum must be written out"]),
         (
             phi("x = np.pad(action, 1, mode='empty')\nreturn [x]"),
@@ -220,7 +216,10 @@ def said(source: str) -> list[str]:
         (phi("x = 2j\nreturn [action]"), ["E-NUMBER line 2: 2j is not a real number"]),
         (phi("x = b'abc'\nreturn [action]"), ["E-NUMBER line 2: b'abc' is not a real number"]),
         (phi(f"x = {2**63 + 1}\nreturn [action]"), ["E-NUMBER line 2: an integer is larger than 2**63"]),
-        (phi("x = 9 ** 9 ** 9\nreturn [action]"), ["E-NUMBER line 2: a power of a power grows without bound"]),
+        (
+            phi("x = 9 ** 9 ** 9\nreturn [action]"),
+            ["E-NUMBER line 2: a power of a power of integers has no bound: make one a float"],
+        ),
         # Attributes
         (phi("x = action.base\nreturn [x]"), ["E-ATTRIBUTE line 2: .base is not available"]),
         (phi("x = np.finfo(np.float32).machep\nreturn [x]"), ["E-ATTRIBUTE line 2: .machep is not available"]),
@@ -324,7 +323,7 @@ def said(source: str) -> list[str]:
         # Types
         (
             phi("return [action.astype('i2')]"),
-            [f"E-DTYPE line 2: {DTYPES}", "E-STRING line 2: the string 'i2' is not available here"],
+            [f"E-DTYPE line 2: {DTYPES}", "E-STRING line 2: astype takes no string here: 'i2'"],
         ),
         (phi("return [np.zeros(3, dtype=object)]"), [f"E-DTYPE line 2: {DTYPES}", "E-NAME line 2: object is not defined"]),
         (phi("return [np.zeros(3, dtype=None)]"), [f"E-DTYPE line 2: {DTYPES}"]),
@@ -332,9 +331,9 @@ def said(source: str) -> list[str]:
         (phi("return [np.full(3, 1, 2)]"), [f"E-DTYPE line 2: {DTYPES}"]),
         (phi("return [np.finfo(3)]"), [f"E-DTYPE line 2: {DTYPES}"]),
         # What outlives a call, and what is not one's own
-        (phi("def f(x=[]): pass\nreturn [action]"), ["E-STATE line 2: a default must be a number or None"]),
-        (phi("def f(*, x=1 + 1): pass\nreturn [action]"), ["E-STATE line 2: a default must be a number or None"]),
-        (phi("f = lambda x='a': x\nreturn [action]"), ["E-STATE line 2: a default must be a number or None"]),
+        (phi("def f(x=[]): pass\nreturn [action]"), ["E-STATE line 2: a default must be a number, a plain word or None"]),
+        (phi("def f(*, x=1 + 1): pass\nreturn [action]"), ["E-STATE line 2: a default must be a number, a plain word or None"]),
+        (phi("f = lambda x='%': x\nreturn [action]"), ["E-STATE line 2: a default must be a number, a plain word or None"]),
         *[
             (
                 f"x = [1]\n{phi(change)}",
@@ -398,10 +397,9 @@ def evaluation_func(observation, action):
         "E-CONSTRUCT line 4: while is not available",
         "E-CONSTRUCT line 6: TryStar is not available",
         "E-CALL line 7: open is not a function that is available",
-        "E-STRING line 7: the string 'x' is not available here",
         "E-CALL line 10: print is not a function that is available; write nothing: the function only returns its factors",
         "E-NUMPY line 10: np.load is not available: it reads or writes files",
-        "E-STATE line 10: a default must be a number or None",
+        "E-STATE line 10: a default must be a number, a plain word or None",
         "E-VALUE line 10: y is a function, and can only be called",
         "E-ATTRIBUTE line 11: .base is not available",
         "E-CONSTRUCT line 11: an f-string is not available",
@@ -421,9 +419,7 @@ def evaluation_func(observation, action):
         "try: x = np.load(1)\nfinally: x = open(2)",
         "x = {np.load(1), open(2)}",
         "x = {np.load(y) for y in open(2)}",
-        "x = (y := [np.load(1), open(2)])",
         "x = yield np.load(1), open(2)",
-        "x = [*np.load(1), *open(2)]",
     ],
 )
 def test_what_stands_in_something_refused_is_looked_at_too(statement):
@@ -487,7 +483,7 @@ def test_the_benign_programs_are_let_through(name):
 # --- hostile programs ------------------------------------------------------------------------------------------------
 
 FIRST_CODE = """
-from_numpy_import_load E-IMPORT     star_import E-IMPORT                import_time_clock E-IMPORT
+from_numpy_import_load E-NUMPY     star_import E-IMPORT                import_time_clock E-IMPORT
 import_random E-IMPORT              open_file E-ATTRIBUTE               eval_string E-CALL
 compile_string E-CALL               getattr_concat E-CALL               globals_call E-CALL
 type_call E-CALL                    exit_call E-CALL                    raise_systemexit E-CONSTRUCT
@@ -497,8 +493,8 @@ math_loader E-MATH                  str_format_attr E-ATTRIBUTE         str_form
 fstring_attr E-CONSTRUCT            fstring_width_memory E-CONSTRUCT    generator_frame E-ATTRIBUTE
 yield_function E-CONSTRUCT          exception_traceback E-CONSTRUCT     attributeerror_obj E-CONSTRUCT
 try_swallow E-CONSTRUCT             match_class_pattern E-CONSTRUCT     annotation_exec E-CONSTRUCT
-default_arg_exec E-STATE            module_level_call E-MODULE          walrus_rebind_np E-CONSTRUCT
-nfkc_homoglyph E-ATTRIBUTE          kwargs_smuggling E-CALL             starargs_dtype_smuggling E-CALL
+default_arg_exec E-STATE            module_level_call E-MODULE          walrus_rebind_np E-DEFINITION
+nfkc_homoglyph E-SYNTAX          kwargs_smuggling E-CALL             starargs_dtype_smuggling E-CALL
 attribute_store_np E-STATE          np_load_pickle E-NUMPY              np_fromfile E-NUMPY
 np_memmap E-NUMPY                   np_savetxt E-NUMPY                  ndarray_ctypes E-ATTRIBUTE
 np_f2py_subprocess E-NUMPY          np_ndarray_ctor E-NUMPY             np_empty E-NUMPY
@@ -752,7 +748,7 @@ def test_a_program_that_breaks_off_has_a_verdict(source, data):
 EXPRESSIONS = [
     *("open('x')", "__import__('os')", "eval('1')", "np.load('x')", "np.random.rand()", "np.f2py", "[np]", "[len]", "().__class__"),
     *("action.ctypes", "action.base", "action.tofile('x')", "action.view(object)", "f'{action}'", "'{}'.format(action)"),
-    *("(lambda: 1)()", "(yield)", "(x := 1)", "{1, 2}", "[*action]", "max(*action)", "math.__loader__", "globals()", "1j"),
+    *("(lambda: 1)()", "(yield)", "(np := 1)", "{1, 2}", "np.abs(*action)", "max(*action)", "math.__loader__", "globals()", "1j"),
     *("np.empty(3)", "np.vectorize(len)", "action.astype('O')", "np.sqrt(action, where=True)", "nobody_defined_this"),
 ]  # fmt: skip
 
@@ -821,12 +817,37 @@ def test_benign_programs_crossed_do_no_harm(first, second, upper, lower):
     assert does_no_harm("\n".join(lines))
 
 
-@pytest.mark.parametrize("letter", ["\x1b", "\x07", "\x00", "\x7f", "\x9b", "\u202e", "\u2066", "\u200b", "\ufeff"])
+UNSEEN = "\x1b\x07\x00\x7f\x9b\u202e\u2066\u200b\ufeff\u00ad\u180e\u034f\u3164\ufe0f\u2800\ue000\U000e0041\U0010fffd"
+
+
+@pytest.mark.parametrize("letter", UNSEEN)
 def test_no_letter_that_nobody_sees(letter):
     """Not even in a comment: a person is to read this, in a terminal."""
     source = f"def evaluation_func(o, a):\n    # upright {letter} and calm\n    return [o]\n"
     (problem,) = inspect(source)
     assert str(problem) == f"E-SYNTAX line 2: there is {letter!a}, a character that nobody sees: only text, please"
+
+
+@pytest.mark.parametrize(
+    ("code", "letter", "line"),
+    [
+        ("\u0430 = 1", "\\u0430", 2),  # the Cyrillic a
+        ("x = 1\nx = \u0440hi(x)", "\\u0440", 3),
+        ("\U0001d431 = 1", "\\U0001d431", 2),  # a bold x, which Python takes for an x
+        ("x = o.\uff33hape", "\\uff33", 2),
+        ("ü = 1", "\\xfc", 2),
+    ],
+)
+def test_letters_of_other_scripts_are_for_comments(code, letter, line):
+    assert said(phi(f"{code}\nreturn [action]  # ü\n'ü'")) == [
+        f"E-SYNTAX line {line}: '{letter}' is no letter of a program: only ASCII stands outside of comments"
+    ]
+
+
+@pytest.mark.parametrize("end", ["\r", "\r\n", "\f\n"])
+def test_lines_may_end_as_they_like(end):
+    source = "def evaluation_func(o, a):\n    # ü\n    return [o]\n"
+    assert inspect(source.replace("\n", end)) == []
 
 
 @pytest.mark.parametrize("letter", ["\t", "\r\n", "ü", "→", "─", "π", "🙂"])

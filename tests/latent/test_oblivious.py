@@ -269,7 +269,7 @@ ARGUMENTS = {
     **{f"numpy.{name}": (lambda x: ([x, x],)) for name in ("stack", "hstack", "vstack", "dstack", "column_stack")},
 }
 """For what cannot simply be called with one array or two."""
-TAKE_NO_ARRAY = {"numpy.arange", "numpy.eye", "numpy.identity", "numpy.ones", "numpy.zeros"}
+TAKE_NO_ARRAY = {"numpy.finfo", "numpy.arange", "numpy.eye", "numpy.identity", "numpy.ones", "numpy.zeros"}
 
 
 @pytest.mark.parametrize("name", sorted(name for name in FUNCTIONS.keys() - TAKE_NO_ARRAY if not name.startswith("$")))
@@ -288,7 +288,7 @@ def test_no_function_of_numpy_forgets_whom_it_was_given(name):
 
 
 def test_functions_of_what_is_not_hidden_hide_nothing():
-    assert type(FUNCTIONS["numpy.sum"](np.ones(3))) is np.float64
+    assert type(FUNCTIONS["numpy.sum"](np.ones(3))) is Watched
     assert type(FUNCTIONS["numpy.zeros"]((2, 3))) is Watched
     assert float(FUNCTIONS["numpy.zeros"]((2, 3))[0, 0]) == 0
 
@@ -344,3 +344,43 @@ def test_an_entry_of_each_row_may_be_chosen_by_its_values():
     assert type(found) is Oblivious
     with pytest.raises(Looked, match=INDEX):
         run_hidden(phi(f"{own}return [observation[nearest]]"))
+
+
+MADE = "z[:] = np.max(observation[:, 8:9], axis=0, initial=0.0)\nif z[0] > 1e5: return [action]\nreturn [-action]"
+SHED = {
+    "a scalar that is reshaped": "z = np.float64(0.0).reshape(1)",
+    "repeated": "z = np.float64(0.0).repeat(1)",
+    "with an axis more": "z = np.float64(0.0)[None]",
+    "with an ellipsis": "z = np.float64(0.0)[..., np.newaxis]",
+    "of a machine": "z = np.finfo(np.float64).eps.reshape(1)",
+    "of a machine, with an axis more": "z = np.finfo(np.float64).max[None]",
+    "of a sum": "z = np.sum([0.0, 1.0]).reshape(1)",
+    "of an entry": "z = np.zeros(3)[0].reshape(1)",
+    "gone through": "for x in np.zeros(3): z = x.reshape(1)",
+    "taken apart": "x, y = np.zeros(2)\nz = x.reshape(1)",
+    "of an operator": "z = (np.float64(0.0) + 1.0).reshape(1)",
+    "of the largest": "z = max(np.zeros(3)).reshape(1)",
+    "of Python's sum": "z = sum(np.zeros(3)).reshape(1)",
+    "transposed": "z = np.float64(0.0).T.reshape(1)",
+    "copied": "z = np.float64(0.0).copy().flatten()",
+    "of a list": "z = [x.ravel() for x in np.zeros(2)][0]",
+}
+
+
+@pytest.mark.parametrize("made", SHED.values(), ids=SHED)
+def test_no_array_sheds_its_watcher(made):
+    with pytest.raises(Looked, match="a decision depends on values of the batch"):
+        run_hidden(phi(f"{made}\n{MADE}"))
+
+
+def test_what_numbers_can_do_constants_can():
+    lines = [
+        "x = np.mean([1.0, 2.5])",
+        "y = round(x, 1) + round(np.float64(2.6)) + abs(-x) + int(x) + float(x) + math.sqrt(x)",
+        "for i in np.arange(3): y += [1, 2, 3][i] * {0: 1, 1: 2, 2: 3}[i]",
+        "if x > 1 and bool(np.any([False, True])) and np.finfo(np.float32).eps < 1: y += max(x, 1) + range(3)[np.int64(1)]",
+        "return [action[:, :1] * y * np.finfo(action.dtype).tiny]",
+    ]
+    source = "import math\n" + phi("\n".join(lines))
+    (found,), (expected,) = run_hidden(source), Program(source)(*batch())
+    np.testing.assert_array_equal(shown(found), expected)

@@ -1,5 +1,8 @@
 """Verification from end to end: gate, workers and checks, and that no program ever runs here."""
 
+import re
+import time
+
 import numpy as np
 import pytest
 
@@ -7,6 +10,7 @@ from lare.errors import LareError
 from lare.latent import verify as verification
 from lare.latent.checks import CHECKS, Check
 from lare.latent.gate import inspect
+from lare.latent.isolation import around
 from lare.latent.jailed import JailedProgram, Returned, WorkerFailed
 from lare.latent.verify import random_steps, verify
 from lare.llm.recording import SHIPPED, read_recording
@@ -63,6 +67,7 @@ ORDER = ["gate", *CHECKS]
             [
                 "E-FLOW line 4: a decision depends on values of the batch: use np.where instead of if, and, or, max, min",
                 "E-LOOP: it makes 65 turns for 64 rows and 1032 for 1031: no loop over the batch, use whole arrays",
+                "E-ROWS line 3: numbers of two rows meet: compute along axis=1, never over the batch",
                 "E-BATCH: a step has other factors when the batch is in another order",
                 "E-EMPTY: a batch without rows: "
                 "E-RUN line 3: IndexError: index 0 is out of bounds for axis 0 with size 0",
@@ -84,7 +89,7 @@ def test_a_sound_function_passes_every_check(chase, layers):
     assert verdict.passed
     assert verdict.checks == tuple(Check(name, True, "") for name in ORDER)
     assert (verdict.size, verdict.advice) == (2, ())
-    assert verdict.isolation == f"a process of its own ({', '.join(layers) or 'without limits'})"
+    assert verdict.isolation == around(layers)
 
 
 def test_advice_is_no_error(chase):
@@ -94,6 +99,12 @@ def test_advice_is_no_error(chase):
         "factor 'still' never varies on the recorded steps",
         "factor 'again' repeats 'action' on the recorded steps",
     )
+
+
+def test_what_is_not_proved_is_said(chase):
+    verdict = verify(phi("return [np.outer(action[:, 0], np.ones(1))]"), chase)
+    assert verdict.passed
+    assert verdict.advice == ("that rows do not touch was tried, not proved: np.outer in line 2",)
 
 
 def test_a_reward_is_exactly_one(chase):
@@ -182,7 +193,7 @@ def test_the_second_worker_must_give_the_same(chase, monkeypatch):
         return call
 
     workers = [Scripted(gives(1)), Scripted(gives(2))]
-    monkeypatch.setattr(verification, "JailedProgram", lambda *_: workers.pop(0))
+    monkeypatch.setattr(verification, "JailedProgram", lambda *_, **__: workers.pop(0))
     assert verify(PHI, chase).errors == (
         "E-CHANCE: the same steps have other factors in another process: a factor must not depend on chance"
     )
@@ -192,10 +203,23 @@ def test_a_worker_that_fails_is_a_failed_check(chase, monkeypatch):
     def call(*_):
         raise WorkerFailed("the process that runs the latent function failed: it did not answer within 30 s")
 
-    monkeypatch.setattr(verification, "JailedProgram", lambda *_: Scripted(call))
+    monkeypatch.setattr(verification, "JailedProgram", lambda *_, **__: Scripted(call))
     verdict = verify(PHI, chase)
     assert not verdict.passed
     assert verdict.errors == ("E-RUN: the process that runs the latent function failed: it did not answer within 30 s")
+
+
+def test_what_is_slow_only_at_some_size_does_not_take_minutes(chase, monkeypatch):
+    for name, seconds in (("SLOWEST_CALL", 2.0), ("LONGEST", 4.0)):
+        monkeypatch.setattr(verification, name, seconds)
+    slow = "if action.shape[0] not in (1, 3, 16, 64, 256, 1031, 4096):\n    for i in range(900): x = x @ x * 1e-3\n"
+    start = time.monotonic()
+    verdict = verify(phi(f"x = np.ones((1500, 1500))\n{slow}return [action + 0 * x[0, 0]]"), chase)
+    assert time.monotonic() - start < 10
+    assert re.fullmatch(
+        r"E-RUN: the process that runs the latent function failed: it did not answer within [012] s, at line 4",
+        verdict.errors,
+    )
 
 
 def test_no_worker_to_be_had_is_no_verdict(chase, monkeypatch):

@@ -2,6 +2,8 @@
 
 import gzip
 import json
+import threading
+import time
 
 import pytest
 
@@ -68,7 +70,7 @@ def test_a_reply_that_was_cut_off_is_said_to_be(served):
     said = []
     _, model, _ = served(lambda handler: handler.send(200, json.dumps(answer).encode()), said=said.append)
     assert model.reply(ASKED, 0) == "half of"
-    assert said == ["m: a reply was cut off at the 16,384 tokens that it was allowed"]
+    assert said[1:] == ["m: a reply was cut off at the 16,384 tokens that it was allowed"]
 
 
 def test_no_request_is_made_that_leaves_no_room_for_a_reply(served):
@@ -117,7 +119,7 @@ def test_a_connection_that_breaks_is_tried_again(served, answer):
         (b'{"choices": [{}]}', "KeyError: 'message'"),
         (b'{"choices": [{"message": null}]}', "AttributeError"),
         (b'{"choices": [{"message": {"content": ["x"]}}]}', "TypeError: the content is not a text"),
-        (b"[" * 5_000, "RecursionError"),
+        (b"[" * 5_000, "ValueError: it is nested more than 64 deep"),
     ],
 )
 def test_an_answer_that_is_none_is_tried_again_and_then_named(served, body, said):
@@ -324,6 +326,85 @@ def test_a_server_that_tells_the_key_is_not_quoted(served):
     _, model, _ = served(says(f"Your key is {KEY}."))
     assert model.reply(ASKED, 0) == "Your key is [key]."
     assert KEY not in repr(model)
+
+
+@pytest.mark.parametrize(
+    ("location", "said"),
+    [
+        ("https://elsewhere.example/v1", "it redirects to https://elsewhere.example, another server"),
+        ("http://127.0.0.1:1/v1/chat/completions", "it redirects to http://127.0.0.1:1, another server"),
+        ("//127.0.0.2/v1", "it redirects to http://127.0.0.2, another server"),
+    ],
+)
+@pytest.mark.parametrize("status", [301, 302, 307, 308])
+def test_nobody_is_sent_to_another_server(served, status, location, said):
+    server, model, waited = served(raw(b"", status, Location=location))
+    with pytest.raises(ModelFailed) as error:
+        model.reply(ASKED, 0)
+    assert str(error.value).endswith(f"{said}: name that one if you mean it")
+    assert (len(server.requests), waited) == (1, [])
+
+
+def test_a_redirect_within_a_server_is_followed(served):
+    server, model, _ = served(raw(b"", 307, Location="/v2/chat"), says("hello"))
+    assert model.reply(ASKED, 0) == "hello"
+    assert server.requests[0] == server.requests[1]
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (raw(b"Your plan has ended.", 401), "HTTP 401: Error code: 401: 'Your plan has ended.'"),
+        (
+            raw(b"<html>\x1b[2J\xe2\x80\xae" + b"x" * 300, 403),
+            f"HTTP 403: Error code: 403: '<html>?[2J?{'x' * 189}...'",
+        ),
+        (raw(b"", 401), "HTTP 401: Error code: 401"),
+        (
+            raw(b"Good evening"),
+            "the answer is not a chat completion (JSONDecodeError: Expecting value: line 1 column 1 (char 0)): 'Good evening'",
+        ),
+    ],
+)
+def test_what_is_no_json_is_shown(served, monkeypatch, answer, said):
+    monkeypatch.setattr(live, "TRIES", 1)
+    _, model, _ = served(answer)
+    with pytest.raises(ModelFailed) as error:
+        model.reply(ASKED, 0)
+    assert str(error.value) == f"m did not answer: {said}"
+
+
+def hangs(handler):
+    threading.Event().wait(30)
+
+
+def test_a_connection_that_hangs_ends_with_the_time_of_the_design(served):
+    said = []
+    server, model, _ = served(hangs, budget=Budget(seconds=1.0), said=said.append)
+    start = time.monotonic()
+    with pytest.raises(BudgetSpent) as error:
+        model.reply(ASKED, 0)
+    assert time.monotonic() - start < 5
+    assert str(error.value) == (
+        "the 1 s of waiting for the model are over (1 s are used, and 0 s are to be waited); the last try failed: "
+        "TimeoutError: the answer was not complete after 1 s"
+    )
+    assert said[0] == "m: waiting for a reply, 1 s at most (1 s are left for all)"
+    with pytest.raises(BudgetSpent):
+        model.reply(ASKED, 1)
+    assert len(server.requests) == 1
+
+
+def test_nobody_waits_longer_than_a_design_may_take(served):
+    said = []
+    _, model, waited = served(refuses(429, Retry_After="999999999"), budget=Budget(seconds=150.0), said=said.append)
+    with pytest.raises(
+        BudgetSpent, match=r"the 2 minutes of waiting for the model are over \(12\d s are used, and 60 s are to"
+    ):
+        model.reply(ASKED, 0)
+    assert waited == [60.0, 60.0]
+    assert said[0] == "m: waiting for a reply, 120 s at most (2 minutes are left for all)"
+    assert said[1].endswith("trying again in 60.0 s")
 
 
 def test_without_key_and_server_it_says_what_to_do(monkeypatch):

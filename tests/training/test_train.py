@@ -198,6 +198,27 @@ def test_metrics_that_are_older_than_the_checkpoint_are_not_made_up(small, tmp_p
         lare.resume(run.directory, listeners=[])
 
 
+@pytest.mark.parametrize("changed", [np.zeros(7), np.array("text"), np.zeros((2, 1), complex), None])
+def test_a_checkpoint_of_other_environments_is_a_line(small, tmp_path, changed):
+    with pytest.raises(Interrupted):
+        lare.train(
+            toy_spec(),
+            small(method="dense"),
+            out=tmp_path / "run",
+            listeners=[At(108, lambda: signal.raise_signal(signal.SIGINT))],
+        )
+    path = tmp_path / "run" / "checkpoint" / "state.npz"
+    with np.load(path) as state:
+        arrays = dict(state)
+    for name in [name for name in arrays if name.startswith("collector/")]:
+        arrays.pop(name)
+        if changed is not None:
+            arrays[name] = changed
+    np.savez(path, **arrays)
+    with pytest.raises(LareError, match=r"^the checkpoint in .*checkpoint does not fit its environments: [^\n]+$"):
+        lare.resume(tmp_path / "run", listeners=[])
+
+
 def test_an_episode_that_cannot_be_restored_is_dropped_and_said(small, tmp_path):
     spec = toy_spec(environment="toys/Forgetful-v0")
     stop = At(108, lambda: signal.raise_signal(signal.SIGINT))

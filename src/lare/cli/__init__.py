@@ -16,8 +16,9 @@ from lare.cli.logs import relabel
 from lare.cli.parse import parse
 from lare.cli.runs import cross_play, evaluate, export, report, train
 from lare.cli.studies import compare, reproduce, sweep
-from lare.cli.terminal import say
+from lare.cli.terminal import progress, say
 from lare.errors import LareError
+from lare.legible import in_a_line
 from lare.source import source
 
 DESCRIPTION = (
@@ -59,7 +60,7 @@ def main() -> None:
     except LareError as error:
         if debug:
             traceback.print_exc()
-        sys.stderr.write(f"lare: {' '.join(str(error).split())}\n")
+        progress(f"lare: {in_a_line(error)}")
         sys.exit(error.status)
     except KeyboardInterrupt:
         sys.exit(130)
@@ -70,7 +71,7 @@ def main() -> None:
             sys.exit(1)
         if debug:
             traceback.print_exc()
-        sys.stderr.write(f"lare: {error}\n")
+        progress(f"lare: {in_a_line(error)}")
         with contextlib.suppress(OSError):  # what is still to be printed can not be
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(2)

@@ -13,10 +13,11 @@ from lare.errors import LareError
 from lare.latent.design import DesignFailed
 from lare.latent.design import design as design_function
 from lare.latent.function import LatentFunction
+from lare.legible import in_a_line
 from lare.tasks.spec import TaskSpec
 
-BUDGET, REQUESTS = 400_000, 60
-"""Tokens and requests of one design, at most."""
+BUDGET, REQUESTS, MINUTES = 400_000, 60, 15.0
+"""Tokens, requests and minutes of waiting of one design, at most."""
 
 
 def design(
@@ -31,6 +32,7 @@ def design(
     pre_verification: bool = True,
     budget: int = BUDGET,
     requests: int = REQUESTS,
+    minutes: float = MINUTES,
     price: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="IN OUT")] = None,
     temperature: float | None = None,
     record: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
@@ -56,6 +58,7 @@ def design(
         pre_verification: without it (the paper's ablation), the first reply is tried once, in its jail, and kept as it is.
         budget: tokens, in and out together: no request is begun that might pass them.
         requests: at most so many requests.
+        minutes: to wait for the model, at most, all requests and tries together.
         price: of a million tokens in and out, to have the cost reckoned.
         temperature: of the model; the server's own unless given.
         record: a file that takes every exchange, for --model FILE; it must not exist, and not be the .json of --out.
@@ -70,7 +73,7 @@ def design(
 
     shipped = model in (None, RECORDED)
     live = not shipped and not str(model).endswith(".json")
-    check_design(live, base_url, draw, budget, requests, price, temperature)
+    check_design(live, base_url, draw, budget, requests, minutes, price, temperature)
     if policy is not None and not reflect:
         raise LareError("--policy plays episodes for --reflect: say how many rounds")
     if reflect < 0:
@@ -80,7 +83,7 @@ def design(
             "--reflect plays episodes in the environment, and --data is for where there is none: leave one out"
         )
     check_files(out, record)
-    spec, cost = load_task(task) if data is None else read_task(task), Budget(requests, budget)
+    spec, cost = load_task(task) if data is None else read_task(task), Budget(requests, budget, 60 * minutes)
     plays = policy_that_plays(policy, spec)
     if live:
         asked = LiveModel(str(model), base_url, temperature, cost, said=progress)
@@ -102,7 +105,7 @@ def design(
 
             function = reflect_on(function, spec, asked, reflect, policy=plays, record=record, said=progress)
     except DesignFailed as error:
-        progress(f"lare: {error}")
+        progress(f"lare: {in_a_line(error)}")
         keep_attempts(error, free_name(Path(f"{spec.name}.attempts.json")))
         sys.exit(error.status)
     finally:
@@ -122,7 +125,7 @@ def keep_attempts(failed: DesignFailed, instead: Path) -> None:
         try:
             recorder.write(path, model, new=path not in own)
         except LareError as error:
-            progress(f"lare: {error}")
+            progress(f"lare: {in_a_line(error)}")
         else:
             progress(f"every attempt is kept in {path}")
             return
@@ -169,6 +172,7 @@ def check_design(
     draw: int,
     budget: int,
     requests: int,
+    minutes: float,
     price: tuple[float, float] | None,
     temperature: float | None,
 ) -> None:
@@ -177,14 +181,16 @@ def check_design(
         raise LareError("--base-url is for a live model: say which one with --model NAME")
     if draw and live:
         raise LareError("--draw chooses among recordings, and a live model says something new each time: leave it out")
-    asked = (budget, requests, price, temperature) != (BUDGET, REQUESTS, None, None)
+    asked = (budget, requests, minutes, price, temperature) != (BUDGET, REQUESTS, MINUTES, None, None)
     if asked and not live:
         raise LareError(
-            "--budget, --requests, --price and --temperature are for a live model: say which one with --model NAME"
+            "--budget, --requests, --minutes, --price and --temperature are for a live model: say which one with --model NAME"
         )
     for name, value in (("budget", budget), ("requests", requests)):
         if value < 1:
             raise LareError(f"{name} = {value}: at least one is needed")
+    if not 0 < minutes < float("inf"):
+        raise LareError(f"minutes = {minutes}: a number above 0")
     if price is not None and not all(0 <= one < float("inf") for one in price):
         raise LareError(f"price = {price[0]} {price[1]}: two numbers from 0 on")
     if temperature is not None and not 0 <= temperature < float("inf"):

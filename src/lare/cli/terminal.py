@@ -9,6 +9,7 @@ import tyro
 from tyro.conf import Positional
 
 from lare.errors import LareError
+from lare.legible import legible
 
 if TYPE_CHECKING:
     from lare.latent.verify import Steps
@@ -24,11 +25,6 @@ WIDTH = 200
 """Characters in a line of a file."""
 
 
-def legible(text: str) -> str:
-    """A text that does not steer the terminal: some of what is printed a stranger has said."""
-    return "".join(letter if letter.isprintable() or letter in "\n\t" else "?" for letter in text)
-
-
 def say(text: str) -> None:
     print(legible(text), flush=True)  # noqa: T201 - the one place that writes to standard output
 
@@ -41,8 +37,8 @@ def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     table = Table(*head, box=None, pad_edge=False)
     table.columns[0].no_wrap = True
     for row in rows:
-        table.add_row(*row)
-    Console(width=None if sys.stdout.isatty() else WIDTH).print(table)
+        table.add_row(*map(legible, row))
+    Console(width=None if sys.stdout.isatty() else WIDTH, markup=False).print(table)
 
 
 def progress(text: str) -> None:

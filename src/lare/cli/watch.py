@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterator, Sequence
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from lare.cli.terminal import legible, progress
+from lare.cli.terminal import progress
 from lare.errors import LareError
 from lare.experiments.jobs import Job
+from lare.legible import legible
 
 EVERY = 2.0
 """Seconds between two looks."""

@@ -14,6 +14,7 @@ from lare.run.decide import decide
 from lare.run.directory import CHECKPOINT, CONFIG, read_config, read_metrics
 from lare.run.settings import ResolvedSettings, Settings
 from lare.tasks.spec import TaskSpec
+from lare.tasks.table import env_spec
 from lare.training.train import chosen_functions
 
 
@@ -100,6 +101,7 @@ def train_one(order: dict[str, Any]) -> None:
     """Begin a run, or go on with it."""
     directory = Path(order["directory"])
     if (directory / CONFIG).is_file():
+        env_spec(TaskSpec(**order["task"]))  # the user named what this imports, and not the run
         lare.resume(directory)
     else:
         settings = Settings(**order["settings"])

@@ -17,12 +17,13 @@ from lare.experiments.credit import credit_of, factor_labels
 from lare.experiments.html import factor_table, function_text, note, table, write_page
 from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN, RETURN_R2
 from lare.experiments.statistics import mean_and_deviation, plus_minus
-from lare.run.directory import Run, open_run
+from lare.run.directory import Run, open_run, read_config
 from lare.run.settings import Settings
 from lare.run.usual import resolve
 from lare.source import source
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import env_spec
+from lare.tasks.trust import TRUSTED, is_trusted, module_of
 from lare.training.explain import explanation_of
 
 TOP = "True rewards, for a million steps of the best public TD3,"
@@ -41,7 +42,7 @@ def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> P
     """
     if not runs:
         raise LareError("say which runs to report on")
-    opened = [open_run(directory) for directory in runs]
+    opened = [read_run(Path(directory)) for directory in runs]
     for run in opened:
         if not run.metrics():
             raise LareError(f"{run.directory} has no evaluation yet: there is nothing to report")
@@ -57,6 +58,18 @@ def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> P
         parts.extend(details(name, run))
     parts.append(note(f"Drawn by LaRe {source()}."))
     return write_page(path, title, "\n".join(parts))
+
+
+def read_run(directory: Path) -> Run:
+    """A run, without its functions where its environment is of a module that is named in its files: a report imports none."""
+    config = read_config(directory)
+    return open_run(directory) if unknown_module(config.task) is None else Run(directory, config, ())
+
+
+def unknown_module(task: TaskSpec) -> str | None:
+    """The module that a task's environment would import, unless this process has it, or the user names it."""
+    module = module_of(task)
+    return None if module is None or is_trusted(module) else module
 
 
 def labels(runs: Sequence[Run]) -> list[str]:
@@ -155,7 +168,12 @@ def details(name: str, run: Run) -> Iterable[str]:
     method = find_method(run.config.settings.method)
     yield f"<h2>{escape(name)} on {escape(run.config.task.name)}</h2>"
     yield f"<p>{escape(method.summary[0].upper() + method.summary[1:])}. Source: {escape(method.source)}.</p>"
-    if run.has_checkpoint():
+    if module := unknown_module(run.config.task):
+        yield note(
+            f"Its environment is of the module {module}, which is not imported for a report. {TRUSTED}={module} has it imported, "
+            "and what credit and factors look like drawn."
+        )
+    elif run.has_checkpoint():
         if said := explanation_of(run):
             yield "<h3>What the returns say</h3>"
             yield from paragraphs(said)
@@ -215,8 +233,10 @@ def judged(run: Run) -> str:
 def settings_table(run: Run) -> str:
     """What differs from the defaults in sight, everything else folded away."""
     settings = run.config.settings
-    usual = resolve(Settings(method=settings.method, algorithm=settings.algorithm), env_spec(run.config.task))
-    defaults = usual.in_force(run.config.task)
+    defaults = {}
+    if unknown_module(run.config.task) is None:
+        usual = resolve(Settings(method=settings.method, algorithm=settings.algorithm), env_spec(run.config.task))
+        defaults = usual.in_force(run.config.task)
     rows = [
         (key, value if isinstance(value, str) else json.dumps(value))
         for key, value in settings.in_force(run.config.task).items()

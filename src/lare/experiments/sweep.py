@@ -5,7 +5,6 @@ command ends a sweep that was killed, and grows one whose file has got longer.
 """
 
 import contextlib
-import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -19,6 +18,7 @@ from lare.errors import Checked, LareError
 from lare.experiments.cluster import on_ray
 from lare.experiments.jobs import Job, check, job_of
 from lare.experiments.processes import in_processes
+from lare.foreign import LARGEST_SETTINGS, read_text, read_toml
 from lare.run.settings import Settings, set_in_vain
 from lare.tasks.spec import load_task
 from lare.training.train import Interrupted
@@ -69,12 +69,10 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
         LareError: it cannot be read, one of its runs could not be trained, or a setting makes no difference to any of them.
     """
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = read_toml(read_text(path, LARGEST_SETTINGS))
         sweep = Sweep(**values)
         jobs = list(jobs_of(sweep, path))
-    except OSError as error:
-        raise LareError(f"{path} cannot be read: {error.strerror}") from error
-    except (LareError, ValueError, RecursionError) as error:
+    except (LareError, ValueError) as error:
         raise LareError(f"{path}: {error}") from error
     places: dict[Path, Job] = {}
     for job in jobs:

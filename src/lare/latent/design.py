@@ -134,7 +134,7 @@ class Conversation:
         self.said(f"attempt {ATTEMPTS}: {first_line(attempt)}")
         if not attempt.errors:
             return attempt
-        raise self.failed(f"none of {ATTEMPTS} attempts passed; the last one failed: {attempt.errors}")
+        raise self.failed(f"none of {ATTEMPTS} attempts passed; the last one failed: {first_line(attempt)}")
 
     def once(self, reply: str) -> Attempt:
         """Take a reply as it is if it runs at all: the ablation without pre-verification. Raises `DesignFailed`."""

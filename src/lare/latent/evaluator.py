@@ -4,11 +4,11 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
-from lare.latent.checks import Failed, factors_of
-from lare.latent.jailed import ROWS, JailedProgram, WorkerFailed
+from lare.latent.checks import Failed, factors_of, same
+from lare.latent.jailed import ROWS, SIZES, JailedProgram, WorkerFailed
 
 WITNESSES = 3
-"""Rows that a sentinel computes again: a batch of a size that was verified."""
+"""Rows that a sentinel computes again."""
 
 
 class LatentRewardError(LareError):
@@ -29,6 +29,8 @@ class Evaluator:
         """Raises `NoWorker` where no process is to be had."""
         self.names = names
         self.calls = 0
+        self.random = np.random.default_rng()
+        """Chooses witnesses, which change nothing that is computed: nobody must know them before."""
         self.program = JailedProgram(source, observation_size, action_size)
         if self.program.problems:
             raise LareError(f"the latent function has no verdict: {self.program.problems[0]}")
@@ -42,7 +44,7 @@ class Evaluator:
     ) -> Float[np.ndarray, "batch factors"]:
         """The factors of a batch.
 
-        At calls 1, 2, 4, 8, ... three rows are computed again alone, and must come out the same.
+        At calls 1, 2, 4, 8, ... three rows by chance are computed again alone, and must come out the same.
 
         Raises:
             LatentRewardError: something came that is no factor, or nothing did.
@@ -64,7 +66,10 @@ class Evaluator:
         parts = []
         for start in range(0, max(1, len(observation)), ROWS):
             part = observation[start : start + ROWS], action[start : start + ROWS]
-            parts.append(factors_of(self.program.call(*part), len(part[0]), "factors"))
+            size = verified_size(len(part[0]))
+            returned = self.program.call(padded(part[0], size), padded(part[1], size))
+            found = factors_of(returned, size, "factors")
+            parts.append(found[: len(part[0])])
         sizes = {part.shape[1] for part in parts}
         if sizes != {len(self.names)}:
             raise Failed(f"it gave {sizes.pop()} factors, not {len(self.names)}")
@@ -78,10 +83,20 @@ class Evaluator:
             raise Failed(f"factor {self.names[column]!r} is {factors[row, column]} for the observation {where}")
 
     def check_witnesses(self, factors: np.ndarray, observation: np.ndarray, action: np.ndarray) -> None:
-        rows = np.linspace(0, len(observation) - 1, WITNESSES).astype(int)
+        rows = self.random.integers(len(observation), size=WITNESSES)
         alone = self.factors(observation[rows], action[rows])
-        if not np.allclose(alone, factors[rows], rtol=1e-4, atol=1e-6 + 1e-5 * np.abs(factors).max(axis=0)):
+        if not same(alone, factors[rows], of=factors).all():
             raise Failed("the same steps have other factors when they are judged again, in a smaller batch")
 
     def close(self) -> None:
         self.program.close()
+
+
+def verified_size(rows: int) -> int:
+    """The least number of rows that a program was verified with, and that holds so many; none are none."""
+    return next(size for size in (0, *SIZES) if size >= rows)
+
+
+def padded(array: np.ndarray, rows: int) -> np.ndarray:
+    """The array with its first row behind it, as often as it takes."""
+    return array if len(array) == rows else np.concatenate([array, np.repeat(array[:1], rows - len(array), axis=0)])

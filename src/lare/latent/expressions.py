@@ -29,6 +29,8 @@ from lare.latent.syntax import Function, dotted, exists, is_key, is_singleton, i
 LARGEST = 2**63
 """Of the integers that may stand in a program."""
 
+HUGE = "an integer is larger than 2**63"
+
 
 MOST_HINTS, LONGEST_HINTED = 10, 40
 """Looking for a name that was meant takes time: only for so many problems, and names of so many letters."""
@@ -131,16 +133,13 @@ class Expressions(ast.NodeVisitor):
     def visit_Constant(self, node: ast.Constant) -> None:
         value = node.value
         if isinstance(value, str):
-            if node not in self.approved:
-                self.refuse("E-STRING", node, f"the string {value[:30]!r} is not available here")
+            if node not in self.approved and not is_key(value):
+                said = f"the string {value[:30]!r} is no plain word: letters, digits, spaces, _ and - only"
+                self.refuse("E-STRING", node, said)
         elif isinstance(value, complex | bytes):
             self.refuse("E-NUMBER", node, f"{str(value)[:30]} is not a real number")
         elif isinstance(value, int) and abs(value) > LARGEST:
-            self.refuse("E-NUMBER", node, "an integer is larger than 2**63")
-
-    def approve(self, *nodes: ast.AST | None) -> None:
-        """Let strings through that are keys of dictionaries."""
-        self.approved |= {node for node in nodes if isinstance(node, ast.Constant) and is_key(node.value)}
+            self.refuse("E-NUMBER", node, HUGE)
 
     def visit_Attribute(self, node: ast.Attribute) -> None:
         name = dotted(node)
@@ -201,8 +200,6 @@ class Expressions(ast.NodeVisitor):
                 self.refuse("E-ATTRIBUTE", node, f".{name}() is not available")
             elif name in CHANGING:
                 self.changing(node.func.value, node)
-            if name == "get":
-                self.approve(*node.args[:1])
             self.visit(node.func.value)
         else:
             self.refuse("E-CALL", node, "only a function that has a name can be called")
@@ -243,6 +240,7 @@ class Expressions(ast.NodeVisitor):
                 self.written_out(argument, "mode")
         if name == "numpy.finfo":
             self.dtype(node.args[0] if node.args else node)
+        self.no_strings(node, name)
 
     def written_out(self, node: ast.AST, keyword: str) -> None:
         """A keyword that takes a string must show which one."""
@@ -270,8 +268,25 @@ class Expressions(ast.NodeVisitor):
             elif len(self.scopes) > 1 and target.id not in self.scopes[-1].names:
                 self.refuse("E-STATE", node, f"{target.id} belongs to another place, and cannot be changed here")
 
+    def no_strings(self, node: ast.Call, name: str) -> None:
+        """Strings that stand in a call of a function that takes none; where it takes some, they have been approved."""
+        if name == "get":
+            return
+        for one in [*node.args, *(keyword.value for keyword in node.keywords)]:
+            if isinstance(one, ast.Constant) and isinstance(one.value, str) and one not in self.approved:
+                self.approved.add(one)
+                self.refuse("E-STRING", one, f"{shown(name)} takes no string here: {one.value[:30]!r}")
+
+    def visit_NamedExpr(self, node: ast.NamedExpr) -> None:
+        self.visit_all([node.value, node.target])
+
+    def visit_Starred(self, node: ast.Starred) -> None:
+        """Of an assignment. What stands in a list has been rewritten, and what stands in a call is refused there."""
+        if node not in self.approved:
+            self.refuse("E-CONSTRUCT", node, "* is available in lists, and once on the left of an assignment")
+        self.visit(node.value)
+
     def visit_Subscript(self, node: ast.Subscript) -> None:
-        self.approve(node.slice)
         if not isinstance(node.ctx, ast.Load):
             self.changing(node.value, node)
         self.visit_all([node.value, node.slice])
@@ -282,7 +297,6 @@ class Expressions(ast.NodeVisitor):
     def visit_Dict(self, node: ast.Dict) -> None:
         if None in node.keys:
             self.refuse("E-CONSTRUCT", node, "** in a dictionary is not available")
-        self.approve(*node.keys)
         self.visit_all([*node.keys, *node.values])
 
     def visit_List(self, node: ast.List) -> None:
@@ -298,7 +312,9 @@ class Expressions(ast.NodeVisitor):
     def visit_BinOp(self, node: ast.BinOp) -> None:
         self.operator(node.op, node)
         if isinstance(node.op, ast.Pow) and isinstance(node.right, ast.BinOp) and isinstance(node.right.op, ast.Pow):
-            self.refuse("E-NUMBER", node, "a power of a power grows without bound")
+            sides = node.left, node.right.left, node.right.right
+            if not any(isinstance(side, ast.Constant) and isinstance(side.value, float) for side in sides):
+                self.refuse("E-NUMBER", node, "a power of a power of integers has no bound: make one a float")
         self.visit_all([node.left, node.right])
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
@@ -309,8 +325,6 @@ class Expressions(ast.NodeVisitor):
         self.visit_all(node.values)
 
     def visit_Compare(self, node: ast.Compare) -> None:
-        if isinstance(node.ops[0], ast.In | ast.NotIn):
-            self.approve(node.left)
         sides = [node.left, *node.comparators]
         for operator, pair in zip(node.ops, itertools.pairwise(sides), strict=True):
             # NumPy has one True and one False: whoever is one of them would tell a value.
@@ -328,7 +342,6 @@ class Expressions(ast.NodeVisitor):
         self.visit_ListComp(node)
 
     def visit_DictComp(self, node: ast.DictComp) -> None:
-        self.approve(node.key)
         self.visit_all([*node.generators, node.key, node.value])
 
     def visit_comprehension(self, node: ast.comprehension) -> None:

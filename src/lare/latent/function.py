@@ -13,18 +13,23 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError, shortened
+from lare.foreign import read_json, read_text
 from lare.latent.checks import Check
 from lare.latent.evaluator import Evaluator
 from lare.latent.names import factor_meanings, names_of
 from lare.latent.verify import Steps, verify
+from lare.llm.key import without_key
 from lare.llm.prompts import Kind
-from lare.tasks.spec import Judges, TaskSpec, read_text
+from lare.llm.recording import Exchange
+from lare.tasks.spec import Judges, TaskSpec
 
 LARGEST_FILE = 1 << 20
 """Bytes of a function file."""
 
 CHANGED = "; changed by hand since"
 """Stands behind the model's name where a source is not the one that was saved."""
+
+VARIATION = "\ufe0f"
 
 HEADER = "# lare: "
 """Marks the lines that `save` puts on top of the source."""
@@ -153,15 +158,23 @@ class LatentFunction:
         )
         top = (" ".join(line.split()) for line in top)  # a name may be anybody's: nothing of it becomes a line of code
         try:
-            path.write_text("".join(f"{HEADER}{line}\n" for line in top) + self.source + "\n", encoding="utf-8")
-            path.with_suffix(".json").write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+            path.write_text(
+                without_key("".join(f"{HEADER}{line}\n" for line in top) + self.source + "\n"), encoding="utf-8"
+            )
+            path.with_suffix(".json").write_text(
+                without_key(json.dumps(asdict(self), indent=1)) + "\n", encoding="utf-8"
+            )
         except OSError as error:
             raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def normal(source: str) -> str:
-    """The source as it is kept: line ends of one kind, no blank lines around it, and no header but that of `save`."""
-    lines = itertools.dropwhile(lambda line: not line or line.startswith(HEADER), source.splitlines())
+    """The source as it is kept: line ends of one kind, no blank lines around it, and no header but that of `save`.
+
+    What makes a sign a coloured picture is left out: models write warning signs into comments, and nobody sees it alone.
+    """
+    text = source.replace(VARIATION, "")
+    lines = itertools.dropwhile(lambda line: not line or line.startswith(HEADER), text.splitlines())
     return "\n".join(lines).rstrip("\n")
 
 
@@ -250,12 +263,12 @@ def with_provenance(function: LatentFunction, record: Path) -> LatentFunction:
     if not record.is_file():
         return function
     try:
-        saved = json.loads(read_text(record))
+        saved = read_json(read_text(record))
         json.dumps(saved, ensure_ascii=False).encode()  # half a character can be read, and not be written again
         same = saved["source"] == function.source
-        model, exchanges = saved["model"], tuple(saved["exchanges"])
-        if not isinstance(model, str) or not all(isinstance(exchange, dict) for exchange in exchanges):
-            raise TypeError("model or exchanges")
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        model, exchanges = saved["model"], tuple(Exchange(**one).model_dump() for one in saved["exchanges"])
+        if not isinstance(model, str):
+            raise TypeError("model")
+    except (LareError, ValueError, KeyError, TypeError) as error:
         raise LareError(f"{record} is not the record of a latent function: {shortened(error)}") from error
     return replace(function, model=model if same else model + CHANGED, exchanges=exchanges)

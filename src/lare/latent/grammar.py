@@ -13,6 +13,7 @@ from lare.latent.syntax import (
     dotted,
     evaluated,
     is_docstring,
+    is_key,
     is_name,
     is_number,
     is_string,
@@ -24,13 +25,11 @@ CONSTRUCTS = {
     ast.While: "while",
     ast.Try: "try",
     ast.Raise: "raise",
-    ast.Assert: "assert",
     ast.ClassDef: "class",
     ast.Global: "global",
     ast.Nonlocal: "nonlocal",
     ast.Delete: "del",
     ast.JoinedStr: "an f-string",
-    ast.NamedExpr: "the operator :=",
     ast.Match: "match",
     ast.Yield: "yield",
     ast.YieldFrom: "yield",
@@ -40,13 +39,12 @@ CONSTRUCTS = {
     ast.AsyncWith: "async",
     ast.Set: "a set",
     ast.SetComp: "a set",
-    ast.Starred: "* in a call",
 }
 """How the commonest of what is not available is called."""
 
 KEPT = (
-    *(ast.While, ast.Try, ast.TryStar, ast.AsyncFor, ast.AsyncWith, ast.Set, ast.SetComp, ast.Starred),
-    *(ast.NamedExpr, ast.Yield, ast.YieldFrom, ast.Await),
+    *(ast.While, ast.Try, ast.TryStar, ast.AsyncFor, ast.AsyncWith, ast.Set, ast.SetComp),
+    *(ast.Yield, ast.YieldFrom, ast.Await),
 )
 """Of these, what stands in them stays when they go, and so has to be right."""
 
@@ -130,10 +128,10 @@ class Gate(Expressions, ast.NodeVisitor):
         for default in [*arguments.defaults, *arguments.kw_defaults]:
             if default is None:
                 continue
-            if is_number(default):
+            if is_number(default) or (isinstance(default, ast.Constant) and is_key(default.value)):
                 self.visit(default)
             else:
-                self.refuse("E-STATE", default, "a default must be a number or None")
+                self.refuse("E-STATE", default, "a default must be a number, a plain word or None")
         for argument in [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]:
             self.new_name(argument, argument.arg)
             self.annotation(argument.annotation)
@@ -164,6 +162,9 @@ class Gate(Expressions, ast.NodeVisitor):
     def visit_Assign(self, node: ast.Assign) -> None:
         if isinstance(node.value, ast.Lambda) and len(node.targets) == 1 and is_name(node.targets[0]):
             self.approved |= {node.value, node.targets[0]}
+        for target in node.targets:
+            if isinstance(target, ast.Tuple | ast.List):
+                self.approved |= {one for one in target.elts if isinstance(one, ast.Starred)}
         self.visit_all([*node.targets, node.value])
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> None:

@@ -6,11 +6,14 @@ lead around every other guard.
 """
 
 import builtins
+import itertools
 import operator
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+
+from lare.latent.language import SHAPING, SIZES
 
 FUEL = 20_000
 """Turns of loops, and calls, of one call of a program; and entries of what is gone through at once."""
@@ -19,6 +22,16 @@ LONGEST_SEQUENCE = 10_000
 LARGEST_BITS, LARGEST_ENTRY = 4096, 64
 """Bits of an integer, and of one in an array."""
 
+LARGEST_SIZE = 1 << 25
+"""Numbers in an array: eight thousand for each row of the largest batch."""
+
+MOST_TURNS = 1000
+"""Of what NumPy does one after the other: differences, pieces."""
+
+MOST_ENTRIES, DEEPEST = 50_000, 32
+"""Of lists within lists."""
+
+NESTING = (list, tuple, dict)
 SEQUENCES = (list, tuple, str)
 INTEGERS = (int, np.integer)
 
@@ -31,7 +44,30 @@ def numbers(value: Any) -> Any:
     """The value, where it is not an array of anything else."""
     if isinstance(value, np.ndarray | np.generic) and value.dtype.kind not in "fiubc":
         raise TypeError(f"arrays hold numbers only, not {value.dtype}")
+    if isinstance(value, np.ndarray) and value.size > LARGEST_SIZE:
+        raise TooLarge(f"an array of {value.size} numbers")
     return value
+
+
+def few(value: Any) -> Any:
+    """The value, where lists within it are few and not deep: one that holds another twice, and so on, has entries without end.
+
+    Whoever compares, hashes or makes arrays goes through all of them, and takes to its own stack for what is deep.
+    """
+    level, left = [value], MOST_ENTRIES
+    for _ in range(DEEPEST):
+        nested = [one for one in level if isinstance(one, NESTING)]
+        if not nested:
+            return value
+        level = list(itertools.islice(itertools.chain.from_iterable(map(entries, nested)), left + 1))
+        left -= len(level)
+        if left < 0:
+            raise TooLarge(f"more than {MOST_ENTRIES} entries within each other")
+    raise TooLarge(f"lists are nested more than {DEEPEST} deep")
+
+
+def entries(value: Any) -> Iterable[Any]:
+    return (*value, *value.values()) if isinstance(value, dict) else value
 
 
 def check_entries(values: Iterable[Any]) -> None:
@@ -43,12 +79,32 @@ def check_entries(values: Iterable[Any]) -> None:
             raise TooLarge("an integer that no array holds")
 
 
-def only_numbers(function: Callable[..., Any]) -> Callable[..., Any]:
+def size(value: Any, most: int = LARGEST_SIZE) -> Any:
+    """What says how large an array is to be, or how often something is done: NumPy reckons with it before it looks."""
+    if isinstance(value, list | tuple):
+        for one in value:
+            size(one, most)
+    elif isinstance(value, np.ndarray):
+        if value.dtype.kind in "iu" and value.size and int(np.asarray(value).max()) > most:
+            raise TooLarge(f"a size above {most}")
+    elif isinstance(value, INTEGERS) and value > most:
+        raise TooLarge(f"a size above {most}")
+    return value
+
+
+def only_numbers(function: Callable[..., Any], name: str) -> Callable[..., Any]:
     """A NumPy function of numbers, whose results are numbers."""
+    places = SHAPING.get(name.removeprefix("numpy."), ())
+    most = MOST_TURNS if name in ("numpy.diff", "numpy.split") else LARGEST_SIZE
 
     def call(*arguments: Any, **keywords: Any) -> Any:
-        check_entries(arguments)
-        check_entries(keywords.values())
+        given = [*arguments, *keywords.values()]
+        few(given)
+        check_entries(given)
+        for place in places:
+            size(arguments[place] if place < len(arguments) else 0, most)
+        for key in keywords.keys() & SIZES:
+            size(keywords[key], most)
         return numbers(function(*arguments, **keywords))
 
     return call
@@ -76,7 +132,7 @@ def total(values: Any, start: Any = 0) -> Any:
     """Python's own sum joins lists, again and again."""
     if isinstance(start, SEQUENCES):
         raise TooLarge("a sum of sequences")
-    return numbers(builtins.sum(values, start))
+    return numbers(of_few(builtins.sum)(values, start))
 
 
 def extend(target: Any, values: Any) -> None:
@@ -89,12 +145,19 @@ def extend(target: Any, values: Any) -> None:
 
 def at_once(function: Callable[..., Any]) -> Callable[..., list[Any]]:
     """A function that gives an iterator, as a list: iterators of iterators go deep without a loop."""
+    guarded_function = of_few(function)
+    return lambda *arguments, **keywords: list(guarded_function(*arguments, **keywords))
 
-    def call(*arguments: Any, **keywords: Any) -> list[Any]:
+
+def of_few(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of Python's that goes through its arguments, one entry after the other."""
+
+    def call(*arguments: Any, **keywords: Any) -> Any:
         for argument in arguments:
-            if hasattr(argument, "__len__"):
+            if hasattr(argument, "__len__") and not (isinstance(argument, np.ndarray) and not argument.ndim):
                 bounded(argument)
-        return list(function(*arguments, **keywords))
+        few(arguments)
+        return function(*arguments, **keywords)
 
     return call
 

@@ -1,18 +1,19 @@
 """The jail: what a process gives up before it runs a program that nobody has read. Linux; plain ctypes, no privileges.
 
-    no_new_privs   nothing that is started later gains rights back
-    rlimits        address space, no files written, no open files, no processes, no core
-    Landlock       no file system, no TCP, no signals and no abstract sockets beyond this process
-    seccomp        some twenty system calls on memory, clocks and the two open pipes; all others fail
+    no new rights   nothing that is started later gains rights back
+    rlimits         address space, no files written, no open files, no processes, no core
+    Landlock        no file system, no TCP, no signals and no abstract sockets beyond this process
+    seccomp         some twenty system calls on memory, clocks and the three open pipes; all others fail
 
-What a kernel does not have is left out and named: `enter` returns what is in force. Layers stand on each other's
-ground on purpose; seccomp alone would hold.
+A layer that a system refuses is left out, and the next one is tried: `enter` returns what is in force, and `isolation` decides
+whether that is enough. Layers stand on each other's ground on purpose; seccomp alone would hold.
 """
 
 import ctypes
 import errno
 import os
 import platform
+import signal
 import struct
 import sys
 from collections.abc import Iterator
@@ -25,7 +26,19 @@ except ImportError:  # Windows, where there is no worker to be jailed
 MEMORY = 2 << 30
 """Bytes of address space beyond what the process has when it enters."""
 
-PR_SET_NO_NEW_PRIVS = 38
+PR_SET_PDEATHSIG, PR_SET_NO_NEW_PRIVS = 1, 38
+
+LIMITS = {
+    "memory": "RLIMIT_AS",
+    "file size": "RLIMIT_FSIZE",
+    "core dumps": "RLIMIT_CORE",
+    "open files": "RLIMIT_NOFILE",
+    "processes": "RLIMIT_NPROC",
+}
+"""What is limited, and what the system calls it."""
+
+LAYERS = ("no new rights", "landlock", *LIMITS, "seccomp")
+"""Every layer that there can be."""
 
 
 def enter(kill: bool = False) -> list[str]:
@@ -35,43 +48,49 @@ def enter(kill: bool = False) -> list[str]:
         kill: a refused system call ends the process, instead of failing. To prove that accepted programs make none.
 
     Returns:
-        The layers in force, outermost first.
+        The layers in force, of `LAYERS`.
     """
+    space = address_space()  # while there still is a file system to read it from
     if sys.platform != "linux":
-        return list(limits())
+        return list(limits(space))
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) != 0:
-        return list(limits())
-    layers = ["landlock"] if landlock(libc) else []  # a ruleset is a file, and limits allow no more of them
-    layers += limits()
+    layers = (
+        ["no new rights"] if no_new_rights(libc) else []
+    )  # without them the kernel refuses Landlock and seccomp too
+    layers += ["landlock"] if landlock(libc) else []  # a ruleset is a file, and limits allow no more of them
+    layers += limits(space)
     return [*layers, "seccomp"] if seccomp(libc, kill) else layers
+
+
+def no_new_rights(libc: ctypes.CDLL) -> bool:
+    return libc.prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0
+
+
+def die_with(parent: int) -> None:
+    """Let the kernel kill this process when the thread ends that has started it. Linux."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        if os.getppid() != parent:  # which has ended before it was asked for
+            os._exit(0)
 
 
 # --- rlimits ---------------------------------------------------------------------------------------------------------
 
 
-def limits() -> Iterator[str]:
-    """Lower the limits that the system has; yields one name for all of them."""
-    wanted = {
-        "RLIMIT_AS": address_space() + MEMORY,
-        "RLIMIT_FSIZE": 0,
-        "RLIMIT_CORE": 0,
-        "RLIMIT_NOFILE": 0,
-        "RLIMIT_NPROC": 0,
-    }
-    if resource is None:
-        return
-    for name, value in wanted.items():
-        number = getattr(resource, name, None)
-        if number is None:
+def limits(space: int) -> Iterator[str]:
+    """Lower every limit that the system lets be lowered; yields what is limited. `space`: what is mapped already."""
+    for name, called in LIMITS.items():
+        number = getattr(resource, called, None)
+        if resource is None or number is None:
             continue
-        _, hard = resource.getrlimit(number)
-        least = value if hard == resource.RLIM_INFINITY else min(value, hard)
+        value = space + MEMORY if name == "memory" else 0
         try:
+            _, hard = resource.getrlimit(number)
+            least = value if hard == resource.RLIM_INFINITY else min(value, hard)
             resource.setrlimit(number, (least, least))
         except (ValueError, OSError):
-            return  # as on macOS, which does not limit address space
-    yield "rlimits"
+            continue  # as on macOS, which does not limit address space: what is left is limited all the same
+        yield name
 
 
 def address_space() -> int:
@@ -151,12 +170,15 @@ NUMBER, ARCHITECTURE, FIRST, THIRD = 0, 4, 16, 32
 """Where the call's number, the processor and (the low words of) the first and third argument stand."""
 
 
+ANSWERS = 3
+"""The descriptor of the pipe to the parent. Standard output is the program's own, and leads nowhere."""
+
 ONLY = {
     "read": (FIRST, (0,)),
-    "write": (FIRST, (1, 2)),
+    "write": (FIRST, (1, 2, ANSWERS)),
     "madvise": (THIRD, (4, 8, 14, 15)),
 }
-"""What an argument must be: the pipes to the parent; pages that are given back, or may be huge (and no worse advice)."""
+"""What an argument must be: the pipes; pages that are given back, or may be huge (and no worse advice)."""
 
 
 def instructions(audit: int, calls: dict[str, int], refused: int) -> Iterator[tuple[int, int, int, int]]:

@@ -6,8 +6,10 @@ bounded, read as JSON and checked; numbers come through shared memory that the w
 
 import contextlib
 import json
+import math
 import mmap
 import os
+import re
 import secrets
 import select
 import subprocess
@@ -16,7 +18,7 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Never
@@ -25,12 +27,19 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
+from lare.foreign import read_json
 from lare.latent.expressions import Problem
 from lare.latent.gate import guard
+from lare.latent.isolation import around, check_isolation
+from lare.latent.program import FILE
 from lare.latent.worker import MOST_FACTORS
+from lare.legible import in_a_line
 
 ROWS = 4096
 """Rows of one call; a larger batch takes several."""
+
+SIZES = tuple(1 << power for power in range(ROWS.bit_length()))
+"""Rows that a call has in training. A program that does something else with some number of rows is met in verification."""
 
 TIME_LIMIT = 30.0
 """Seconds for one answer."""
@@ -38,8 +47,9 @@ TIME_LIMIT = 30.0
 LONGEST_ANSWER = 1 << 16
 """Bytes."""
 
-Mode = Literal["plain", "oblivious", "strict", "traced"]
-"""A plain call; on arrays that refuse to be looked into; with floating-point errors raised; with memory traced."""
+Mode = Literal["plain", "oblivious", "rows", "strict", "traced"]
+"""A plain call; on arrays that refuse to be looked into; on arrays that know which row each number depends on; with floating-point
+errors raised; with memory traced."""
 
 START = "import sys; sys.path[:] = {path!r}; from lare.latent.worker import main; main({argument!r})"
 
@@ -88,6 +98,8 @@ class JailedProgram:
         gated: bool = True,
         kill: bool = False,
         audit: bool = False,
+        limit: float | None = None,
+        until: float = math.inf,
     ):
         """Start a worker.
 
@@ -95,12 +107,16 @@ class JailedProgram:
             gated: whether the gate stands in front of the jail. Without it a program may be any Python.
             kill: a refused system call ends the worker.
             audit: note Python's audit events during calls.
+            limit: seconds for one answer; `TIME_LIMIT` unless given.
+            until: when there is an end to all answers, by `time.monotonic`.
 
         Raises:
             NoWorker: it cannot be started.
+            NotIsolated: less stands around it than the program needs.
             WorkerFailed: the program broke it.
         """
         self.sizes = observation_size, action_size
+        self.limit, self.until = limit, until
         self.lock = threading.Lock()
         self.layers: tuple[str, ...] = ()
         self.problems: list[Problem] = list(guard(source)) if gated else []
@@ -113,9 +129,10 @@ class JailedProgram:
         given = ROWS * 8 * (observation_size + action_size)
         text = source.encode(errors="replace")  # what cannot be encoded, the gate has refused
         with shared(max(given, len(text))) as self.inputs, shared(ROWS * 8 * MOST_FACTORS) as self.outputs:
-            self.process = start([self.inputs, self.outputs], kill, audit)
+            self.process = start([self.inputs, self.outputs], {"kill": kill, "audit": audit, "gate": gated})
         weakref.finalize(self, shut, self.process)
-        os.set_blocking(self.process.stdin.fileno(), False)  # type: ignore[union-attr]
+        for pipe in (self.process.stdin, self.process.stderr):
+            os.set_blocking(pipe.fileno(), False)  # type: ignore[union-attr]
         self.poll = select.poll()
         self.poll.register(self.process.stdout, select.POLLIN)  # type: ignore[arg-type]
         try:
@@ -124,9 +141,14 @@ class JailedProgram:
             self.close()
             raise NoWorker(f"the process for the latent function does not start: {error}") from error
         try:
+            check_isolation(self.layers, gated)
+        except LareError:
+            self.close()
+            raise
+        try:
             self.inputs.memory[: len(text)] = text
             sizes = {"observation": observation_size, "action": action_size, "rows": ROWS}
-            answer = self.ask({"source": len(text), "gate": gated, **sizes})
+            answer = self.ask({"source": len(text), **sizes})
             self.problems = [Problem(plain(code), count(line), plain(said)) for code, line, said in answer["problems"]]
             self.failed = self.read(answer, 0) if "error" in answer else None
             if self.problems:
@@ -137,7 +159,7 @@ class JailedProgram:
     @property
     def isolation(self) -> str:
         """What stands around the program, for a person."""
-        return f"a process of its own ({', '.join(self.layers) or 'without limits'})"
+        return around(self.layers)
 
     def call(self, observation: np.ndarray, action: np.ndarray, mode: Mode = "plain") -> Returned:
         """Run the program on at most `ROWS` rows, float32 or float64.
@@ -151,7 +173,7 @@ class JailedProgram:
             for array, offset in ((observation, 0), (action, place)):
                 target = np.frombuffer(self.inputs.memory, kind, array.size, offset)
                 target[:] = np.asarray(array, kind).ravel()
-            answer = self.ask({"mode": mode, "rows": rows, "type": kind, "seconds": TIME_LIMIT + 5})
+            answer = self.ask({"mode": mode, "rows": rows, "type": kind})
             try:
                 return self.read(answer, rows)
             except (KeyError, TypeError, ValueError, ArithmeticError) as error:
@@ -182,28 +204,29 @@ class JailedProgram:
         """Send a request, if there is one, and wait for the answer to it."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
-        deadline = time.monotonic() + TIME_LIMIT
+        seconds = max(0.1, min(self.limit or TIME_LIMIT, self.until - time.monotonic()))
+        deadline = time.monotonic() + seconds
         number = (
             secrets.token_hex(8) if request is not None else ""
         )  # an answer cannot be laid up before it is asked for
         try:
             if request is not None:
-                request = request | {"number": number}
+                request = request | {"number": number, "seconds": seconds}
                 # A request fits into the pipe whole, or the pipe is full because nobody reads it, and this fails.
                 os.write(self.process.stdin.fileno(), json.dumps(request).encode() + b"\n")
             line = b""
             while not line.endswith(b"\n"):
                 left = deadline - time.monotonic()
                 if left <= 0 or not self.poll.poll(1000 * left):
-                    self.broken(f"it did not answer within {TIME_LIMIT:.0f} s")
+                    self.broken(f"it did not answer within {seconds:.0f} s{where(self.complaint())}")
                 more = os.read(self.process.stdout.fileno(), LONGEST_ANSWER)
                 if not more:
                     self.broken(f"it ended ({self.ending()})")
                 line += more
                 if len(line) > LONGEST_ANSWER:
                     self.broken("it said more than it may")
-            answer = json.loads(line)
-        except (OSError, ValueError, RecursionError) as error:
+            answer = read_json(line)
+        except (OSError, ValueError) as error:
             self.broken(f"it broke off ({error}; {self.ending()})")
         except BaseException:
             self.close()  # its answer would be taken for that to the next request
@@ -214,14 +237,22 @@ class JailedProgram:
 
     def ending(self) -> str:
         """How the worker ended, in a few words."""
-        with contextlib.suppress(subprocess.TimeoutExpired, ValueError, OSError):
+        try:
             code = self.process.wait(1)
-            if code < 0:
-                return f"signal {-code}"
-            said = os.read(self.process.stderr.fileno(), LONGEST_ANSWER) if self.process.stderr else b""
-            last = said.decode(errors="replace").strip().splitlines()[-1:]
-            return f"exit status {code}" + (f": {last[0][:200]}" if last else "")
-        return "still running"
+        except subprocess.TimeoutExpired:
+            return "still running"
+        said = self.complaint()
+        if code < 0:
+            return f"signal {-code}{where(said)}"
+        last = said.strip().splitlines()[-1:]
+        return f"exit status {code}" + (f": {plain(last[0])[:200]}" if last else "")
+
+    def complaint(self) -> str:
+        """What stands on its standard error, whoever wrote it."""
+        try:
+            return os.read(self.process.stderr.fileno(), LONGEST_ANSWER).decode(errors="replace")  # type: ignore[union-attr]
+        except (OSError, ValueError):  # nothing, or it is closed
+            return ""
 
     def broken(self, how: str) -> Never:
         self.close()
@@ -232,6 +263,8 @@ class JailedProgram:
         if hasattr(self, "process"):
             shut(self.process)
 
+
+AT = re.compile(rf'File "{re.escape(FILE)}", line (\d{{1,6}}) in ')
 
 REAL = frozenset("bool float16 float32 float64 int8 int16 int32 int64 uint8 uint16 uint32 uint64".split())
 """Types of numbers that a factor may have."""
@@ -247,8 +280,14 @@ def count(value: Any) -> int:
 
 
 def plain(value: Any) -> str:
-    """A text in a line, without what a terminal would obey."""
-    return "".join(letter if letter.isprintable() else " " for letter in str(value)[:500])
+    """A text in a line, without what a terminal would obey, or nobody sees."""
+    return in_a_line(str(value)[:500])
+
+
+def where(complaint: str) -> str:
+    """The line of the program that the worker was last seen at, where its standard error tells."""
+    found = AT.search(complaint.rpartition("most recent call first")[2])
+    return f", at line {found[1]}" if found else ""
 
 
 def described(value: Sequence[Any]) -> tuple[Any, ...]:
@@ -274,26 +313,45 @@ class Shared:
 
 
 @contextlib.contextmanager
-def shared(size: int) -> Any:
+def shared(size: int) -> Iterator[Shared]:
     """Memory in an unnamed file; the descriptors are open only as long as a child is started."""
-    place = "/dev/shm" if Path("/dev/shm").is_dir() else None
     try:
-        with tempfile.NamedTemporaryFile(dir=place, prefix="lare-") as file:
-            os.posix_fallocate(file.fileno(), 0, size) if hasattr(os, "posix_fallocate") else file.truncate(size)
-            read = os.open(file.name, os.O_RDONLY)
-            memory = mmap.mmap(file.fileno(), size)
-            try:
-                yield Shared(memory, file.fileno(), read)
-            finally:
-                os.close(read)
+        with unnamed() as (write, read):
+            os.posix_fallocate(write, 0, size) if hasattr(os, "posix_fallocate") else os.truncate(write, size)
+            seal(write)
+            yield Shared(mmap.mmap(write, size), write, read)
     except OSError as error:
         raise NoWorker(f"there is no shared memory for the latent function: {error.strerror or error}") from error
 
 
-def start(memory: Sequence[Shared], kill: bool, audit: bool) -> subprocess.Popen[bytes]:
+@contextlib.contextmanager
+def unnamed() -> Iterator[tuple[int, int]]:
+    """Descriptors of a new file: one to write by, and one that can only read."""
+    with contextlib.ExitStack() as stack:
+        if hasattr(os, "memfd_create"):
+            write = os.memfd_create("lare", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+            stack.callback(os.close, write)
+            name = f"/proc/self/fd/{write}"
+        else:
+            file = stack.enter_context(tempfile.NamedTemporaryFile(prefix="lare-"))
+            write, name = file.fileno(), file.name
+        read = os.open(name, os.O_RDONLY)
+        stack.callback(os.close, read)
+        yield write, read
+
+
+def seal(descriptor: int) -> None:
+    """Let nobody change the file's size, where the system has seals: memory whose file has shrunk kills whoever reads it."""
+    if hasattr(os, "memfd_create"):
+        import fcntl
+
+        fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
+
+
+def start(memory: Sequence[Shared], asked: Mapping[str, bool]) -> subprocess.Popen[bytes]:
     """A new worker: isolated Python, nothing of this environment, no open files but the pipes and the memory."""
     inputs, outputs = memory
-    argument = json.dumps({"input": inputs.read, "output": outputs.write, "kill": kill, "audit": audit})
+    argument = json.dumps({"input": inputs.read, "output": outputs.write, "parent": os.getpid(), **asked})
     path = [entry for entry in sys.path if entry and Path(entry).is_absolute()]
     # Pythons of some clusters find their own libraries by this variable alone; it holds no secrets.
     needed = {name: os.environ[name] for name in ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH") if name in os.environ}

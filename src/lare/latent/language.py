@@ -174,11 +174,36 @@ BUILTINS: dict[str, Signature] = {
     **signatures("dict", 0, 1),
     **signatures("enumerate", 1, 2, "start"),
     **signatures("max min", 1, 16),
-    **signatures("range", 1, 3),
+    **signatures("range slice", 1, 3),
     **signatures("round", 1, 2),
     **signatures("sum", 1, 2, "start"),
     **signatures("zip", 1, 16, "strict"),
 }
+
+SHAPING = {
+    **dict.fromkeys("zeros ones full identity".split(), (0,)),
+    **dict.fromkeys("tile reshape broadcast_to pad".split(), (1,)),
+    **dict.fromkeys("repeat split".split(), (1, 2)),
+    "arange": (0, 1, 2),
+    "linspace": (2,),
+    "eye": (0, 1, 2),
+    **dict.fromkeys("all any amax amin argmax argmin average cumprod cumsum max mean median min nanmax".split(), (1,)),
+    **dict.fromkeys("nanmean nanmin nansum prod ptp sort std sum var".split(), (1,)),
+    **{f"{name}.reduce": (1,) for name in "add multiply maximum minimum logical_and logical_or".split()},
+    **dict.fromkeys("concatenate diff stack transpose tril triu".split(), (1,)),
+    **dict.fromkeys("expand_dims flip squeeze moveaxis swapaxes roll linalg.norm".split(), (1, 2)),
+    **dict.fromkeys("percentile quantile take take_along_axis tensordot".split(), (2,)),
+}
+"""Functions of NumPy some of whose arguments say what shape the result has, or along which axis it is reckoned, and which."""
+
+SHAPING_METHODS = {
+    **dict.fromkeys("all any argmax argmin cumprod cumsum max mean min prod squeeze std sum var".split(), (0,)),
+    **dict.fromkeys("reshape transpose".split(), tuple(range(8))),
+    **dict.fromkeys("repeat swapaxes".split(), (0, 1)),
+    "take": (1,),
+}
+SIZES = frozenset("shape num N M k repeats indices_or_sections pad_width axis axes keepdims n ndmin ord shift".split())
+"""Keywords that do."""
 
 FUTURE = frozenset("absolute_import annotations division print_function unicode_literals".split())
 """What comes of `__future__` and has come: importing it changes nothing."""
@@ -186,7 +211,7 @@ FUTURE = frozenset("absolute_import annotations division print_function unicode_
 TYPING = frozenset("Any Dict Iterable List NamedTuple Optional Sequence Tuple Union".split())
 
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_ -]{0,63}")
-"""A string that may be a key of a dictionary. Not a format."""
+"""A string that may stand in a program: a plain word, no format."""
 
 AXES = r"[a-zA-Z]{0,8}(\.\.\.[a-zA-Z]{0,8})?"
 EINSUM = re.compile(rf"{AXES}(,{AXES}){{0,7}}(->{AXES})?")
@@ -206,7 +231,8 @@ CALLBACK = "it calls Python for each element"
 REASONS = {
     **dict.fromkeys("load save savez savez_compressed loadtxt savetxt genfromtxt fromfile memmap open_memmap".split(), FILES),
     **dict.fromkeys("random".split(), CHANCE),
-    **dict.fromkeys("empty empty_like ndarray".split(), MEMORY),
+    **dict.fromkeys("empty empty_like".split(), MEMORY),
+    "ndarray": "np.array, np.asarray and np.zeros make arrays, and whatever is given is one",
     **dict.fromkeys("unique nonzero argwhere flatnonzero extract compress trim_zeros union1d".split(), VALUES),
     **dict.fromkeys("vectorize frompyfunc apply_along_axis apply_over_axes fromfunction piecewise".split(), CALLBACK),
 }  # fmt: skip
@@ -241,7 +267,7 @@ INSTEAD = {
     "pow": "the operator **",
     "print": "nothing: the function only returns its factors",
     "isinstance": "the shapes that are given: two arrays of two dimensions",
-    "map": "array operations or a list comprehension",
+    "map": "a list comprehension",
     "filter": "np.where with three arguments",
 }
 """What to write for what is not there."""

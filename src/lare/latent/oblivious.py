@@ -6,12 +6,13 @@ that runs through on these arrays takes the same way through its code whatever t
 
 import weakref
 from collections.abc import Callable, Iterable, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from lare.latent.guards import only_numbers
-from lare.latent.language import DOTTED, METHODS
+from lare.latent.language import ATTRIBUTES, DOTTED, METHODS, SHAPING, SHAPING_METHODS, SIZES
 from lare.latent.program import resolve
 from lare.latent.rewrite import CALLED_TYPES
 
@@ -29,7 +30,10 @@ WRITTEN: weakref.WeakValueDictionary[int, np.ndarray] = weakref.WeakValueDiction
 
 
 class Watched(np.ndarray):
-    """An array of constants, as long as no values of the batch are written into its memory; then it is hidden too."""
+    """An array of constants, as long as no values of the batch are written into its memory; then it is hidden too.
+
+    A single number is one as well: NumPy's own scalars would make arrays that nobody watches, by `reshape` or `[None]`.
+    """
 
     def __bool__(self) -> bool:
         refuse(self, "a decision depends on values of the batch: use np.where instead of if, and, or, max, min")
@@ -46,6 +50,13 @@ class Watched(np.ndarray):
     def __index__(self) -> int:
         refuse(self, "a value of the batch is used as an index: use np.where or np.take_along_axis")
         return super().__index__()
+
+    def __round__(self, digits: int | None = None) -> Any:
+        return round(float(self), digits)  # as NumPy's scalars, which have it, and arrays do not
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        refuse(self, "a value of the batch is used as a key: use np.where")
+        return hash(self.item())
 
     def __getitem__(self, key: Any) -> Any:
         parts = key if isinstance(key, tuple) else (key,)
@@ -128,8 +139,8 @@ def hidden(value: Any) -> Any:
 
 def watched(value: Any) -> Any:
     """The same constants, where it is noticed if something is written into them."""
-    if isinstance(value, np.ndarray):
-        return value.view(Watched)
+    if isinstance(value, np.ndarray | np.generic):
+        return np.asarray(value).view(Watched)
     if isinstance(value, list | tuple):
         return type(value)(watched(one) for one in value)
     return value
@@ -170,41 +181,25 @@ def careful(function: Callable[..., Any], shaping: tuple[int, ...] = (), *owners
     return call
 
 
-TELLING = {"numpy.shape", "numpy.ndim", "numpy.size", "numpy.finfo"}
+TELLING = {"numpy.shape", "numpy.ndim", "numpy.size"}
 """Functions that tell nothing of values."""
 
-SHAPING = {
-    **dict.fromkeys("zeros ones full identity".split(), (0,)),
-    **dict.fromkeys("tile reshape broadcast_to pad".split(), (1,)),
-    **dict.fromkeys("repeat split".split(), (1, 2)),
-    "arange": (0, 1, 2),
-    "linspace": (2,),
-    "eye": (0, 1, 2),
-    **dict.fromkeys("all any amax amin argmax argmin average cumprod cumsum max mean median min nanmax".split(), (1,)),
-    **dict.fromkeys("nanmean nanmin nansum prod ptp sort std sum var".split(), (1,)),
-    **{f"{name}.reduce": (1,) for name in "add multiply maximum minimum logical_and logical_or".split()},
-    **dict.fromkeys("concatenate diff stack transpose tril triu".split(), (1,)),
-    **dict.fromkeys("expand_dims flip squeeze moveaxis swapaxes roll linalg.norm".split(), (1, 2)),
-    **dict.fromkeys("percentile quantile take take_along_axis tensordot".split(), (2,)),
-}
-"""Functions of NumPy some of whose arguments say what shape the result has, or along which axis it is reckoned, and which."""
 
-SHAPING_METHODS = {
-    **dict.fromkeys("all any argmax argmin cumprod cumsum max mean min prod squeeze std sum var".split(), (0,)),
-    **dict.fromkeys("reshape transpose".split(), tuple(range(8))),
-    **dict.fromkeys("repeat swapaxes".split(), (0, 1)),
-    "take": (1,),
-}
-SIZES = set("shape num N M k repeats indices_or_sections pad_width axis axes keepdims n ndmin ord shift".split())
-"""Keywords that do."""
+def finfo(dtype: Any) -> SimpleNamespace:
+    """`np.finfo`, whose numbers are watched."""
+    told = np.finfo(dtype)
+    return SimpleNamespace(
+        **{name: watched(getattr(told, name)) for name in (*ATTRIBUTES, "max", "min") if hasattr(told, name)}
+    )
 
 
 def careful_functions() -> Mapping[str, Callable[..., Any]]:
     """The NumPy functions of the language, for `Program`. Some of them would forget whom their arguments were."""
     names = DOTTED.keys() - TELLING - CALLED_TYPES
     functions = {
-        name: careful(only_numbers(resolve(name)), SHAPING.get(name.removeprefix("numpy."), ()))
+        name: careful(only_numbers(resolve(name), name), SHAPING.get(name.removeprefix("numpy."), ()))
         for name in names
         if name.startswith("numpy.")
     }
+    functions["numpy.finfo"] = finfo
     return functions | {f"{name}()": careful(resolve(name)) for name in CALLED_TYPES}

@@ -1,8 +1,8 @@
 """From a source that the gate has passed to a function: every name bound to what `language` lists, every loop counted.
 
-The program is rewritten into the body of one function (`rewrite.py`), which is run anew at each call, so that nothing that a call
-leaves behind reaches the next one. Its names are bound to Python's and NumPy's functions, guarded (`guards.py`), and to nothing
-that leads further. Loops, comprehensions and calls consume fuel.
+The program is simplified (`simplify.py`) and rewritten into the body of one function (`rewrite.py`), which is run anew at each
+call, so that nothing that a call leaves behind reaches the next one. Its names are bound to Python's and NumPy's functions,
+guarded (`guards.py`), and to nothing that leads further. Loops, comprehensions and calls consume fuel.
 """
 
 import ast
@@ -23,14 +23,18 @@ from lare.latent.guards import (
     bounded,
     dtype_of,
     extend,
+    few,
     guarded,
     numbers,
+    of_few,
     only_numbers,
     rounded,
+    size,
     total,
 )
 from lare.latent.language import BUILTINS, CONSTANTS, DOTTED
 from lare.latent.rewrite import CALLED_TYPES, Rewrite
+from lare.latent.simplify import simplified
 
 FILE = "latent_function.py"
 """What tracebacks call the program."""
@@ -49,7 +53,7 @@ class Program:
         Raises:
             SyntaxError: what passed the gate does not compile (as `return` outside of a function).
         """
-        tree = ast.fix_missing_locations(Rewrite().program(ast.parse(source)))
+        tree = ast.fix_missing_locations(Rewrite().program(simplified(ast.parse(source))))
         names = {**namespace(), **(functions or {}), "$burn": self.burn, "$range": self.range}
         exec(compile(tree, FILE, "exec", dont_inherit=True), names)
         self.make: Callable[[], Callable[[np.ndarray, np.ndarray], Any]] = names["$program"]
@@ -77,8 +81,10 @@ def namespace() -> dict[str, Any]:
 @functools.cache
 def everything() -> dict[str, Any]:
     names: dict[str, Any] = {name: resolve(name) for name in DOTTED.keys() | CONSTANTS | {"numpy.errstate"}}
-    names |= {name: only_numbers(names[name]) for name in DOTTED if name.startswith("numpy.") and name not in CONSTANTS}
-    names |= {f"{name}()": only_numbers(names[name]) for name in CALLED_TYPES}
+    names |= {
+        name: only_numbers(names[name], name) for name in DOTTED if name.startswith("numpy.") and name not in CONSTANTS
+    }
+    names |= {f"{name}()": only_numbers(names[name], name) for name in CALLED_TYPES}
     names |= {name: getattr(builtins, name) for name in BUILTINS if name != "range"}  # which counts its turns
     for name, (plain, in_place) in OPERATORS.items():
         names |= {f"${name}": guarded(name, plain), f"$i{name}": guarded(name, in_place)}
@@ -89,10 +95,13 @@ def everything() -> dict[str, Any]:
         "$dtype": dtype_of,
         "$numbers": numbers,
         "$extend": extend,
+        "$few": few,
+        "$size": size,
         "round": rounded,
         "sum": total,
     }
     names |= {name: at_once(getattr(builtins, name)) for name in ("enumerate", "reversed", "zip")}
+    names |= {name: of_few(getattr(builtins, name)) for name in "all any dict list max min sorted tuple".split()}
     # NumPy imports parts of itself through its caller's __import__, which no program can name.
     return {**names, "__builtins__": {"__import__": already_loaded}}
 

@@ -1,8 +1,8 @@
 """From the syntax tree of what was written to that of what is run: one function, in which nothing is named but what it is given.
 
 Dotted names become plain ones that no source can spell (`np.sum` in one piece), so that no module is in sight; operators become
-calls (`$add`), so that they can be guarded; imports, annotations and docstrings go; generators become lists; loops,
-comprehensions and calls burn fuel. Lines stay where they are.
+calls (`$add`), so that they can be guarded; what is compared or hashed is counted before; imports, annotations and
+docstrings go; generators become lists; loops, comprehensions and calls burn fuel. Lines stay where they are.
 """
 
 import ast
@@ -45,6 +45,18 @@ def sliced(index: ast.expr) -> ast.expr:
     if isinstance(index, ast.Tuple):
         return ast.copy_location(ast.Tuple([sliced(one) for one in index.elts], ast.Load()), index)
     return index
+
+
+def looked_into(node: ast.expr) -> ast.expr:
+    """What is to be compared or hashed, counted before. Numbers and words that are written out are few."""
+    return node if isinstance(node, ast.Constant) else ast.copy_location(called("$few", node), node)
+
+
+def looked_up(index: ast.expr) -> ast.expr:
+    """An index, which may be the key of a dictionary."""
+    if isinstance(index, ast.Tuple):
+        return ast.copy_location(ast.Tuple([looked_up(one) for one in index.elts], ast.Load()), index)
+    return index if isinstance(index, ast.Slice) else looked_into(index)
 
 
 class Rewrite(ast.NodeTransformer):
@@ -102,6 +114,26 @@ class Rewrite(ast.NodeTransformer):
         self.generic_visit(node)
         return ast.copy_location(ast.ListComp(node.elt, node.generators), node)
 
+    def visit_Compare(self, node: ast.Compare) -> ast.expr:
+        self.generic_visit(node)
+        node.left, node.comparators = looked_into(node.left), [looked_into(one) for one in node.comparators]
+        return node
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
+        self.generic_visit(node)
+        node.slice = looked_up(node.slice)
+        return node
+
+    def visit_Dict(self, node: ast.Dict) -> ast.expr:
+        self.generic_visit(node)
+        node.keys = [key and looked_into(key) for key in node.keys]
+        return node
+
+    def visit_DictComp(self, node: ast.DictComp) -> ast.expr:
+        self.generic_visit(node)
+        node.key = looked_into(node.key)
+        return node
+
     def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
         self.generic_visit(node)
         return ast.copy_location(called(f"${GUARDED[type(node.op)]}", node.left, node.right), node)
@@ -127,6 +159,9 @@ class Rewrite(ast.NodeTransformer):
         elif name is None and method == "extend":
             assert isinstance(node.func, ast.Attribute)
             return ast.copy_location(called("$extend", node.func.value, *node.args), node)
+        elif name is None and method in ("get", "pop", "repeat"):
+            of = looked_into if method != "repeat" else lambda one: ast.copy_location(called("$size", one), one)
+            node.args = [of(one) for one in node.args]
         for keyword in node.keywords:
             if keyword.arg == "out":
                 keyword.value = ast.copy_location(called("$array", keyword.value), node)

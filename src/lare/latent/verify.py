@@ -4,13 +4,14 @@ import contextlib
 import functools
 import hashlib
 import itertools
+import time
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
-from lare.latent.checks import Check, Failed, Trial, advice, examine, failed
+from lare.latent.checks import LONGEST, SLOWEST_CALL, Check, Failed, Trial, advice, examine, failed
 from lare.latent.jailed import JailedProgram, WorkerFailed
 from lare.latent.names import names_of
 from lare.llm.prompts import Kind
@@ -65,16 +66,17 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | N
     """
     observation, action = tried_on(task, steps)
     sizes = observation.shape[1], action.shape[1]
+    start = functools.partial(JailedProgram, source, *sizes, limit=SLOWEST_CALL, until=time.monotonic() + LONGEST)
     try:
         with contextlib.ExitStack() as stack:
-            program = stack.enter_context(contextlib.closing(JailedProgram(source, *sizes)))
+            program = stack.enter_context(contextlib.closing(start()))
             if program.problems:
                 return Verdict((Check("gate", False, "\n".join(map(str, program.problems))),), 0)
             passed = Check("gate", True, "")
             if program.failed is not None:
                 said = failed("E-RUN", program.failed.error or "", program.failed.line)
                 return Verdict((passed, Check("runs", False, str(said))), 0, isolation=program.isolation)
-            again = stack.enter_context(contextlib.closing(JailedProgram(source, *sizes)))
+            again = stack.enter_context(contextlib.closing(start()))
             # Numbers that always come out the same for a source, and that its author cannot know.
             random = np.random.default_rng(list(hashlib.sha256(source.encode(errors="replace")).digest()))
             trial = Trial(program, again, observation, action, kind, random=random)
@@ -83,7 +85,9 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | N
                 return Verdict(checks, 0, isolation=program.isolation)
             factors = trial.known
             size = factors.shape[1]
-            return Verdict(checks, size, tuple(advice(factors, names_of(source, size))), program.isolation)
+            said = advice(factors, names_of(source, size))
+            said += [f"that rows do not touch was tried, not proved: {trial.unproved}"] if trial.unproved else []
+            return Verdict(checks, size, tuple(said), program.isolation)
     except (WorkerFailed, Failed) as error:
         return Verdict((Check("runs", False, f"E-RUN: {error}"),), 0)
 

@@ -1,11 +1,13 @@
 """The process in which generated code runs, from its first check to the end of training: it goes to jail, then obeys.
 
-Requests come on standard input and answers go to standard output, one JSON object a line; arrays travel through two
-pieces of shared memory. `jailed` is the other end. Nothing in here judges what a program returns: whoever is in jail
-is no witness. It says what came back, and the parent checks the numbers.
+Requests come on standard input and answers go out by a pipe of their own, one JSON object a line; arrays travel through two
+pieces of shared memory. What a program prints goes nowhere. `jailed` is the other end. Nothing in here judges what a program
+returns: whoever is in jail is no witness. It says what came back, and the parent checks the numbers.
 """
 
 import builtins
+import contextlib
+import faulthandler
 import functools
 import gc
 import json
@@ -26,32 +28,39 @@ from lare.latent import gate, jail
 from lare.latent.language import NAME
 from lare.latent.oblivious import careful_functions, hidden
 from lare.latent.program import FILE, Program
+from lare.latent.rows import FUNCTIONS, Mixed, Unproved, check_own, labelled
 
 MOST_FACTORS = 32
 MOST_PROBLEMS = 30
+
+GRACE = 5.0
+"""Seconds that a worker outlives the end of a call: its parent, where there is one, ends it before."""
 
 Function = Callable[[np.ndarray, np.ndarray], Any]
 
 
 def main(argument: str) -> None:
-    """Serve until standard input closes. `argument`: the file descriptors of the memory, and what is to be watched."""
+    """Serve until standard input closes. `argument`: the descriptors of the memory, and what is to be watched."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # whoever asks a run to stop means the parent, which needs this to save
     warnings.simplefilter("ignore")
     given = json.loads(argument)
     memory = mmap.mmap(given["input"], 0, prot=mmap.PROT_READ), mmap.mmap(given["output"], 0)
-    os.close(given["input"])
-    os.close(given["output"])
+    only_pipes(beyond=max(given["input"], given["output"]))
     functions = careful_functions()
     warm(functions)
+    tell_lines()
     events: list[str] = []
+    if not given["gate"]:  # no program that the gate has passed outlives its parent
+        jail.die_with(given["parent"])
     layers = jail.enter(kill=given["kill"])
     send({"layers": layers})
     start = receive()
     source = memory[0][: start["source"]].decode()
-    problems = gate.inspect(source) if start["gate"] else []
+    begin(start["seconds"])
+    problems = gate.inspect(source) if given["gate"] else []
     try:
-        programs = {} if problems else load(source, functions, gated=start["gate"])
+        programs = {} if problems else load(source, functions, gated=given["gate"])
         send({"number": start["number"], "problems": problems[:MOST_PROBLEMS]})
     except BaseException as error:  # a program that is not gated does what it likes here
         send({"number": start["number"], "problems": []} | failure(error))
@@ -62,18 +71,46 @@ def main(argument: str) -> None:
     while True:
         request = receive()
         events.clear()
-        # Whoever has lost its parent in the middle of a long call ends all the same: the signal is not handled.
-        signal.setitimer(signal.ITIMER_REAL, request["seconds"])
+        begin(request["seconds"])
         answer = serve(programs, request, memory, sizes) | {"number": request["number"]}
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        begin(0)
         send(answer | {"events": events[:10]} if given["audit"] else answer)
+
+
+def only_pipes(beyond: int) -> None:
+    """Leave nothing open but the pipes: requests on 0, errors on 2, answers on `jail.ANSWERS`. What is printed on 1 goes nowhere.
+
+    The memory is mapped by then. `mmap` keeps descriptors of its own, the lowest that are free, and needs them no more.
+    """
+    os.closerange(jail.ANSWERS, beyond + 64)
+    os.dup2(1, jail.ANSWERS)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
+
+
+def tell_lines() -> None:
+    """Let a crash, and a call that takes a quarter of its time, write the line where it happens to standard error."""
+    os.set_blocking(2, False)  # nobody reads it before the end
+    faulthandler.enable(2, all_threads=False)
+    faulthandler.register(signal.SIGPROF, 2, all_threads=False)
+
+
+def begin(seconds: float) -> None:
+    """Start the clocks of a call, or stop them (0).
+
+    Whoever has lost its parent in the middle of a long call ends all the same: this signal is not handled.
+    """
+    signal.setitimer(signal.ITIMER_REAL, seconds and seconds + GRACE)
+    signal.setitimer(signal.ITIMER_PROF, seconds / 4)
 
 
 def load(source: str, functions: Any, gated: bool) -> dict[str, Function]:
     """The program, as it is called in each mode."""
     if gated:
         program, watched = Program(source), Program(source, functions)
-        return {"plain": program, "strict": program, "traced": program, "oblivious": watched}
+        modes = {"plain": program, "strict": program, "traced": program}
+        return modes | {"oblivious": watched, "rows": Program(source, FUNCTIONS)}
     names: dict[str, Any] = {"__builtins__": builtins, "np": np}
     exec(compile(source, FILE, "exec", dont_inherit=True), names)
     return dict.fromkeys(("plain", "strict", "traced"), names[NAME])
@@ -95,6 +132,8 @@ def warm(functions: Any) -> None:
     with np.errstate(all="ignore"):
         np.concatenate(Program(source)(x, x), axis=1)
         Program(source, functions)(hidden(x), hidden(x))
+        with contextlib.suppress(Unproved, Mixed):
+            Program(source, FUNCTIONS)(labelled(x), labelled(x))
     tracemalloc.start()
     tracemalloc.stop()
     gc.collect()
@@ -112,6 +151,8 @@ def serve(
     inputs = arrays(memory[0], rows, sizes, request["type"])
     if mode == "oblivious":
         inputs = hidden(inputs)
+    if mode == "rows":
+        inputs = labelled(inputs[0]), labelled(inputs[1])
     if mode == "traced":
         tracemalloc.start()
     try:
@@ -119,6 +160,8 @@ def serve(
             values = function(*inputs)
             answer = {"values": describe(values)}
             if fits(values, rows):
+                if mode == "rows":
+                    check_own(values, rows)
                 out = np.frombuffer(memory[1], np.float64, rows * len(values))
                 np.concatenate(values, axis=1, out=out.reshape(rows, len(values)), casting="unsafe")
     except BaseException as error:  # the same
@@ -171,7 +214,10 @@ def failure(error: BaseException) -> dict[str, Any]:
             return {"error": f"SyntaxError: {error.msg}"[:500], "line": error.lineno}
         lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == FILE]
         said = " ".join(str(error).split())
-        return {"error": f"{type(error).__name__}: {said}"[:500], "line": lines[-1] if lines else None}
+        return {
+            "error": f"{type(error).__name__}{': ' if said else ''}{said}"[:500],
+            "line": lines[-1] if lines else None,
+        }
     except BaseException:  # an exception class of the program's own may fail when it is shown
         return {"error": "an exception that cannot be shown", "line": None}
 
@@ -179,7 +225,7 @@ def failure(error: BaseException) -> dict[str, Any]:
 def send(answer: dict[str, Any]) -> None:
     line = json.dumps(answer).encode() + b"\n"
     while line:
-        line = line[os.write(1, line) :]
+        line = line[os.write(jail.ANSWERS, line) :]
 
 
 def receive() -> dict[str, Any]:

@@ -19,6 +19,22 @@ class TooMuch(Exception):
     """An answer has no end."""
 
 
+class Elsewhere(Exception):
+    """A server sends whoever asks to another one."""
+
+
+def stay(response: Any) -> None:
+    """Raise `Elsewhere` where an answer leads to another origin: the request would be told to it, task and all."""
+    if not response.has_redirect_location:
+        return
+    here = response.request.url
+    there = here.join(response.headers["location"])
+    if (there.scheme, there.host, there.port) != (here.scheme, here.host, here.port):
+        raise Elsewhere(
+            f"it redirects to {there.scheme}://{there.netloc.decode()}, another server: name that one if you mean it"
+        )
+
+
 def bound(response: Any) -> None:
     """Let the body of an answer, of whatever status, be read in time and no further than it may go."""
     # Which HTTP library is beneath depends on the client's version; a stream must be one of its own kind.
@@ -50,9 +66,9 @@ def bound(response: Any) -> None:
     response.stream = Bounded(response.stream)
 
 
-def in_time(fetch: Callable[[], bytes]) -> bytes:
-    """What `fetch` returns or raises. Raises `TimeoutError` where it does neither in time: a server may say its headers letter by
-    letter, and each one starts a socket's clock anew.
+def in_time(fetch: Callable[[], bytes], limit: float) -> bytes:
+    """What `fetch` returns or raises. Raises `TimeoutError` where it does neither in so many seconds: a server may say its headers
+    letter by letter, and each one starts a socket's clock anew.
     """
     outcome: queue.SimpleQueue[tuple[bytes, BaseException | None]] = queue.SimpleQueue()
 
@@ -64,9 +80,9 @@ def in_time(fetch: Callable[[], bytes]) -> bytes:
 
     threading.Thread(target=run, daemon=True).start()
     try:
-        body, error = outcome.get(timeout=1.1 * TIMEOUT)  # the sockets' own clocks come first, and say more
+        body, error = outcome.get(timeout=1.1 * limit)  # the sockets' own clocks come first, and say more
     except queue.Empty:
-        raise TimeoutError(f"the answer was not complete after {TIMEOUT:.0f} s") from None
+        raise TimeoutError(f"the answer was not complete after {limit:.0f} s") from None
     if error is not None:
         raise error
     return body

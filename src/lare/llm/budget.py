@@ -1,6 +1,8 @@
-"""What a design may cost: requests and tokens, counted before each request so that they are never passed."""
+"""What a design may cost: requests, tokens and time, counted before each request so that they are never passed."""
 
-from collections.abc import Sequence
+import contextlib
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,9 +23,12 @@ class Budget:
 
     requests: int = 60
     tokens: int = 400_000
+    seconds: float = 900.0
+    """Waiting for the model, between two tries too."""
     requests_made: int = 0
     tokens_in: int = 0
     tokens_out: int = 0
+    seconds_waited: float = 0.0
     estimated: bool = False
     """Whether a server said nothing of tokens, and they were counted as bytes."""
 
@@ -35,11 +40,38 @@ class Budget:
         """
         if self.requests_made >= self.requests:
             raise BudgetSpent(f"the budget of {self.requests} requests is spent")
+        self.wait(0.0)
         left = self.tokens - self.tokens_in - self.tokens_out - most_tokens(messages)
         if left < least:
             used = self.tokens_in + self.tokens_out
             raise BudgetSpent(f"the next request might pass the budget of {self.tokens:,} tokens ({used:,} are used)")
         return left
+
+    @property
+    def seconds_left(self) -> float:
+        return max(0.0, self.seconds - self.seconds_waited)
+
+    def wait(self, seconds: float) -> None:
+        """Count a wait that is to come. Raises `BudgetSpent` where no time would be left after it."""
+        if seconds >= self.seconds_left:
+            spent = f"{self.seconds_waited:.0f} s are used" + (
+                f", and {seconds:.0f} s are to be waited" if seconds else ""
+            )
+            raise BudgetSpent(f"the {minutes(self.seconds)} of waiting for the model are over ({spent})")
+        self.seconds_waited += seconds
+
+    @contextlib.contextmanager
+    def clock(self) -> Iterator[None]:
+        """Count the time that something takes."""
+        start = time.monotonic()
+        try:
+            yield
+        finally:
+            self.seconds_waited += time.monotonic() - start
+
+    def patience(self, longest: float) -> str:
+        """How long a reply is waited for that may take so many seconds, in words."""
+        return f"{min(longest, self.seconds_left):.0f} s at most ({minutes(self.seconds_left)} are left for all)"
 
     def count(self, usage: Any, messages: Sequence[Message], reply: str) -> None:
         """Add what a reply cost, by the server's own count where it gives one."""
@@ -60,6 +92,10 @@ class Budget:
         if prices is not None:
             text += f", {(self.tokens_in * prices[0] + self.tokens_out * prices[1]) / 1e6:.4f} by the given prices"
         return text
+
+
+def minutes(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} minutes"
 
 
 def most_tokens(messages: Sequence[Message]) -> int:

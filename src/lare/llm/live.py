@@ -1,15 +1,15 @@
 """A live language model behind any OpenAI-compatible endpoint: OpenAI, vLLM, Ollama, llama.cpp, gateways.
 
-    time-outs    see `bounded`
+    time-outs    see `bounded`; of all replies together, see `budget`
+    redirects    to another server are refused: the request would be told to it
     retries      408, 409, 429, 5xx and broken connections, with back-off or as long as the server says
     structure    asked for as a JSON schema; of servers that know none, as a JSON object; else only in words
     budget       see `budget`
-    the key      from the environment, into the request, and nowhere else
+    the key      see `key`
 
 What a reply says is read by `reply`, whatever way it was asked for.
 """
 
-import json
 import os
 import re
 import time
@@ -18,8 +18,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from lare.errors import LareError
-from lare.llm.bounded import LARGEST_BODY, TIMEOUT, TooMuch, bound, in_time
+from lare.foreign import read_json
+from lare.legible import in_a_line
+from lare.llm.bounded import LARGEST_BODY, TIMEOUT, Elsewhere, TooMuch, bound, in_time, stay
 from lare.llm.budget import Budget, BudgetSpent
+from lare.llm.key import VARIABLE, key, without_key
 from lare.llm.prompts import Message
 
 TRIES = 6
@@ -31,9 +34,12 @@ LONGEST_WAIT = 60.0
 REPLY_TOKENS, SHORTEST_REPLY = 16_384, 1024
 """The most that a reply may have; halved as long as the model allows less, down to the second."""
 
+LONGEST_EXCERPT = 200
+"""Characters of an answer that cannot be read."""
+
 RETRIED = {408, 409, 429}
 
-HOPELESS = ("UnsupportedProtocol", "InvalidURL", "LocalProtocolError")
+HOPELESS = ("UnsupportedProtocol", "InvalidURL", "LocalProtocolError", "Elsewhere")
 NOT_SENT = ("Connect", *HOPELESS)
 """How the names of errors begin: of those that come again, and of those before a request was on its way."""
 
@@ -84,13 +90,12 @@ class LiveModel:
     def __post_init__(self) -> None:
         if not self.name.strip() or not self.name.isprintable():
             raise ModelFailed(f"{self.name!a} is not the name of a model")
-        self.key = os.environ.get("OPENAI_API_KEY", "").strip()
-        if not re.fullmatch(r"[!-~]*", self.key):
-            raise ModelFailed("the environment variable OPENAI_API_KEY holds characters that are in no key")
+        if not re.fullmatch(r"[!-~]*", key()):
+            raise ModelFailed(f"the environment variable {VARIABLE} holds characters that are in no key")
         base_url = self.base_url or os.environ.get("OPENAI_BASE_URL")
-        if not self.key and base_url is None:
+        if not key() and base_url is None:
             raise ModelFailed(
-                f"to ask {self.name!r}, put a key into the environment variable OPENAI_API_KEY, or name a server of "
+                f"to ask {self.name!r}, put a key into the environment variable {VARIABLE}, or name a server of "
                 "your own with --base-url (as http://localhost:11434/v1 for Ollama)"
             )
         self.endpoint = base_url
@@ -99,44 +104,38 @@ class LiveModel:
         except ImportError:
             raise ModelFailed("a live model needs an extra: pip install 'lare-rl[llm]'") from None
         except Exception as error:
-            raise ModelFailed(f"the endpoint {base_url!r} cannot be used: {self.scrubbed(error)}") from None
+            raise ModelFailed(f"the endpoint {base_url!r} cannot be used: {scrubbed(error)}") from None
 
     def connect(self) -> Any:
         """A client that reads no answer without end."""
         import openai
 
-        http = openai.DefaultHttpxClient(event_hooks={"response": [bound]}, timeout=TIMEOUT)
+        http = openai.DefaultHttpxClient(event_hooks={"response": [stay, bound]}, timeout=TIMEOUT)
         return openai.OpenAI(
-            api_key=self.key or "none", base_url=self.endpoint, max_retries=0, http_client=http, default_headers=PLAIN
+            api_key=key() or "none", base_url=self.endpoint, max_retries=0, http_client=http, default_headers=PLAIN
         )
-
-    def scrubbed(self, text: object) -> str:
-        """A message in one line, without the key."""
-        return self.without_key(" ".join(str(text).split()))[:500]
-
-    def without_key(self, text: str) -> str:
-        """A text without the key, whoever put it there. What is shorter is no secret, but a word like "none"."""
-        return text.replace(self.key, "[key]") if len(self.key) >= 8 else text
 
     def reply(self, messages: Sequence[Message], sample: int) -> str:
         """One reply. `sample` makes no difference here: a model says something new each time.
 
         Raises:
             ModelFailed: there was no reply, after all tries.
-            BudgetSpent: the budget does not allow another request.
+            BudgetSpent: the budget does not allow another request, or its time is over.
         """
+        self.said(f"{self.name}: waiting for a reply, {self.budget.patience(TIMEOUT)}")
         failure, tries = Failure("nothing was tried", again=True), 0
         while failure.again and tries < TRIES:
-            if failure.wait:
-                self.said(f"{self.name}: {failure.said}; trying again in {failure.wait:.1f} s")
-                self.sleep(failure.wait)
             try:
+                if failure.wait:
+                    self.budget.wait(failure.wait)
+                    self.said(f"{self.name}: {failure.said}; trying again in {failure.wait:.1f} s")
+                    self.sleep(failure.wait)
                 outcome = self.ask(messages)
             except BudgetSpent as error:
                 why = f"; the last try failed: {failure.said}" if tries else ""
                 raise BudgetSpent(f"{error}{why}") from None
             if isinstance(outcome, str):
-                return self.without_key(outcome)
+                return without_key(outcome)
             tries += outcome.wait is not None
             failure = outcome
             if failure.wait == 0:
@@ -161,7 +160,8 @@ class LiveModel:
                 return response.read()
 
         try:
-            body = in_time(fetch)
+            with self.budget.clock():
+                body = in_time(fetch, min(TIMEOUT, self.budget.seconds_left))
         except openai.APIStatusError as error:
             return self.refused(error)
         except openai.APIConnectionError as error:
@@ -169,19 +169,21 @@ class LiveModel:
             if not type(cause).__name__.startswith(NOT_SENT):
                 self.count_all(messages, allowed)
             hopeless = type(cause).__name__.startswith(HOPELESS)
-            return Failure(self.scrubbed(f"{where} cannot be reached: {cause}"), again=not hopeless)
+            return Failure(scrubbed(f"{where} cannot be reached: {cause}"), again=not hopeless)
         except (openai.OpenAIError, OSError) as error:
             if isinstance(error, TimeoutError):  # whoever goes on reading is left behind
                 self.client.close()
                 self.client = self.connect()
             self.count_all(messages, allowed)
-            return Failure(self.scrubbed(f"{type(error).__name__}: {error}"), again=True)
+            return Failure(scrubbed(f"{type(error).__name__}: {error}"), again=True)
         except TooMuch as error:
             self.budget.count(None, messages, "x" * LARGEST_BODY)
             return Failure(str(error), again=False)
+        except Elsewhere as error:
+            return Failure(scrubbed(error), again=False)
         except Exception as error:  # what the transport raises while a body is read depends on the client's version
             self.count_all(messages, allowed)
-            return Failure(self.scrubbed(f"the answer broke off ({type(error).__name__}: {error})"), again=True)
+            return Failure(scrubbed(f"the answer broke off ({type(error).__name__}: {error})"), again=True)
         return self.read(body, messages, allowed)
 
     def count_all(self, messages: Sequence[Message], allowed: int) -> None:
@@ -191,18 +193,17 @@ class LiveModel:
     def read(self, body: bytes, messages: Sequence[Message], allowed: int) -> "str | Failure":
         """The text of a chat completion. An answer that is none is tried again: something is wrong on the way."""
         try:
-            answer = json.loads(body)
+            answer = read_json(body)
             choice = answer["choices"][0]
             message = choice["message"]
             text = message.get("content") or message.get("refusal") or ""
             if not isinstance(text, str):
                 raise TypeError("the content is not a text")
             text = text.encode(errors="replace").decode()  # half a character is none
-        except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+        except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
             self.budget.count(None, messages, body.decode(errors="replace"))
-            return Failure(
-                self.scrubbed(f"the answer is not a chat completion ({type(error).__name__}: {error})"), again=True
-            )
+            what = f"the answer is not a chat completion ({type(error).__name__}: {error})"
+            return Failure(scrubbed(f"{what}: {excerpt(body.decode(errors='replace'))}"), again=True)
         self.budget.count(answer.get("usage"), messages, text)
         if choice.get("finish_reason") == "length":
             self.said(f"{self.name}: a reply was cut off at the {allowed:,} tokens that it was allowed")
@@ -210,7 +211,9 @@ class LiveModel:
 
     def refused(self, error: Any) -> "Failure":
         """An HTTP status that is no success: ask for less, wait, or give up."""
-        status, said = error.status_code, self.scrubbed(error)
+        status, body = error.status_code, getattr(error, "body", None)
+        # The client's own message tells nothing of a body that is not JSON: a page of a proxy, or a plain sentence.
+        said = scrubbed(f"{error}: {excerpt(body)}" if isinstance(body, str) and body.strip() else error)
         if status in (400, 422) and self.step_down(said.lower()):
             return Failure(said, again=True, wait=None)
         again = (status in RETRIED or status >= 500) and "insufficient_quota" not in said
@@ -245,6 +248,17 @@ class Failure:
     again: bool
     wait: float | None = 0.0
     """Seconds until the next try; 0 where nobody has said, None where something else is tried at once."""
+
+
+def scrubbed(text: object) -> str:
+    """A message in one line, without the key, and without what a terminal would obey."""
+    return without_key(in_a_line(text))[:500]
+
+
+def excerpt(body: str) -> str:
+    """The beginning of an answer that cannot be read."""
+    text = in_a_line(body[:2000])
+    return repr(text if len(text) <= LONGEST_EXCERPT else f"{text[:LONGEST_EXCERPT]}...")
 
 
 def seconds(retry_after: str | None) -> float:

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from lare.errors import LareError
+from lare.foreign import read_text
 from lare.llm.prompts import Kind, Message
 from lare.llm.recording import RecordedModel, read_recording, shipped_recordings
-from lare.tasks.spec import read_text
 
 
 @runtime_checkable

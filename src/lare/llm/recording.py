@@ -9,6 +9,8 @@ from pathlib import Path
 
 from lare.errors import Checked, LareError
 from lare.files import replace
+from lare.foreign import read_json
+from lare.llm.key import without_key
 from lare.llm.prompts import Kind, Message, Stage
 
 SHIPPED = files("lare.llm") / "recordings"
@@ -52,11 +54,11 @@ def shipped_recordings(kind: Kind, draw: int) -> list[Recording]:
 def read_recording(text: str, name: str) -> Recording:
     """Raises `LareError` where `text` is not a recording; `name` says in the message which one."""
     try:
-        values = json.loads(text)
+        values = read_json(text)
         json.dumps(values, ensure_ascii=False).encode()
     except UnicodeEncodeError as error:
         raise LareError(f"recording {name} holds half a character (a surrogate), which no file can keep") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise LareError(f"recording {name} is not JSON: {error}") from error
     if not isinstance(values, dict):
         raise LareError(f"recording {name} is JSON, but not an object")
@@ -157,4 +159,4 @@ class Recorder:
             temperature=self.temperature,
             exchanges=self.exchanges,
         )
-        return recording.model_dump_json(indent=1) + "\n"
+        return without_key(recording.model_dump_json(indent=1)) + "\n"

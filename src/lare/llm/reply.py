@@ -7,6 +7,8 @@ from typing import Any
 from pydantic import ConfigDict, Field
 
 from lare.errors import Checked, LareError
+from lare.foreign import integer, read_json, shallow
+from lare.llm.key import without_key
 
 LONGEST = 200_000
 """Characters of a reply."""
@@ -54,8 +56,8 @@ def parse(text: str) -> Reply:
         raise MalformedReply(f"the reply has {len(text)} characters; at most {LONGEST} are read")
     check_characters(text)
     try:
-        values = json.loads(text, strict=False)  # lines may end within a string
-    except (ValueError, RecursionError) as error:
+        values = read_json(text, strict=False)
+    except ValueError as error:
         values = embedded(text)
         if values is None:
             raise MalformedReply(f"the reply is not one JSON object: {error}") from error
@@ -68,9 +70,9 @@ def parse(text: str) -> Reply:
     for part in (reply.understand, reply.analyze, reply.functions):
         check_characters(part)
     inner = FENCE.search(reply.functions)
-    if inner is None or "def " in reply.functions[: inner.start()]:
-        return reply
-    return reply.model_copy(update={"functions": inner[2]})
+    functions = reply.functions if inner is None or "def " in reply.functions[: inner.start()] else inner[2]
+    texts = {"understand": reply.understand, "analyze": reply.analyze, "functions": functions}
+    return reply.model_copy(update={name: without_key(text) for name, text in texts.items()})
 
 
 def check_characters(text: str) -> None:
@@ -85,11 +87,11 @@ def check_characters(text: str) -> None:
 
 def embedded(text: str) -> dict[str, Any] | None:
     """The last whole object that stands somewhere in a text, or the function that stands in a fence."""
-    decoder, partial = json.JSONDecoder(strict=False), None
+    decoder, partial = json.JSONDecoder(strict=False, parse_int=integer), None
     text = THOUGHT.split(text)[-1]
     for start in [match.start() for match in START.finditer(text)][: -MOST_STARTS - 1 : -1]:
         try:
-            value, _ = decoder.raw_decode(text, start)
+            value = shallow(decoder.raw_decode(text, start)[0])
         except (ValueError, RecursionError):
             continue
         if value.keys() >= KEYS:

@@ -10,6 +10,7 @@ A row file is only ever added; `state.npz` is written beside the old one and ren
 
 import contextlib
 import json
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -20,16 +21,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare.errors import LareError
+from lare.errors import LareError, shortened
 from lare.files import write_atomically
+from lare.foreign import read_json
 
 STATE = "state.npz"
 
 BY_ROW = ".replay.columns"
 """The part of the state that is saved by row."""
 
-DAMAGED = (OSError, ValueError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-"""What reading a file that is not whole may raise."""
+DAMAGED = (
+    *(
+        OSError,
+        ValueError,
+        KeyError,
+        EOFError,
+        NotImplementedError,
+        zipfile.BadZipFile,
+        zlib.error,
+        tokenize.TokenError,
+    ),
+    *(TypeError, IndexError, AttributeError, OverflowError, MemoryError, SyntaxError),
+)
+"""What reading a file may raise that is not whole, or holds something else than it should."""
+
+LARGEST_COUNT = 2**53
+"""Of what a checkpoint counts."""
 
 
 @runtime_checkable
@@ -50,9 +67,46 @@ Some = TypeVar("Some", bound=WithReplay)
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """The arrays of a file. NumPy would leave one that is not whole open."""
+    """The arrays of a file, which takes no more room than its size says. NumPy would leave one that is not whole open."""
     with path.open("rb") as file, np.load(file, allow_pickle=False) as saved:
+        if not isinstance(saved, np.lib.npyio.NpzFile):
+            raise ValueError("it holds a single array")
+        check_stored(file)
         yield saved
+
+
+def check_stored(file: Any) -> None:
+    """Raise `ValueError` where an archive holds something packed: a few bytes unpack to gigabytes."""
+    with zipfile.ZipFile(file) as archive:
+        for entry in archive.infolist():
+            if entry.compress_type != zipfile.ZIP_STORED:
+                raise ValueError(f"{entry.filename} is packed, which no checkpoint is")
+
+
+def counted(value: Any) -> Any:
+    """Numbers that count something, in lists as they come. Raises `ValueError` where one is none."""
+    if isinstance(value, list):
+        return [counted(one) for one in value]
+    if type(value) is not int or not 0 <= value <= LARGEST_COUNT:
+        raise ValueError(f"{shortened(value)} counts nothing")
+    return value
+
+
+def read_host(text: Any) -> dict[str, Any]:
+    """What was to be remembered beside the arrays. Raises `ValueError` where it cannot be that."""
+    host = read_json(str(text))
+    if not isinstance(host, dict):
+        raise ValueError("host is no object")
+    counted([host[name] for name in ("step", "metrics_length", "functions_since") if name in host])
+    digests = host.get("function_sha256", [])
+    if not (isinstance(digests, list) and all(isinstance(one, str) for one in digests)):
+        raise ValueError("function_sha256 is no list of texts")
+    return host
+
+
+def read_segments(text: Any) -> list[dict[str, Any]]:
+    """Which row files count. Raises `ValueError` as `read_host`."""
+    return [{name: counted(one[name]) for name in ("number", "start", "count")} for one in read_json(str(text))]
 
 
 def named_leaves(learner: Any) -> dict[str, Any]:
@@ -90,7 +144,7 @@ def save(
     start, segments, old = np.zeros_like(end), [], []
     if (directory / STATE).exists():
         with opened(directory / STATE) as saved:
-            start, segments = saved[".replay.next_row"], json.loads(str(saved["segments"]))
+            start, segments = saved[".replay.next_row"], read_segments(saved["segments"])
     number = segments[-1]["number"] + 1 if segments else 0
     if anew:
         start, segments, old = np.maximum(end - rows + 1, 0), [], segments
@@ -131,10 +185,10 @@ def load(directory: Path, template: Some) -> tuple[Some, dict[str, Any], dict[st
     try:
         with opened(path) as saved:
             state = {name: saved[name] for name in saved.files}
-        host, segments = json.loads(str(state.pop("host"))), json.loads(str(state.pop("segments")))
+        host, segments = read_host(state.pop("host")), read_segments(state.pop("segments"))
         learner = with_rows(fill(template, state), directory, segments)
     except DAMAGED as error:
-        raise LareError(f"the checkpoint {path} cannot be read: {error}") from error
+        raise LareError(f"the checkpoint {path} cannot be read: {error or type(error).__name__}") from error
     return learner, host, {name: array for name, array in state.items() if not name.startswith(".")}
 
 
@@ -142,7 +196,7 @@ def saved_host(directory: Path) -> dict[str, Any] | None:
     """The `host` of the last checkpoint; None where there is none that can be read."""
     try:
         with opened(directory / STATE) as saved:
-            return json.loads(str(saved["host"]))
+            return read_host(saved["host"])
     except DAMAGED:
         return None
 
@@ -155,6 +209,8 @@ def fill(template: Some, state: Mapping[str, np.ndarray]) -> Some:
         name = jax.tree_util.keystr(path)
         if name in known and state[name].shape != leaf.shape:
             raise ValueError(f"{name} has shape {state[name].shape}, not {leaf.shape}")
+        if name in known and state[name].dtype != leaf.dtype:
+            raise ValueError(f"{name} holds {state[name].dtype}, not {leaf.dtype}")
         filled.append(jnp.asarray(state[name]) if name in known else leaf)
     return jax.tree.unflatten(structure, filled)
 

@@ -26,6 +26,7 @@ from jaxtyping import Float
 
 from lare.errors import Checked, LareError
 from lare.files import write_atomically
+from lare.foreign import read_json, read_text
 from lare.latent.evaluator import LatentRewardError
 from lare.latent.function import LatentFunction, load, per_role
 from lare.run.checkpoint import STATE, saved_host
@@ -33,6 +34,7 @@ from lare.run.settings import ResolvedSettings
 from lare.source import source
 from lare.tasks.spec import Judges, TaskSpec
 from lare.tasks.table import env_spec
+from lare.tasks.trust import check_trusted
 
 CONFIG, METRICS, FUNCTION, CHECKPOINT = "config.json", "metrics.jsonl", "latent_function.py", "checkpoint"
 FAILED_BATCH = "failed_batch.npz"
@@ -40,6 +42,12 @@ FAILED_BATCH = "failed_batch.npz"
 VERSIONS = ("jax", "optax", "gymnasium", "mujoco", "numpy")
 """Packages that results depend on."""
 
+
+LARGEST_CONFIG, LARGEST_METRICS = 8 << 20, 512 << 20
+"""Bytes of these files."""
+
+LARGEST_STEP = 2**53
+"""Of the whole numbers in metrics.jsonl; beyond it a float is another number."""
 
 FORMAT = 3
 """Of config.json and of the checkpoint. What stands in them changed with every number."""
@@ -235,7 +243,7 @@ def read_config(directory: Path) -> Config:
     if not path.is_file():
         raise LareError(f"{directory} is not a run: there is no {CONFIG} in it")
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = read_json(read_text(path, LARGEST_CONFIG))
         if not isinstance(values, dict):
             raise LareError("it is JSON, but not an object")
         if values.get("format") != FORMAT:
@@ -249,17 +257,32 @@ def read_config(directory: Path) -> Config:
 
 
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
-    """Every complete line of a run's metrics.jsonl, in order. Raises `LareError` where one makes no sense."""
+    """Every complete line of a run's metrics.jsonl, in order. Raises `LareError` where one makes no sense, or none can be read."""
     path = directory / METRICS
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
-        found = [json.loads(line) for line in lines if line.endswith("\n")]
-    except (OSError, ValueError) as error:
-        raise LareError(f"{path} is damaged: {error}") from error
-    for place, line in enumerate(found, start=1):
-        if not (isinstance(line, dict) and isinstance(line.get("step"), int) and isinstance(line.get("seed"), int)):
+    found = []
+    for place, line in enumerate(whole_lines(path), start=1):
+        try:
+            found.append(read_json(line))
+        except ValueError as error:
+            raise LareError(f"{path} is damaged: {error} in line {place}") from error
+        if not is_evaluation(found[-1]):
             raise LareError(f"{path} is damaged: line {place} is no evaluation")
     return found
+
+
+def whole_lines(path: Path) -> list[str]:
+    """Lines that have their end; none where there is no such file."""
+    return read_text(path, LARGEST_METRICS).split("\n")[:-1] if path.exists() else []
+
+
+def is_evaluation(line: Any) -> bool:
+    """Whether it is a line of metrics.jsonl: numbers by name, and what they were measured of."""
+    return (
+        isinstance(line, dict)
+        and all(type(line.get(name)) is int and 0 <= line[name] <= LARGEST_STEP for name in ("step", "seed"))
+        and all(value is None or type(value) in (int, float) for value in line.values())
+        and all(abs(value) <= LARGEST_STEP for value in line.values() if type(value) is int)
+    )
 
 
 def read_measured(directory: Path) -> Run:
@@ -271,13 +294,16 @@ def open_run(directory: str | Path) -> Run:
     """Read a run directory; its latent function is verified again before anything executes it.
 
     Raises:
-        LareError: it is not a run, or its files are not what they should be.
+        LareError: it is not a run, its files are not what they should be, or its environment is a file that nobody named.
     """
     directory = Path(directory)
     config = read_config(directory)
+    check_trusted(config.task, directory)
     functions, since, digests = [], 0, config.function_sha256
     if config.settings.reflect_every is not None and (host := saved_host(directory / CHECKPOINT)) is not None:
-        since, digests = host["functions_since"], tuple(host["function_sha256"])
+        since, digests = host.get("functions_since", 0), tuple(host.get("function_sha256", ()))
+    if digests and len(digests) != len(config.task.roles):
+        raise LareError(f"{directory}: there are {len(digests)} latent functions for {len(config.task.roles)} roles")
     for role, digest in zip(config.task.roles, digests, strict=True) if digests else ():
         place = directory / function_file(config.task, role, since)
         function = load(place, role)

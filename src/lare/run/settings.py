@@ -21,6 +21,9 @@ from lare.tasks.spec import Judges, TaskSpec
 
 LARGEST_SEED = 2**31 - 1
 
+MOST_SEEDS = 1000
+"""In one process."""
+
 
 def optional(field: FieldInfo) -> tuple[Any, Any]:
     """A field that may also be None, which it is unless given."""
@@ -107,6 +110,8 @@ class Settings(Checked):
 
     @model_validator(mode="after")
     def seeds_that_there_are(self) -> "Settings":
+        if self.seeds > MOST_SEEDS:
+            raise ValueError(f"seeds = {self.seeds}: at most {MOST_SEEDS} train in one process")
         if self.seed + self.seeds - 1 > LARGEST_SEED:
             raise ValueError(f"seed = {self.seed} and {self.seeds - 1} that follow it: the largest is {LARGEST_SEED}")
         return self
@@ -118,7 +123,7 @@ class ResolvedSettings(Checked):
     method: str
     algorithm: Name
     steps: Count
-    seeds: Count
+    seeds: Annotated[int, Field(ge=1, le=MOST_SEEDS)]
     seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)]
     judges: Judges | None
     draw: Annotated[int, Field(ge=0)]

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import tomllib
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from lare.errors import Checked, LareError, did_you_mean
+from lare.foreign import LARGEST_SETTINGS, read_text, read_toml
 
 Judges = Literal["before", "after", "both"]
 """Which observation `phi` judges a step by: that before the action, that which the action led to, or both, one after
@@ -153,7 +153,7 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     if task in shipped_tasks():
         text = (SHIPPED / f"{task}.toml").read_text(encoding="utf-8")
     elif is_file(task):
-        text = read_text(Path(task))
+        text = read_text(Path(task), LARGEST_SETTINGS)
     else:
         if task.endswith(".toml"):
             raise LareError(f"there is no task file {task}")
@@ -162,8 +162,8 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
             f"no task {task!r}{hint}: neither a file nor one of the shipped tasks, {', '.join(shipped_tasks())}"
         )
     try:
-        values = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # TOMLDecodeError is one; a number without end is another
+        values = read_toml(text)
+    except ValueError as error:  # TOMLDecodeError is one; a number without end is another
         raise LareError(f"task {task!r} is not valid TOML: {error}") from error
     like, teams = values.get("like"), values.get("teams")
 
@@ -192,16 +192,6 @@ def is_file(name: str) -> bool:
         return Path(name).is_file()
     except (OSError, ValueError):  # too long, or with a character that no file name has
         return False
-
-
-def read_text(path: Path) -> str:
-    """A file's text. Raises `LareError` where it has none."""
-    try:
-        if path.exists() and not path.is_file():
-            raise LareError(f"{path} is not a file")
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise LareError(f"{path} cannot be read: {error}") from error
 
 
 def the_role(spec: TaskSpec) -> TaskSpec:

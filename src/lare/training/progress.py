@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lare.errors import needs_extra
+from lare.legible import legible
 
 Metrics = Sequence[Mapping[str, Any]]
 """One mapping a seed, as in metrics.jsonl."""
@@ -99,7 +100,7 @@ class Terminal:
         return f", {math.ceil((self.steps - step) / rate / 60)} min left"
 
     def said(self, message: str) -> None:
-        self.console.print(message, highlight=False, markup=False, soft_wrap=True)
+        self.console.print(legible(message), highlight=False, markup=False, soft_wrap=True)
 
     def stopped(self) -> None:
         if self.progress:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Key
 from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import find_method
 from lare.data.trajectory import Trajectory
+from lare.errors import LareError
 from lare.latent.improve import Model
 from lare.run import checkpoint
 from lare.run.directory import Run
@@ -189,7 +190,12 @@ def restore(run: Run) -> tuple[Session, list[str]]:
     """A session as of the last checkpoint, and what is to be said about it."""
     config, learner, host, arrays = load_learner(run)
     session = begin(run, config, lambda: learner)
-    return session, session.return_to(host, arrays)
+    try:
+        return session, session.return_to(host, arrays)
+    except checkpoint.DAMAGED as error:
+        session.close()
+        said = f"{type(error).__name__}: {error}"
+        raise LareError(f"the checkpoint in {run.checkpoint} does not fit its environments: {said}") from error
 
 
 def begin(run: Run, config: TrainConfig, make_learner: Callable[[], Learner]) -> Session:
