@@ -23,12 +23,12 @@ from measure import advance, interleave, new_session, show, summary, write
 
 import lare
 from lare.algorithms.td3 import TD3Settings
-from lare.latent import gate
-from lare.latent.checks import Trial, examine
-from lare.latent.evaluator import Evaluator
-from lare.latent.jailed import JailedProgram, WorkerFailed
-from lare.latent.program import Program
-from lare.latent.verify import verify
+from lare.latent.function import Evaluator
+from lare.latent.language import gate
+from lare.latent.language.program import Program
+from lare.latent.sandbox.jailed import JailedProgram, WorkerFailed
+from lare.latent.verification.checks import Trial, examine
+from lare.latent.verification.verify import verify
 from lare.llm.recording import SHIPPED, read_recording
 from lare.llm.reply import parse
 from lare.tasks.spec import read_task

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from lare.latent.program import FILE, Program
+from lare.latent.language.program import FILE, Program
 from toys import phi
 
 

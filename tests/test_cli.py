@@ -8,7 +8,7 @@ import pytest
 from lare import cli
 from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import METHODS
-from lare.latent.checks import CHECKS
+from lare.latent.verification.checks import CHECKS
 from lare.llm.prompts import candidate
 from lare.source import source
 from lare.tasks.spec import read_task, shipped_tasks
@@ -181,7 +181,7 @@ def test_what_cannot_be_tried_is_status_2(command, phi, arguments, message):
 
 
 def test_no_process_to_be_had_is_status_2(command, phi, spec_file, monkeypatch):
-    monkeypatch.setattr("lare.latent.jailed.START", "raise SystemExit('no Python here')")
+    monkeypatch.setattr("lare.latent.sandbox.jailed.START", "raise SystemExit('no Python here')")
     status, out, err = command("verify", phi, "--task", spec_file())
     assert (status, out) == (2, "")
     assert err.startswith("lare: the process for the latent function does not start: ")

@@ -97,7 +97,7 @@ def test_another_name_is_not():
     "module",
     [
         "lare",
-        "lare.latent.worker",
+        "lare.latent.sandbox.worker",
         "lare.latent.design",
         "lare.tasks.spec",
         "lare.tasks.pettingzoo",

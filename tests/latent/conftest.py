@@ -1,6 +1,6 @@
 import pytest
 
-from lare.latent.jailed import JailedProgram
+from lare.latent.sandbox.jailed import JailedProgram
 from toys import PHI
 
 

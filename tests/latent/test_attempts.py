@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lare.latent.checks import Trial, examine
-from lare.latent.gate import inspect
-from lare.latent.jailed import JailedProgram
+from lare.latent.language.gate import inspect
+from lare.latent.sandbox.jailed import JailedProgram
+from lare.latent.verification.checks import Trial, examine
 
 ATTEMPTS = json.loads(Path(__file__).with_name("attempts.json").read_text(encoding="utf-8"))
 BY_NAME = {one["name"]: one for one in ATTEMPTS}

@@ -8,9 +8,9 @@ import pytest
 
 from lare.errors import LareError
 from lare.latent import design as module
-from lare.latent.checks import Check
 from lare.latent.design import ATTEMPTS, LONGEST_QUOTE, DesignBroken, DesignFailed, DesignStopped, design
-from lare.latent.verify import Verdict
+from lare.latent.verification.checks import Check
+from lare.latent.verification.verify import Verdict
 from lare.llm.prompts import candidate, combine, correct
 from lare.llm.recording import read_recording
 from lare.tasks.spec import read_task, shipped_tasks

@@ -11,10 +11,9 @@ import pytest
 
 from lare.errors import LareError
 from lare.latent import function as module
-from lare.latent.checks import CHECKS, Check
-from lare.latent.evaluator import LatentRewardError
-from lare.latent.function import HEADER, LatentFunction, load, normal, read_source, verified
-from lare.latent.verify import Verdict
+from lare.latent.function import HEADER, LatentFunction, LatentRewardError, load, normal, read_source, verified
+from lare.latent.verification.checks import CHECKS, Check
+from lare.latent.verification.verify import Verdict
 from toys import PHI, phi, toy_spec
 
 SOURCE = PHI.strip("\n")

@@ -9,9 +9,9 @@ import numpy as np
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from lare.latent.gate import inspect
-from lare.latent.program import Program
-from lare.latent.rows import FUNCTIONS, check_own, labelled
+from lare.latent.language.gate import inspect
+from lare.latent.language.program import Program
+from lare.latent.verification.rows import FUNCTIONS, check_own, labelled
 from toys import phi
 
 ROWS = 6

@@ -39,7 +39,7 @@ def needed(method, function):
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_worker_that_is_killed_or_starved_stops_the_run_and_harms_nothing(number, small, tmp_path, monkeypatch):
-    monkeypatch.setattr("lare.latent.jailed.TIME_LIMIT", 4.0)
+    monkeypatch.setattr("lare.latent.sandbox.jailed.TIME_LIMIT", 4.0)
     whole = lare.train(toy_spec(), small(), function=verified(PHI, toy_spec()), out=tmp_path / "whole", listeners=[])
     function = verified(PHI, toy_spec())
     worker = function.evaluator(2, 1).program.process

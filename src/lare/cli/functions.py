@@ -98,7 +98,7 @@ def verify(
             or the id of a local data set of Minari's.
     """
     from lare.latent.function import read_source
-    from lare.latent.verify import verify as verify_source
+    from lare.latent.verification.verify import verify as verify_source
     from lare.tasks.spec import load_task, read_task
 
     source, changed = read_source(file)

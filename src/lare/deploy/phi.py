@@ -14,7 +14,7 @@ import numpy as np
 
 from lare.deploy.graph import Graph
 from lare.deploy.rows import BATCH, FUNCTIONS, LARGEST, METHODS, Rows, Untranslatable, indexed, is_rows, joined
-from lare.latent.language import NAME
+from lare.latent.language.allowed import NAME
 
 MOST_STEPS = 20_000
 """Of a walk, so that it ends."""

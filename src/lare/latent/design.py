@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from lare.errors import LareError
-from lare.latent.checks import Check, Failed, factors_of
 from lare.latent.function import LatentFunction, normal
-from lare.latent.jailed import JailedProgram, WorkerFailed
-from lare.latent.verify import Steps, Verdict, tried_on, verify
+from lare.latent.sandbox.jailed import JailedProgram, WorkerFailed
+from lare.latent.verification.checks import Check, Failed, factors_of
+from lare.latent.verification.verify import Steps, Verdict, tried_on, verify
 from lare.llm import prompts
 from lare.llm.model import Model, recorded_model
 from lare.llm.prompts import Kind, Message, Stage

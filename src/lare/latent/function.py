@@ -1,4 +1,7 @@
-"""LatentFunction: the artifact. A verified `phi`, readable, with where it came from and what it passed."""
+"""LatentFunction: the artifact. A verified `phi`, readable, with where it came from and what it passed; and its worker.
+
+`phi` at work is a program in the sandbox that is called again and again, and believed no more at the last call than at the first.
+"""
 
 import functools
 import hashlib
@@ -14,14 +17,109 @@ from jaxtyping import Float
 
 from lare.errors import LareError, shortened
 from lare.foreign import read_json, read_text
-from lare.latent.checks import Check
-from lare.latent.evaluator import Evaluator
-from lare.latent.names import factor_meanings, names_of
-from lare.latent.verify import Steps, verify
+from lare.latent.language.names import factor_meanings, names_of
+from lare.latent.sandbox.jailed import ROWS, SIZES, JailedProgram, WorkerFailed
+from lare.latent.verification.checks import Check, Failed, factors_of, same
+from lare.latent.verification.verify import Steps, verify
 from lare.llm.key import without_key
 from lare.llm.prompts import Kind
 from lare.llm.recording import Exchange
 from lare.tasks.spec import Judges, TaskSpec
+
+WITNESSES = 3
+"""Rows that a sentinel computes again."""
+
+
+class LatentRewardError(LareError):
+    """A verified function gave something that cannot be used, or its process failed.
+
+    `observation` and `action` are the batch that it happened with.
+    """
+
+    def __init__(self, message: str, observation: np.ndarray, action: np.ndarray):
+        super().__init__(message)
+        self.observation, self.action = observation, action
+
+
+class Evaluator:
+    """A worker process for one latent function. Close it, or let it go."""
+
+    def __init__(self, source: str, names: list[str], observation_size: int, action_size: int):
+        """Raises `NoWorker` where no process is to be had."""
+        self.names = names
+        self.calls = 0
+        self.random = np.random.default_rng()
+        """Chooses witnesses, which change nothing that is computed: nobody must know them before."""
+        self.program = JailedProgram(source, observation_size, action_size)
+        if self.program.problems:
+            raise LareError(f"the latent function has no verdict: {self.program.problems[0]}")
+
+    @property
+    def isolation(self) -> str:
+        return self.program.isolation
+
+    def __call__(
+        self, observation: Float[np.ndarray, "batch observation"], action: Float[np.ndarray, "batch action"]
+    ) -> Float[np.ndarray, "batch factors"]:
+        """The factors of a batch.
+
+        At calls 1, 2, 4, 8, ... three rows by chance are computed again alone, and must come out the same.
+
+        Raises:
+            LatentRewardError: something came that is no factor, or nothing did.
+        """
+        observation, action = np.asarray(observation, np.float32), np.asarray(action, np.float32)
+        try:
+            factors = self.factors(observation, action)
+            self.check_finite(factors, observation)
+            self.calls += 1
+            if self.calls & (self.calls - 1) == 0 and len(observation):
+                self.check_witnesses(factors, observation, action)
+        except Failed as error:
+            raise LatentRewardError(f"the latent function failed: {error}", observation, action) from error
+        except WorkerFailed as error:
+            raise LatentRewardError(str(error), observation, action) from error
+        return factors
+
+    def factors(self, observation: np.ndarray, action: np.ndarray) -> np.ndarray:
+        parts = []
+        for start in range(0, max(1, len(observation)), ROWS):
+            part = observation[start : start + ROWS], action[start : start + ROWS]
+            size = verified_size(len(part[0]))
+            returned = self.program.call(padded(part[0], size), padded(part[1], size))
+            found = factors_of(returned, size, "factors")
+            parts.append(found[: len(part[0])])
+        sizes = {part.shape[1] for part in parts}
+        if sizes != {len(self.names)}:
+            raise Failed(f"it gave {sizes.pop()} factors, not {len(self.names)}")
+        with np.errstate(over="ignore"):
+            return np.concatenate(parts).astype(np.float32)
+
+    def check_finite(self, factors: np.ndarray, observation: np.ndarray) -> None:
+        if not np.isfinite(factors).all():
+            row, column = np.argwhere(~np.isfinite(factors))[0]
+            where = np.array2string(observation[row], precision=3, threshold=6)
+            raise Failed(f"factor {self.names[column]!r} is {factors[row, column]} for the observation {where}")
+
+    def check_witnesses(self, factors: np.ndarray, observation: np.ndarray, action: np.ndarray) -> None:
+        rows = self.random.integers(len(observation), size=WITNESSES)
+        alone = self.factors(observation[rows], action[rows])
+        if not same(alone, factors[rows], of=factors).all():
+            raise Failed("the same steps have other factors when they are judged again, in a smaller batch")
+
+    def close(self) -> None:
+        self.program.close()
+
+
+def verified_size(rows: int) -> int:
+    """The least number of rows that a program was verified with, and that holds so many; none are none."""
+    return next(size for size in (0, *SIZES) if size >= rows)
+
+
+def padded(array: np.ndarray, rows: int) -> np.ndarray:
+    """The array with its first row behind it, as often as it takes."""
+    return array if len(array) == rows else np.concatenate([array, np.repeat(array[:1], rows - len(array), axis=0)])
+
 
 LARGEST_FILE = 1 << 20
 """Bytes of a function file."""

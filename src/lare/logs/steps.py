@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lare.latent.verify import STEPS, Steps
+from lare.latent.verification.verify import STEPS, Steps
 from lare.logs.source import open_logs
 from lare.tasks.spec import TaskSpec
 

@@ -27,8 +27,7 @@ from jaxtyping import Float
 from lare.errors import Checked, LareError
 from lare.files import write_atomically
 from lare.foreign import read_json, read_text
-from lare.latent.evaluator import LatentRewardError
-from lare.latent.function import LatentFunction, load, per_role
+from lare.latent.function import LatentFunction, LatentRewardError, load, per_role
 from lare.run.checkpoint import STATE, saved_host
 from lare.run.settings import ResolvedSettings
 from lare.source import source

@@ -1,0 +1,1 @@
+"""Where a program runs: a process without rights, and its other end."""

@@ -1,0 +1,1 @@
+"""What a program must do before it is believed."""

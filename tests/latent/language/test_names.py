@@ -1,0 +1,96 @@
+"""What a source says of its factors: nothing is executed for it."""
+
+import gc
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from lare.latent.language.names import factor_meanings, factor_names, names_of
+from toys import PHI, phi
+
+
+@pytest.mark.parametrize(
+    ("source", "size", "names"),
+    [
+        (PHI, 2, ["f_near", "f_effort"]),
+        (phi("return [-action, action]"), 2, ["factor_1", "action"]),
+        (phi("return (action, -action)"), 2, ["action", "factor_2"]),
+        # Where the list is not written out, or not at the end, or not as long, there are no names in it.
+        (phi("factors = [action, -action]\nreturn factors"), 2, ["factor_1", "factor_2"]),
+        (phi("return [action] * 2"), 2, ["factor_1", "factor_2"]),
+        (phi("if True:\n    return [action]"), 1, ["factor_1"]),
+        (phi("return [x for x in (action, action)]"), 2, ["factor_1", "factor_2"]),
+        (PHI, 3, ["factor_1", "factor_2", "factor_3"]),
+        (phi("return []"), 0, []),
+        # Another function's list is not this one's.
+        (
+            "def helper(a, b):\n    return [a, b]\n\n" + phi("return [observation, action]"),
+            2,
+            ["observation", "action"],
+        ),
+    ],
+)
+def test_names(source, size, names):
+    assert names_of(source, size) == names
+
+
+def test_names_that_cannot_be_read_off():
+    assert factor_names("x = 1") is None
+    assert factor_names(phi("return action")) is None
+
+
+@pytest.mark.parametrize(
+    ("lines", "meaning"),
+    [
+        ("# how near", "how near"),
+        ("# 1. how near", "how near"),
+        ("#  12) how near", "how near"),
+        ("# Factor 3: how near", "how near"),
+        ("# how near it is,\n    #   in metres", "how near it is, in metres"),
+        ("## how near", "how near"),
+        ("# something else\n\n    # how near", "how near"),
+        ("# 3 metres", "3 metres"),
+        ("# factors of two", "factors of two"),
+    ],
+)
+def test_the_comment_above_an_assignment_is_what_it_means(lines, meaning):
+    assert factor_meanings(phi(f"{lines.replace(chr(10) + '    ', chr(10))}\nx = action\nreturn [x]")) == {"x": meaning}
+
+
+def test_other_comments_mean_nothing():
+    source = phi("# not this one\n\nx = action\ny = action  # nor this\nx[0] = 1\n# nor that\nreturn [x, y]")
+    assert factor_meanings(source) == {}
+
+
+def test_the_last_assignment_counts():
+    assert factor_meanings(phi("# first\nx = action\n# then\nx = -x\nreturn [x]")) == {"x": "then"}
+
+
+def test_meanings_of_the_toy():
+    assert factor_meanings(PHI) == {"f_near": "how near the action comes", "f_effort": "effort"}
+
+
+def test_a_numbered_comment_may_stand_above_the_first_of_several_lines():
+    body = "# 1. how near\nd = action\nx = -d\n# 2. effort\ny = action\nz = x\n# not numbered\ne = x\nw = e\nreturn [x, y, z, w]"
+    assert factor_meanings(phi(body)) == {"d": "how near", "x": "how near", "y": "effort", "e": "not numbered"}
+
+
+def test_sources_are_read_in_threads():
+    """As those of several candidates are. JAX has such a hook in the garbage collector too."""
+    source = phi("\n".join(["action = action + (1 + (2 + (3 + (4 + action))))"] * 20) + "\nreturn [action]")
+    usual = gc.get_threshold()
+    threads = ThreadPoolExecutor(8)
+
+    def another_goes_on(phase, info):
+        time.sleep(0)
+
+    gc.callbacks.append(another_goes_on)
+    gc.set_threshold(5)
+    try:
+        names = list(threads.map(lambda _: factor_names(source), range(200)))
+    finally:
+        gc.set_threshold(*usual)
+        gc.callbacks.remove(another_goes_on)
+        threads.shutdown()
+    assert names == [["action"]] * 200
