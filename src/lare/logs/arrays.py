@@ -8,9 +8,8 @@ import numpy as np
 
 from lare.errors import LareError, shortened
 from lare.logs import npz
-from lare.logs.episode import KEYS, NEEDED, Logged, checked, form_of
+from lare.logs.episode import KEYS, NEEDED, Hints, Logged, Paid, checked, form_of
 from lare.logs.output import check_free
-from lare.logs.source import Hints, Paid
 
 D4RL = {"terminals": "terminations", "timeouts": "truncations"}
 """Names of flags in D4RL's data sets, and ours."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -47,6 +47,22 @@ class Form:
     action: Layout
     limit: int | None = None
     """Steps after which an episode is ended by its time limit; None where that is not known."""
+
+
+class Paid(NamedTuple):
+    """An episode with its new rewards."""
+
+    episode: Logged
+    r_hat: Float[np.ndarray, " steps"]
+
+
+class Hints(NamedTuple):
+    """What a task says of logs."""
+
+    sizes: Mapping[str, int]
+    """Of `observation` and `action` rows."""
+    limit: int | None
+    """Steps of an episode that the time limit ended."""
 
 
 def checked(name: str, values: Mapping[str, Any], form: Form, kept: Any) -> Logged:

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from lare.errors import LareError, needs_extra, shortened
-from lare.logs.episode import Form, Logged, checked
+from lare.logs.episode import Form, Hints, Logged, Paid, checked
 from lare.logs.output import check_free, whole
-from lare.logs.source import Hints, Paid
 from lare.plugs.layout import layout_of
 
 try:

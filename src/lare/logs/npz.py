@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from lare.errors import LareError, shortened
-from lare.logs.episode import Logged, checked, form_of
+from lare.logs.episode import Hints, Logged, Paid, checked, form_of
 from lare.logs.output import check_free, whole
-from lare.logs.source import Hints, Paid
 
 
 class NpzLogs:

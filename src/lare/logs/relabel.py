@@ -16,8 +16,8 @@ from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import Reward, find_method
 from lare.errors import LareError
 from lare.latent.function import LatentFunction
-from lare.logs.episode import Logged
-from lare.logs.source import Paid, Source, open_logs
+from lare.logs.episode import Logged, Paid
+from lare.logs.source import Source, open_logs
 from lare.plugs.assigner import CreditAssigner
 from lare.tasks.spec import TaskSpec
 

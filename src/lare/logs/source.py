@@ -2,21 +2,11 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
-
-import numpy as np
-from jaxtyping import Float
+from typing import Any, Protocol, runtime_checkable
 
 from lare.errors import LareError, shortened
-from lare.logs.episode import Form, Logged
+from lare.logs.episode import Form, Hints, Logged, Paid
 from lare.tasks.spec import TaskSpec, the_role
-
-
-class Paid(NamedTuple):
-    """An episode with its new rewards."""
-
-    episode: Logged
-    r_hat: Float[np.ndarray, " steps"]
 
 
 @runtime_checkable
@@ -47,15 +37,6 @@ class Source(Protocol):
             about: a sentence on what was done, where there is a place for one.
         """
         ...
-
-
-class Hints(NamedTuple):
-    """What a task says of logs."""
-
-    sizes: Mapping[str, int]
-    """Of `observation` and `action` rows."""
-    limit: int | None
-    """Steps of an episode that the time limit ended."""
 
 
 def hints_of(task: TaskSpec | None) -> Hints:

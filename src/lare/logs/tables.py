@@ -11,9 +11,8 @@ import numpy as np
 import pyarrow as pa
 
 from lare.errors import LareError
-from lare.logs.episode import KEYS, Logged, checked, form_of
+from lare.logs.episode import KEYS, Hints, Logged, Paid, checked, form_of
 from lare.logs.output import check_free, whole
-from lare.logs.source import Hints, Paid
 
 ROWS = 8192
 """That are read, and at least as many that are written, at a time."""

@@ -415,8 +415,6 @@ def test_where_there_is_no_worker_it_is_said_in_a_line(monkeypatch):
 
 
 def test_the_package_is_there_where_limits_are_not():
-    script = (
-        "import sys; sys.modules['resource'] = None; import lare; from lare.latent.sandbox import jail; print(*jail.limits(0))"
-    )
+    script = "import sys; sys.modules['resource'] = None; import lare; from lare.latent.sandbox import jail; print(*jail.limits(0))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout == "\n"
