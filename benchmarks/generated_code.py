@@ -87,14 +87,29 @@ def replies() -> dict[str, dict[str, int]]:
     return {name: dict(row) for name, row in found.items()}
 
 
+def timed(cases: list[dict[str, str]], seconds: list[float]) -> Counter[str]:
+    """Where each of some programs ends. How long that took is added to `seconds`."""
+    found: Counter[str] = Counter()
+    for case in cases:
+        start = time.perf_counter()
+        found[judged(case["code"])] += 1
+        seconds.append(time.perf_counter() - start)
+    return found
+
+
 def refused() -> None:
     cases = json.loads(CASES.read_text(encoding="utf-8"))
-    hostile = Counter(judged(case["code"]) for case in cases["hostile"])
-    benign = Counter(judged(case["code"]) for case in cases["benign"])
+    seconds: list[float] = []
+    hostile, benign = timed(cases["hostile"], seconds), timed(cases["benign"], seconds)
     without_gate = Counter(contained(case["code"]) for case in cases["hostile"])
     figures = {
         "hostile programs": dict(hostile),
         "benign programs": dict(benign),
+        "seconds to judge one of both": {
+            "median": float(np.median(seconds)),
+            "95th percentile": float(np.quantile(seconds, 0.95)),
+            "worst": max(seconds),
+        },
         "hostile programs in the jail, without the gate": dict(without_gate),
         "recorded replies that pass as they came": replies(),
     }
