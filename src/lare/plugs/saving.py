@@ -18,13 +18,14 @@ from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
 from lare.errors import LareError, shortened
 from lare.files import write_atomically
+from lare.foreign import read_json, read_text
 from lare.latent.function import LatentFunction
 from lare.latent.function import load as load_function
 from lare.plugs.assigner import CreditAssigner
 from lare.plugs.layout import Layout
 from lare.plugs.store import Episode, Store
 from lare.run.checkpoint import DAMAGED, opened
-from lare.tasks.spec import TaskSpec, read_text
+from lare.tasks.spec import TaskSpec
 
 FORMAT = 1
 TEXT, ARRAYS, FUNCTION = "assigner.json", "state.npz", "phi.py"
@@ -100,7 +101,7 @@ def load(directory: Path) -> CreditAssigner:
     """Read such a directory."""
     path = directory / TEXT
     try:
-        text = json.loads(read_text(path))
+        text = read_json(read_text(path))
         with opened(directory / ARRAYS) as saved:
             arrays = {name: saved[name] for name in saved.files}
         if not isinstance(text, dict) or text.get("format") != FORMAT:
