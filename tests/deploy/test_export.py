@@ -267,4 +267,13 @@ def test_the_command_line(run, command, monkeypatch, tmp_path):
     status, _, noted = command("export", run.directory, "--out", "second")
     assert (status, noted) == (2, "lare: second exists, and is not overwritten; choose another --out\n")
     status, _, noted = command("export", run.directory, "--out", "third", "--seed", "7")
-    assert (status, noted) == (2, f"lare: {run.directory} has no seed 7: there are 0, 1\n")
+    assert (status, noted) == (2, f"lare: {run.directory} has no seed 7; its seeds: 0, 1\n")
+
+
+def test_what_an_exported_function_is_not_given_is_named(run, tmp_path):
+    lare.export(run, tmp_path / "out")
+    exported = loaded(tmp_path / "out")
+    with pytest.raises(ValueError, match="there is no function 'nope', only policy, reward"):
+        exported.load("nope")
+    with pytest.raises(ValueError, match="policy needs the inputs observation: observation is missing"):
+        exported.load("policy")(obs=np.zeros((1, 2)))

@@ -87,7 +87,7 @@ def test_the_policy_of_each_seed(small, tmp_path):
     for place, seed in enumerate(run.seeds):
         np.testing.assert_allclose(policy_of(run, seed)(observation), together[place, 0], rtol=1e-5)
     np.testing.assert_array_equal(policy_of(run)(observation), policy_of(run, 0)(observation))
-    with pytest.raises(LareError, match=r"run has no seed 7: there are 0, 1$"):
+    with pytest.raises(LareError, match=r"run has no seed 7; its seeds: 0, 1$"):
         policy_of(run, 7)
 
 

@@ -49,7 +49,7 @@ def test_refuses_what_was_not_recorded(messages, sample):
         recorded().reply(messages, sample)
     said = str(error.value)
     assert said.startswith(f"no recorded reply fits this request for task 'Chase' (reply {sample + 1}): ")
-    assert said.endswith(", or give a function of your own with --function FILE")
+    assert said.endswith("or by a method that needs none (--method bayes)")
     assert "\n" not in said
 
 

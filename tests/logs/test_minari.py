@@ -95,7 +95,10 @@ def test_what_cannot_be_is_refused(datasets, tmp_path):
     made("log-v0", logged(10))
     for out, message in (
         ("new", "new is no id of Minari's, as cheetah/relabelled-v0: a name, -v and a number"),
-        ("log-v0", f"{datasets / 'log-v0'} exists, and is not overwritten without overwrite (--overwrite)"),
+        (
+            "log-v0",
+            f"{datasets / 'log-v0'} exists: choose another --out, or replace it with --overwrite (overwrite=True)",
+        ),
     ):
         with pytest.raises(LareError) as error:
             lare.relabel("log-v0", out)

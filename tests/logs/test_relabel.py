@@ -160,12 +160,12 @@ def test_a_failure_in_the_second_pass_leaves_what_was_there(tmp_path):
             return iter(logged(20 if self.passes < 4 else 19))
 
     (tmp_path / "new").mkdir()
-    (tmp_path / "new" / "mine").write_text("kept")
+    (tmp_path / "new" / "mine.npz").write_text("kept")
     with pytest.raises(LareError) as error:
         lare.relabel(Log(), tmp_path / "new", overwrite=True)
     assert str(error.value) == "episodes has changed while it was read: 20 episodes first, then 19"
     assert [one.name for one in tmp_path.iterdir()] == ["new"]
-    assert (tmp_path / "new" / "mine").read_text() == "kept"
+    assert (tmp_path / "new" / "mine.npz").read_text() == "kept"
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_the_command(command, folder, tmp_path, task):
     assert command("relabel", path, "--out", "new") == (
         2,
         "",
-        "lare: new exists, and is not overwritten without overwrite (--overwrite)\n",
+        "lare: new exists: choose another --out, or replace it with --overwrite (overwrite=True)\n",
     )
     status, said, _ = command("verify", "phi.py", "--task", "task.toml", "--data", path)
     assert (status, "FAILED" in said) == (0, False)
@@ -214,3 +214,14 @@ def test_the_command(command, folder, tmp_path, task):
     assert (status, wrong.count("\n")) == (2, 1)
     assert wrong.startswith("lare: task 'Logs' has no environment (environment = 'none')")
     assert command("relabel", "gone/", "--out", "new2")[2] == "lare: there is no gone/\n"
+
+
+def test_a_directory_of_other_files_is_never_replaced(folder, tmp_path):
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "thesis.txt").write_text("years")
+    with pytest.raises(LareError) as refused:
+        lare.relabel(folder(logged(9)), tmp_path / "precious", method="rd-linear", overwrite=True)
+    assert str(refused.value) == (
+        f"{tmp_path / 'precious'} holds thesis.txt, which is no log, and is not replaced: choose another --out"
+    )
+    assert (tmp_path / "precious" / "thesis.txt").read_text() == "years"

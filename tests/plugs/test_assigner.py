@@ -237,7 +237,7 @@ def instead(place, value):
         (
             instead(0, np.zeros(2)),
             {},
-            "before must be rows (steps, 2), as many as before has, and its shape is (2,)",
+            "before must be rows (steps, 2), and its shape is (2,)",
         ),
         (
             instead(1, np.zeros((3, 1))),
@@ -518,7 +518,7 @@ def test_rows_of_agents_must_have_their_axis():
     credit = assigner("rd-linear", agents=3, max_steps=6)
     with pytest.raises(LareError) as refused:
         credit.add(*ROW)
-    assert str(refused.value) == ("before must be rows (steps, 3, 2), as many as before has, and its shape is (2, 2)")
+    assert str(refused.value) == ("before must be rows (steps, 3, 2), and its shape is (2, 2)")
 
 
 def test_several_threads_may_show_and_ask():
@@ -571,3 +571,19 @@ def test_it_computes_on_the_host():
     credit.fit(4)
     assert {device.platform for leaf in jax.tree.leaves(credit.learner.state) for device in leaf.devices()} == {"cpu"}
     assert SMALL.hidden == (8,)
+
+
+@pytest.mark.parametrize("steps", [[0.5], [-2], ["0"], [True]])
+def test_what_is_no_number_of_a_step_is_refused(steps):
+    credit = assigner()
+    show(credit, episodes([3])[0])
+    with pytest.raises(LareError) as refused:
+        credit.rewards_at(steps)
+    assert str(refused.value) == f"steps must be numbers that `add` has given, or -1, and are {steps}"
+
+
+@pytest.mark.parametrize("capacity", [0, -1])
+def test_a_capacity_is_a_whole_number(capacity):
+    with pytest.raises(LareError) as refused:
+        assigner(capacity=capacity)
+    assert str(refused.value) == f"capacity = {capacity}: it is a whole number, 1 or more"

@@ -55,7 +55,7 @@ def new_task(
         say(f"  fill in: {key} ({'the log' if drafted.of_logs else 'the environment'} does not document it)")
     data = f" --data {environment}" if drafted.of_logs else ""
     say(f"read it, then: lare design {path}{data} --model NAME --out phi.py")
-    none = "lare relabel without --function" if drafted.of_logs else "--method rrdu"
+    none = "lare relabel without --function" if drafted.of_logs else "--method bayes"
     say(f"or, without a model: write phi.py by what lare prompt {path} says; {none} needs none")
 
 

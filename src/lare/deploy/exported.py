@@ -70,7 +70,11 @@ OPERATIONS = {
 @cache
 def described(name):
     """What `export.json` says of a function."""
-    return json.loads((HERE / "export.json").read_text(encoding="utf-8"))[name]
+    text = json.loads((HERE / "export.json").read_text(encoding="utf-8"))
+    functions = [key for key, value in text.items() if isinstance(value, dict)]
+    if name not in functions:
+        raise ValueError(f"there is no function {name!r}, only {', '.join(functions)}")
+    return text[name]
 
 
 @cache
@@ -81,6 +85,8 @@ def load(name):
         constants = dict(file)
 
     def function(**inputs):
+        if missing := [key for key in graph["inputs"] if key not in inputs]:
+            raise ValueError(f"{name} needs the inputs {', '.join(graph['inputs'])}: {', '.join(missing)} is missing")
         values = constants | {key: np.asarray(inputs[key], graph["inputs"][key]["type"]) for key in graph["inputs"]}
         for operation, arguments, result, axis in graph["operations"]:
             more = {} if axis is None else {"axis": axis}

@@ -89,9 +89,9 @@ class RecordedModel:
                 self.name = f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
                 return replies[sample]
         raise LareError(
-            f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}): recordings answer only "
-            "the exact texts of a shipped task, and the number of candidates that was recorded (or 1). Ask a live model "
-            "with lare design --model NAME, or give a function of your own with --function FILE"
+            f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}): only the tasks that ship have "
+            "some, for their exact texts. Ask a model (lare design TASK --model NAME --out phi.py), train with a function that you "
+            "have (--function phi.py), or by a method that needs none (--method bayes)"
         )
 
 

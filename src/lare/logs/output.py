@@ -8,11 +8,18 @@ from uuid import uuid4
 
 from lare.errors import LareError
 
+OF_LOGS = frozenset({".npz", ".parquet", ".arrow", ".json"})
+"""Files of logs. A directory that holds others is never replaced."""
+
 
 def check_free(out: Path, overwrite: bool) -> None:
     """Raise `LareError` where something is there that is not to be overwritten, or nothing can be written."""
     if out.exists() and not overwrite:
-        raise LareError(f"{out} exists, and is not overwritten without overwrite (--overwrite)")
+        raise LareError(f"{out} exists: choose another --out, or replace it with --overwrite (overwrite=True)")
+    if out.is_dir():
+        other = next((path for path in sorted(out.iterdir()) if path.is_dir() or path.suffix not in OF_LOGS), None)
+        if other is not None:
+            raise LareError(f"{out} holds {other.name}, which is no log, and is not replaced: choose another --out")
     if not out.name or not out.parent.is_dir():
         raise LareError(f"{out} cannot be written: there is no directory {out.parent}")
 

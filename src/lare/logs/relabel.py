@@ -65,7 +65,8 @@ def predicted(found: Relabelled) -> list[str]:
     """How well unseen returns are predicted, in words."""
     if found.held_out < FEWEST:
         return [
-            f"How well unseen returns are predicted is not known: {found.held_out} episodes were held out, 8 are needed."
+            f"How well unseen returns are predicted is not known: {found.held_out} episodes were held out, and {FEWEST} "
+            "are needed: hold out a larger share (--hold-out 0.2)."
         ]
     of = f"returns of {found.held_out:,} episodes that were held out"
     if math.isnan(found.return_correlation):

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import Reward, find_method
-from lare.errors import LareError
+from lare.errors import LareError, shortened
 from lare.latent.function import LatentFunction
 from lare.plugs.config import CreditConfig, Space, check, layouts
 from lare.plugs.learner import CHUNK, PIECE, WAITING, Learner
@@ -307,7 +307,7 @@ class CreditAssigner:
         """
         with self.lock:
             self.catch_up()
-            steps = np.asarray(steps, np.int64)
+            steps = numbers_of(steps)
             flat = steps.ravel()
             known = flat >= 0
             rows = self.store.rows(flat[known])
@@ -413,6 +413,14 @@ class CreditAssigner:
         """End the worker of `phi`. It starts again when it is needed."""
         if self.config.phi is not None:
             self.config.phi.close()
+
+
+def numbers_of(steps: Any) -> Int[np.ndarray, "*shape"]:
+    """Numbers of steps. Raises `LareError` where some are none."""
+    found = np.asarray(steps)
+    if found.size and (found.dtype.kind not in "iu" or found.min() < -1):
+        raise LareError(f"steps must be numbers that `add` has given, or -1, and are {shortened(steps)}")
+    return found.astype(np.int64)
 
 
 def check_finite(values: np.ndarray, rows: np.ndarray, name: str) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from lare.credit.basis import MOST_ENTRIES, Basis
 from lare.credit.decomposition import SUM, CreditSettings, forms_of
 from lare.credit.methods import Decoder, Encoder, Fit, Method, Reward
-from lare.errors import LareError
+from lare.errors import LareError, shortened
 from lare.latent.function import LatentFunction
 from lare.plugs.layout import Layout, layout_of
 from lare.tasks.spec import Judges, TaskSpec
@@ -98,9 +98,8 @@ class CreditConfig:
         for name, values in found.items():
             if values.shape[:-1] != lead:
                 wanted = ", ".join(["steps", *map(str, self.axis), str(values.shape[-1])])
-                raise LareError(
-                    f"{name} must be rows ({wanted}), as many as before has, and its shape is {values.shape}"
-                )
+                also = "" if name == "before" else ", as many as before has"
+                raise LareError(f"{name} must be rows ({wanted}){also}, and its shape is {values.shape}")
         return found["before"], found["action"], found["after"]
 
     def team_reward(
@@ -145,6 +144,8 @@ def layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) -> list[L
 def check(config: CreditConfig) -> None:
     """Raise `LareError` where method, function and sizes do not go together."""
     method, phi, name = config.method, config.phi, config.method.name
+    if not isinstance(config.capacity, int) or config.capacity < 1:
+        raise LareError(f"capacity = {shortened(config.capacity)}: it is a whole number, 1 or more")
     if not method.has_proxy:
         raise LareError(f"{name} assigns no credit: train on what the environment pays")
     if method.whole_episodes:

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 
 from lare.errors import LareError, shortened
 from lare.plugs.assigner import CreditAssigner
-from lare.plugs.spaces import Rows
+from lare.plugs.spaces import Rows, check_assigner
 from lare.tasks.episodic import TRUE_REWARD, score_in
 
 CREDIT_STEP = "credit_step"
@@ -215,6 +215,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
 
 def check(credit: CreditAssigner, pay: str) -> None:
     """Raise `LareError` where an assigner cannot pay a single agent, or what is to be paid is not known."""
+    check_assigner(credit)
     if credit.config.agents > 1:
         raise LareError(f"Gymnasium environments have one agent, and the assigner has agents = {credit.config.agents}")
     check_pay(pay)

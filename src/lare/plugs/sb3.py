@@ -20,6 +20,7 @@ from lare.errors import LareError, needs_extra
 from lare.plugs import saving
 from lare.plugs.assigner import CreditAssigner
 from lare.plugs.layout import layout_of
+from lare.plugs.spaces import check_assigner
 
 try:
     import stable_baselines3
@@ -158,6 +159,7 @@ class CreditCallback(BaseCallback):
             verbose: as in every callback of Stable-Baselines3.
         """
         super().__init__(verbose)
+        check_assigner(credit)
         self.credit, self.updates = credit, updates
         self.steps: list[Int[np.ndarray, " environments"]] = []
         """Numbers of the steps of this rollout."""
@@ -249,6 +251,7 @@ class Recorder:
         Raises:
             LareError: they are not.
         """
+        check_assigner(credit)
         self.credit = credit
         self.observation = layout_of(observation_space, "observation_space")
         self.action = layout_of(action_space, "action_space")

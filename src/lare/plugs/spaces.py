@@ -4,9 +4,15 @@ from typing import Any
 
 import gymnasium
 
-from lare.errors import LareError
+from lare.errors import LareError, shortened
 from lare.plugs.assigner import CreditAssigner
 from lare.plugs.layout import layout_of
+
+
+def check_assigner(credit: object) -> None:
+    """Raise `LareError` where something else was given for an assigner."""
+    if not isinstance(credit, CreditAssigner):
+        raise LareError(f"credit must be a CreditAssigner, and is {shortened(credit)}")
 
 
 class Rows:
@@ -20,6 +26,7 @@ class Rows:
     """
 
     def __init__(self, credit: CreditAssigner, observations: gymnasium.Space, actions: gymnasium.Space):
+        check_assigner(credit)
         self.observation, self.action = layout_of(observations, "observation_space"), layout_of(actions, "action_space")
         known = credit.config
         for name, own, other in (

@@ -14,6 +14,7 @@ import numpy as np
 from lare.errors import LareError, needs_extra
 from lare.plugs.assigner import CreditAssigner
 from lare.plugs.layout import Layout
+from lare.plugs.spaces import check_assigner
 
 try:
     import torch
@@ -51,6 +52,7 @@ class CreditTransform(Transform):
             LareError: the assigner is one for many agents.
         """
         super().__init__()
+        check_assigner(credit)
         if credit.config.agents > 1:
             raise LareError(
                 f"CreditTransform pays a single agent, and the assigner has agents = {credit.config.agents}"

@@ -136,7 +136,7 @@ class Run:
         if seed is None:
             return 0
         if seed not in self.seeds:
-            raise LareError(f"{self.directory} has no seed {seed}: there are {', '.join(map(str, self.seeds))}")
+            raise LareError(f"{self.directory} has no seed {seed}; its seeds: {', '.join(map(str, self.seeds))}")
         return self.seeds.index(seed)
 
     def has_checkpoint(self) -> bool:
