@@ -19,6 +19,7 @@ from lare.latent.language import allowed
 from lare.latent.language.program import Program
 from lare.latent.sandbox import isolation, jailed
 from lare.latent.sandbox.jailed import ROWS, JailedProgram, NoWorker, WorkerFailed
+from lare.latent.sandbox.worker import GRACE
 from toys import PHI, phi
 
 SEVERAL = phi(
@@ -78,6 +79,13 @@ def test_the_numbers_are_those_of_this_process(several, rows, dtype):
     assert [value[2] for value in returned.values] == [np.dtype(dtype).name, np.dtype(dtype).name, "bool", "int64"]
     np.testing.assert_array_equal(returned.factors, expected(SEVERAL, *inputs))
     assert (returned.steps, returned.peak, returned.events) == (2, 0, ())
+
+
+def test_a_worker_waits_for_its_first_call_as_long_as_that_takes(worker):
+    """Training compiles for a minute before it calls. The clocks of loading must not go on until then."""
+    program = worker(limit=1.0)
+    time.sleep(1.0 + GRACE + 0.5)
+    assert program.call(*batch(2)).factors is not None
 
 
 def test_one_call_leaves_nothing_to_the_next(several):

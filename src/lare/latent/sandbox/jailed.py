@@ -205,10 +205,10 @@ class JailedProgram:
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         seconds = max(0.1, min(self.limit or TIME_LIMIT, self.until - time.monotonic()))
+        if request is None:  # a process that starts on a busy machine is nothing that a program could do anything about
+            seconds = TIME_LIMIT
         deadline = time.monotonic() + seconds
-        number = (
-            secrets.token_hex(8) if request is not None else ""
-        )  # an answer cannot be laid up before it is asked for
+        number = secrets.token_hex(8) if request is not None else ""  # the worker may not answer before it is asked
         try:
             if request is not None:
                 request = request | {"number": number, "seconds": seconds}

@@ -62,6 +62,7 @@ def main(argument: str) -> None:
     problems = gate.inspect(source) if given["gate"] else []
     try:
         programs = {} if problems else load(source, functions, gated=given["gate"])
+        begin(0)  # the first call may come much later
         send({"number": start["number"], "problems": problems[:MOST_PROBLEMS]})
     except BaseException as error:  # a program that is not gated does what it likes here
         send({"number": start["number"], "problems": []} | failure(error))
