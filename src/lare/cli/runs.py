@@ -56,8 +56,9 @@ def train(
     if resume is not None:
         if (task, function, out, settings) != (None, (), None, DEFAULTS):
             raise LareError("--resume goes on with the run's own settings: give it no task and no other settings")
-        asked = model_of(model, base_url, open_run(resume).config.task.name)
-        listeners = listeners_of(wandb, mlflow, open_run(resume).config.settings)
+        config = open_run(resume).config
+        asked = model_of(model, base_url, config.task.name)
+        listeners = listeners_of(wandb, mlflow, config.settings)
         run = lare.resume(resume, model=asked, tensorboard=tensorboard, listeners=listeners)
     elif task is None:
         raise LareError("say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR")

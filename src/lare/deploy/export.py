@@ -62,11 +62,12 @@ def export(run: Run, out: str | Path, seed: int | None = None) -> Exported:
     graphs = {"policy": policy(actor, config, start)}
     credit = of_seed(learner, place).credit
     left_out = unexported(config, credit[0].decoder if credit else None)
-    files, apart = [], {}
+    files: dict[str, str] = {}
+    apart: dict[str, str] = {}
     for team, role in enumerate(run.config.task.roles if left_out is None else ()):
         name = "reward" if role is run.config.task else f"reward_{role.team}"
         phi, decoder = run.functions[team] if run.functions else None, credit[team] if credit else None
-        files.append(function_file(run.config.task, role))
+        files[name] = function_file(run.config.task, role)
         try:
             graphs[name] = reward(decoder, config, team, phi, run.judges)
         except Untranslatable as error:
@@ -90,11 +91,11 @@ def export(run: Run, out: str | Path, seed: int | None = None) -> Exported:
         text[name] = described(graph)
         if name in apart:
             judges = ["before", "after"] if run.judges == "both" else [run.judges]
-            text[name] |= {"phi": files[list(graphs).index(name) - 1], "judges": judges}
+            text[name] |= {"phi": files[name], "judges": judges}
         write_arrays(out / f"{name}.npz", graph)
         if onnx.is_installed():
             onnx.write(graph, out / f"{name}.onnx", name)
-    for file, function in zip(files, run.functions, strict=False):
+    for file, function in zip(files.values(), run.functions, strict=False):
         function.save(out / file)
     whole = json.dumps(text, indent=1).encode()
     write_atomically(out / TEXT, lambda file: file.write(whole))

@@ -33,8 +33,7 @@ ARITHMETIC: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
     ast.BitOr: ("logical_or", operator.or_),
 }
 CONSTANTS = {"np.pi": math.pi, "np.e": math.e, "np.newaxis": None, "np.inf": math.inf}
-CASTS = {"float": "float32", "np.float32": "float32", "np.float64": "float32"}
-
+CASTS = frozenset({"float", "np.float32", "np.float64"})
 OF_CONSTANTS = frozenset("sqrt exp log tanh cos sin abs square maximum minimum sum mean max min prod".split())
 
 

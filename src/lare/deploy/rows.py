@@ -136,10 +136,10 @@ def clip(x: Any, a_min: Any = None, a_max: Any = None) -> Any:
 
 
 def where(condition: Rows, yes: Any, no: Any) -> Rows:
-    """`numpy.where`, by arithmetic on 0 and 1, where all three are of one shape after broadcasting."""
+    """`numpy.where`. A constant among the values is first given the axes of the condition."""
     if not is_rows(condition) or condition.kind != "bool":
         raise Untranslatable("a condition that is not made of comparisons")
-    zero = together("Mul", condition, 0.0)  # the shape that all of them share
+    zero = together("Mul", condition, 0.0)
     yes, no = (
         together("Add", zero if not is_rows(value) else value, 0.0 if is_rows(value) else value) for value in (yes, no)
     )
