@@ -16,8 +16,8 @@ from measure import apart, correlation, write
 
 from lare.algorithms.table import ALGORITHMS
 from lare.credit import arel
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
+from lare.credit.settings import CreditSettings
 from lare.data.trajectory import Trajectory
 from lare.experiments.watch import on_device, proxy_of
 from lare.tasks.particles.env import ParticleJaxEnv

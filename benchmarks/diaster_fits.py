@@ -17,9 +17,8 @@ import tyro
 from measure import write
 
 from lare.credit import accuracy, decomposition
-from lare.credit.accuracy import RECENT
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import METHODS
+from lare.credit.settings import RECENT, CreditSettings
 from lare.data import replay
 from lare.run.directory import open_run
 from lare.training import learner as common

@@ -22,7 +22,7 @@ import numpy as np
 from measure import advance, interleave, new_session, show, summary, write
 
 import lare
-from lare.algorithms.td3 import TD3Settings
+from lare.algorithms.settings import TD3Settings
 from lare.latent.function import Evaluator
 from lare.latent.language import gate
 from lare.latent.language.program import Program

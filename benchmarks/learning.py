@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 import lare
-from lare.credit.decomposition import CreditSettings
+from lare.credit.settings import CreditSettings
 from lare.experiments import figures
 
 PUBLISHED = {"credit": CreditSettings(normalise=False)}

@@ -16,9 +16,9 @@ import numpy as np
 from measure import write
 
 from lare.credit import accuracy, decomposition, descent
-from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Fit
+from lare.credit.settings import RECENT
 from lare.data import replay
 from lare.data.sampling import CreditSample, sample_parts
 from lare.normalise import Scale

@@ -25,10 +25,10 @@ import tyro
 from measure import advance, interleave, new_session, show, summary, write
 
 import lare
+from lare.algorithms.settings import TD3Settings
 from lare.algorithms.table import ALGORITHMS
-from lare.algorithms.td3 import TD3Settings
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
+from lare.credit.settings import CreditSettings
 from lare.data import replay
 from lare.data.replay import Replay
 from lare.data.trajectory import Trajectory

@@ -13,7 +13,7 @@ import tyro
 from measure import advance, interleave, new_session, show, summary, write
 
 import lare
-from lare.algorithms.td3 import TD3Settings
+from lare.algorithms.settings import TD3Settings
 
 TASK, BEFORE = "HalfCheetah-v4", 2000
 

@@ -25,7 +25,7 @@ from measure import TD3, advance, interleave, new_session, ratio, show, summary,
 from stable_baselines3.common.noise import NormalActionNoise
 
 import lare
-from lare.algorithms.td3 import TD3Settings
+from lare.algorithms.settings import TD3Settings
 from lare.training.session import Session
 
 TASK, SEED = "HalfCheetah-v4", 0

@@ -11,7 +11,7 @@ import pytest
 
 from jax_toys import Echo, echo_spec
 from lare import cli
-from lare.algorithms.ppo import PPOSettings
+from lare.algorithms.settings import PPOSettings
 from lare.algorithms.table import ALGORITHMS
 from lare.latent.function import LatentFunction, verified
 from lare.run.settings import Settings

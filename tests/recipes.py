@@ -6,12 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare.algorithms.ppo import PPOSettings
-from lare.algorithms.qmix import QMIXSettings
+from lare.algorithms.settings import PPOSettings, QMIXSettings, TD3Settings
 from lare.algorithms.table import ALGORITHMS
-from lare.algorithms.td3 import TD3Settings
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import METHODS
+from lare.credit.settings import CreditSettings
 from lare.data import replay
 from lare.data.trajectory import Trajectory
 from lare.tasks.env import EnvSpec, Team, Timestep, in_units

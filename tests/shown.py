@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, flatten
 
-from lare.credit.decomposition import CreditSettings
+from lare.credit.settings import CreditSettings
 from lare.plugs.assigner import CreditAssigner
 from toys import toy_spec
 

@@ -21,6 +21,7 @@ MUST_NOT_KNOW = {
     "foreign": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
     "legible": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
     "files": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
+    "compilation": "tasks llm latent data credit networks algorithms run training plugs logs experiments deploy cli",
     "source": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
     "networks": "tasks llm latent credit algorithms run training plugs logs experiments deploy cli",
     "normalise": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
@@ -108,3 +109,24 @@ def test_what_need_not_wait_for_jax_does_not(module):
     program = f"import sys, {module}; print({module}.__name__, 'jax' in sys.modules)"
     printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert printed == f"{module} False\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "most"), [("--help", 450), ("tasks", 620), ("methods", 500), ("train --help", 450)]
+)
+def test_the_command_line_answers_before_anything_slow_is_imported(command, most):
+    program = f"""
+import sys
+from lare.cli import main
+sys.argv = ["lare", *{command.split()!r}]
+try:
+    main()
+except SystemExit:
+    pass
+print(*sys.modules, file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    modules = done.stderr.split()
+    assert {"jax", "equinox", "gymnasium", "mujoco", "matplotlib", "scipy", "openai"}.isdisjoint(modules)
+    assert 100 < len(modules) < most
+    assert done.stdout

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lare.algorithms import qmix
-from lare.algorithms.qmix import Networks, QMIXSettings, Sequences
+from lare.algorithms.qmix import Networks, Sequences
+from lare.algorithms.settings import QMIXSettings
 
 PINNED = json.loads((Path(__file__).parent / "algorithms" / "qmix_pinned.json").read_text())
 SETTINGS = QMIXSettings(hidden=2, embed=2, hypernet=2)

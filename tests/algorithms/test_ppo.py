@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from lare.algorithms import ppo
-from lare.algorithms.ppo import PPOSettings, Rollout
+from lare.algorithms.ppo import Rollout
+from lare.algorithms.settings import PPOSettings
 from lare.normalise import deviation, observe
 
 SETTINGS = PPOSettings(hidden=(16,), minibatch_size=8, epochs=3)

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from lare.algorithms import qmix
-from lare.algorithms.qmix import QMIX, VDN, QMIXSettings, Sequences
+from lare.algorithms.qmix import QMIX, Sequences
+from lare.algorithms.settings import QMIXSettings
+from lare.algorithms.table import VDN
 from lare.networks import start_adam
 from worked_qmix import PINNED, SETTINGS, networks, sequences
 

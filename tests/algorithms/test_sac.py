@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lare.algorithms import sac
-from lare.algorithms.sac import SACSettings
+from lare.algorithms.settings import SACSettings
 from lare.networks import MLP
 from twins import forward, transitions
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lare.algorithms import td3
+from lare.algorithms.settings import TD3Settings
 from lare.algorithms.table import DDPG
-from lare.algorithms.td3 import TD3Settings
 from twins import forward, transitions
 
 SETTINGS = TD3Settings(hidden=(8, 8), batch_size=16)

@@ -12,8 +12,9 @@ from lare.credit import decomposition, descent
 from lare.credit.arel import AREL, Block
 from lare.credit.attention import LayerNorm, attend, causal
 from lare.credit.decoders import Bottleneck, StepDecoder
-from lare.credit.decomposition import CreditSettings, Episodes
+from lare.credit.decomposition import Episodes
 from lare.credit.methods import TABLE, Decoder, Fit
+from lare.credit.settings import CreditSettings
 from lare.credit.stas import STAS, USED, Coalitions, TimeLayer, dropout
 
 EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6

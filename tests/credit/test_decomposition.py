@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from lare.credit import decomposition, descent
-from lare.credit.decomposition import CreditSettings, Episodes
+from lare.credit.decomposition import Episodes
 from lare.credit.methods import METHODS, Fit
+from lare.credit.settings import CreditSettings
 from lare.errors import LareError
 
 EPISODES, LENGTH, FEATURES = 64, 10, 3

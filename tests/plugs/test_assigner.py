@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import METHODS
+from lare.credit.settings import CreditSettings
 from lare.errors import LareError
 from lare.plugs import assigner as assigners
 from lare.plugs import learner, payment

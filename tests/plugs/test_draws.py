@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import Fit
+from lare.credit.settings import CreditSettings
 from lare.plugs import draws
 from lare.plugs.store import Store
 

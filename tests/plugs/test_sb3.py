@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import lare
 from lare import LareError
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import METHODS
+from lare.credit.settings import CreditSettings
 from lare.plugs.sb3 import CreditCallback, CreditDictReplayBuffer, CreditNStepReplayBuffer, CreditReplayBuffer
 from toys import Chase, Pick, toy_spec
 

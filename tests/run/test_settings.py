@@ -2,10 +2,10 @@
 
 import pytest
 
-from lare.algorithms.ppo import PPOSettings
+from lare.algorithms.settings import PPOSettings
 from lare.algorithms.table import ALGORITHMS, IPPO
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import TABLE
+from lare.credit.settings import CreditSettings
 from lare.errors import LareError
 from lare.run.decide import decide
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain

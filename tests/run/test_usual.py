@@ -2,9 +2,8 @@
 
 import pytest
 
-from lare.algorithms.qmix import QMIXSettings
-from lare.credit.accuracy import RECENT
-from lare.credit.decomposition import CreditSettings
+from lare.algorithms.settings import QMIXSettings
+from lare.credit.settings import RECENT, CreditSettings
 from lare.run.decide import decide
 from lare.run.settings import Settings
 from lare.run.usual import MANY_AGENTS

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lare.credit import closed_form, decomposition, returns
-from lare.credit.decomposition import CreditSettings
+from lare.credit.settings import CreditSettings
 from lare.data import replay
 from lare.training import episodes
 from lare.training import learner as common

@@ -11,8 +11,8 @@ import pytest
 from lare.credit import closed_form, returns
 from lare.credit.basis import Basis
 from lare.credit.closed_form import LinearDecoder
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import TABLE, Fit, Reward
+from lare.credit.settings import CreditSettings
 from lare.data import replay
 from lare.data.sampling import sample_parts
 from lare.normalise import magnitude

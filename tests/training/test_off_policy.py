@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lare.algorithms import td3
-from lare.credit.decomposition import CreditSettings
+from lare.credit.settings import CreditSettings
 from lare.data import replay
 from lare.training import learner as common
 from lare.training import off_policy

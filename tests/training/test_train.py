@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 import lare
-from lare.algorithms.ppo import PPOSettings
+from lare.algorithms.settings import PPOSettings
 from lare.algorithms.table import ALGORITHMS
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import METHODS
+from lare.credit.settings import CreditSettings
 from lare.data import replay
 from lare.errors import LareError
 from lare.latent.function import verified

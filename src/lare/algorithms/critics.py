@@ -4,35 +4,14 @@ The algorithms know rewards, never where they come from. Actions lie in [-1, 1] 
 environment rescales them.
 """
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
-from pydantic import Field
 
-from lare.errors import Checked
 from lare.networks import MLP
-
-
-class OffPolicySettings(Checked):
-    """The hyperparameters that these algorithms share; none of them depends on the task."""
-
-    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
-    """Widths of the hidden layers of actor and critics."""
-    critics: Annotated[int, Field(ge=1)] = 2
-    """How many there are; the smallest of their values counts."""
-    learning_rate: Annotated[float, Field(gt=0)] = 3e-4
-    """Adam's step size, for all that is learned."""
-    batch_size: Annotated[int, Field(ge=1)] = 256
-    """Transitions in one update."""
-    gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
-    """Discount of a step."""
-    tau: Annotated[float, Field(gt=0, le=1)] = 0.005
-    """How far the targets move towards the networks at a time."""
-    warmup: Annotated[int, Field(ge=0)] = 10_000
-    """Environment steps with uniformly random actions before the first update."""
 
 
 class Transitions(NamedTuple):

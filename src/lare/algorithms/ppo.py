@@ -13,51 +13,17 @@ The critic predicts returns in units of their running mean and deviation (Yu et 
 over the rollout, so rewards of any scale train alike.
 """
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
-from pydantic import Field
 
 from lare.algorithms.policies import Available, StochasticPolicy
-from lare.errors import Checked
+from lare.algorithms.settings import PPOSettings
 from lare.networks import MLP, clipped, descend, orthogonal, start_adam
 from lare.normalise import RunningMeanStd, deviation, new_mean_std, observe, standardise_if_known
-
-
-class PPOSettings(Checked):
-    """Hyperparameters of PPO; what `lare train` uses where nothing is said stands in `table.py`."""
-
-    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (64, 64)
-    """Widths of the hidden layers of actor and critic."""
-    learning_rate: Annotated[float, Field(gt=0)] = 3e-4
-    """Adam's step size, for actor and critic."""
-    gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
-    """Discount of a step."""
-    gae_lambda: Annotated[float, Field(ge=0, le=1)] = 0.95
-    """Of the generalised advantage estimates: 0 trusts the critic, 1 the rewards."""
-    epochs: Annotated[int, Field(ge=1)] = 10
-    """How often an update goes over its rollout."""
-    minibatch_size: Annotated[int, Field(ge=1)] = 64
-    """Steps of one agent in one gradient step."""
-    clip: Annotated[float, Field(gt=0)] = 0.2
-    """How far the probability ratio may move."""
-    value_clip: Annotated[float, Field(gt=0)] = 0.5
-    """How far the value may move in one update, in deviations of the return."""
-    value_coef: Annotated[float, Field(ge=0)] = 0.5
-    """Of the value loss beside the policy's."""
-    entropy_coef: Annotated[float, Field(ge=0)] = 0.0
-    """Of the policy's entropy beside its objective."""
-    huber_delta: Annotated[float, Field(gt=0)] = 10.0
-    """Where the value loss turns from square to linear, in deviations of the return."""
-    max_grad_norm: Annotated[float, Field(gt=0)] = 0.5
-    """What the gradient of actor and critic together is cut down to."""
-    anneal: bool = False
-    """Let learning rate and clip fall linearly to 0 over the run."""
-    normalise_observations: bool = False
-    """Let the networks see observations by their running mean and deviation."""
 
 
 class Networks(NamedTuple):

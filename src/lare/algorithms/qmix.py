@@ -11,54 +11,17 @@ algorithm knows rewards, never where they come from. VDN (Sunehag et al., 2018) 
 mixer.
 """
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
-from pydantic import Field
 
 from lare.algorithms.mixer import Mixer, mixed
 from lare.algorithms.recurrent import Recurrent
-from lare.errors import Checked
+from lare.algorithms.settings import QMIXSettings
 from lare.networks import clipped, descend, start_adam
-
-
-class QMIXSettings(Checked):
-    """Hyperparameters, as PyMARL2 sets them for most maps of the StarCraft challenge."""
-
-    hidden: Annotated[int, Field(ge=1)] = 64
-    """Width of the agents' network and of its memory."""
-    monotonic: bool = True
-    """Mix the agents' values by a monotonic network; otherwise add them up, which is VDN."""
-    embed: Annotated[int, Field(ge=1)] = 32
-    """Width of the mixer."""
-    hypernet: Annotated[int, Field(ge=1)] = 64
-    """Width of the hidden layers of the networks that write the mixer's weights."""
-    learning_rate: Annotated[float, Field(gt=0)] = 1e-3
-    """Adam's step size, for all that is learned."""
-    gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
-    """Discount of a step."""
-    td_lambda: Annotated[float, Field(ge=0, le=1)] = 0.6
-    """Of the targets: 0 trusts the target networks, 1 the rewards."""
-    max_grad_norm: Annotated[float, Field(gt=0)] = 10.0
-    """What the gradient of agents and mixer together is cut down to."""
-    batch_size: Annotated[int, Field(ge=1)] = 128
-    """Episodes in one update."""
-    update_every: Annotated[int, Field(ge=1)] = 8
-    """Episodes that are played for one update."""
-    target_every: Annotated[int, Field(ge=1)] = 200
-    """Episodes after which the targets are copied from the networks."""
-    epsilon_start: Annotated[float, Field(ge=0, le=1)] = 1.0
-    """How often an agent explores at first."""
-    epsilon_end: Annotated[float, Field(ge=0, le=1)] = 0.05
-    """How often it explores at last."""
-    epsilon_steps: Annotated[int, Field(ge=1)] = 100_000
-    """Environment steps over which that falls, linearly."""
-
-
-VDN = QMIXSettings(monotonic=False)
 
 
 class Networks(NamedTuple):

@@ -10,28 +10,19 @@
 The policy is a normal distribution through a tanh, pi = tanh(N(mu(s), sigma(s))), in [-1, 1].
 """
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
-from pydantic import Field
 
-from lare.algorithms.critics import OffPolicySettings, Transitions, critics, squared_errors, values
+from lare.algorithms.critics import Transitions, critics, squared_errors, values
+from lare.algorithms.settings import SACSettings
 from lare.networks import MLP, descend, move_towards, start_adam
 
 SMALLEST_LOG, LARGEST_LOG = -20.0, 2.0
 """Bounds of log sigma."""
-
-
-class SACSettings(OffPolicySettings):
-    """Hyperparameters, as the LaRe paper sets them."""
-
-    target_every: Annotated[int, Field(ge=1)] = 2
-    """Updates from one move of the target critics to the next."""
-    temperature: Annotated[float, Field(gt=0)] = 1.0
-    """alpha at the start."""
 
 
 class Networks(NamedTuple):

@@ -8,10 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
-from lare.algorithms.ppo import PPOSettings
-from lare.algorithms.qmix import VDN, QMIXSettings
-from lare.algorithms.sac import SACSettings
-from lare.algorithms.td3 import TD3Settings
+from lare.algorithms.settings import PPOSettings, QMIXSettings, SACSettings, TD3Settings
 
 AlgorithmSettings = TD3Settings | SACSettings | PPOSettings | QMIXSettings
 
@@ -69,6 +66,7 @@ class Algorithm:
 
 DDPG = TD3Settings(critics=1, policy_noise=0.0, policy_delay=1)
 PPO = PPOSettings(hidden=(256, 256), entropy_coef=0.01, anneal=True, normalise_observations=True)
+VDN = QMIXSettings(monotonic=False)
 IPPO = PPOSettings(
     learning_rate=1e-4, gamma=1.0, minibatch_size=128, clip=0.5, entropy_coef=0.01, max_grad_norm=10.0, anneal=True
 )

@@ -11,29 +11,16 @@ noise on the actions that are taken, which is white here. Actions lie in [-1, 1]
 bound" is plain noise.
 """
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
-from pydantic import Field
 
-from lare.algorithms.critics import OffPolicySettings, Transitions, critics, squared_errors, value, values
+from lare.algorithms.critics import Transitions, critics, squared_errors, value, values
+from lare.algorithms.settings import TD3Settings
 from lare.networks import MLP, descend, move_towards, start_adam
-
-
-class TD3Settings(OffPolicySettings):
-    """Hyperparameters, as the LaRe paper sets them. The targets move at each policy update."""
-
-    policy_noise: Annotated[float, Field(ge=0)] = 0.2
-    """Standard deviation of the noise on the target action, in units of the action bound."""
-    noise_clip: Annotated[float, Field(ge=0)] = 0.5
-    """Bound of that noise."""
-    policy_delay: Annotated[int, Field(ge=1)] = 2
-    """Critic updates for each update of actor and targets."""
-    exploration_noise: Annotated[float, Field(ge=0)] = 0.1
-    """Standard deviation of the noise on the actions that are taken, in units of the action bound."""
 
 
 class Networks(NamedTuple):

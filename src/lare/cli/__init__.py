@@ -9,6 +9,7 @@ import os
 import sys
 import traceback
 
+from lare import compilation
 from lare.cli.design import design
 from lare.cli.functions import new_task, prompt, verify
 from lare.cli.lists import algorithms, methods, tasks
@@ -56,7 +57,9 @@ def main() -> None:
         if arguments == ["--version"]:
             say(source())
         else:
-            parse(COMMANDS, DESCRIPTION, arguments)()
+            command = parse(COMMANDS, DESCRIPTION, arguments)
+            os.environ.update(compilation.variables(os.environ))  # JAX reads them when a command imports it
+            command()
     except LareError as error:
         if debug:
             traceback.print_exc()

@@ -3,18 +3,20 @@
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import tyro
 
 from lare.cli.terminal import Data, Kind, Task, free_name, progress, say, steps_of
 from lare.errors import LareError
-from lare.latent.design import DesignFailed
-from lare.latent.design import design as design_function
-from lare.latent.function import LatentFunction
 from lare.legible import in_a_line
-from lare.tasks.spec import TaskSpec
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from lare.latent.design import DesignFailed
+    from lare.latent.function import LatentFunction
+    from lare.tasks.spec import TaskSpec
 
 BUDGET, REQUESTS, MINUTES = 400_000, 60, 15.0
 """Tokens, requests and minutes of waiting of one design, at most."""
@@ -66,6 +68,8 @@ def design(
             file, or the id of a local data set of Minari's.
         out: a .py file to write, with the replies and checks in a .json beside it; it must not exist.
     """
+    from lare.latent.design import DesignFailed
+    from lare.latent.design import design as design_function
     from lare.llm.budget import Budget
     from lare.llm.live import LiveModel
     from lare.llm.model import RECORDED, recorded_model
@@ -117,7 +121,7 @@ def design(
         save_function(function, out)
 
 
-def keep_attempts(failed: DesignFailed, instead: Path) -> None:
+def keep_attempts(failed: "DesignFailed", instead: Path) -> None:
     """Keep what was said, in its own file or `instead`; where no file can be written, print it: it was paid for."""
     recorder, model = failed.recorder, failed.model
     own = [recorder.path] if recorder.path and recorder.begun else []
@@ -132,7 +136,7 @@ def keep_attempts(failed: DesignFailed, instead: Path) -> None:
     say(recorder.text(model))
 
 
-def print_function(function: LatentFunction, instead: Path) -> None:
+def print_function(function: "LatentFunction", instead: Path) -> None:
     """Print a function; where nothing can be printed it was paid for all the same, and is saved `instead`."""
     try:
         say(function.source)
@@ -143,7 +147,7 @@ def print_function(function: LatentFunction, instead: Path) -> None:
         raise LareError(f"nothing can be printed ({error.strerror}); the function is kept in {instead}") from error
 
 
-def save_function(function: LatentFunction, out: Path) -> None:
+def save_function(function: "LatentFunction", out: Path) -> None:
     """Save a function; where it cannot be, it is printed: it was paid for."""
     try:
         function.save(out)
@@ -153,7 +157,7 @@ def save_function(function: LatentFunction, out: Path) -> None:
     say(f"wrote {out.with_suffix('.py')}: {function.size} factors ({', '.join(function.names)})")
 
 
-def policy_that_plays(run: Path | None, spec: TaskSpec) -> Callable[[np.ndarray], np.ndarray] | None:
+def policy_that_plays(run: Path | None, spec: "TaskSpec") -> "Callable[[np.ndarray], np.ndarray] | None":
     """The policy of a run, if there is one."""
     if run is None:
         return None

@@ -11,10 +11,10 @@ from tyro.conf import Positional
 from lare.cli.design import BUDGET, REQUESTS
 from lare.cli.terminal import RunDirectories, RunDirectory, progress, say, show
 from lare.errors import LareError
-from lare.llm.model import Model
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain
 
 if TYPE_CHECKING:
+    from lare.llm.model import Model
     from lare.training.progress import Listener
 
 DEFAULTS = Settings()
@@ -102,7 +102,7 @@ def listeners_of(wandb: str | None, mlflow: str | None, settings: ResolvedSettin
     return told
 
 
-def model_of(model: str | None, base_url: str | None, task: str) -> Model | None:
+def model_of(model: str | None, base_url: str | None, task: str) -> "Model | None":
     """Whom a run asks for better functions, if anybody."""
     from lare.llm.budget import Budget
     from lare.llm.live import LiveModel

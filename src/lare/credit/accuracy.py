@@ -3,9 +3,6 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-RECENT = 5000
-"""Steps over which they are compared: the newest, of every agent."""
-
 
 def metrics(
     r_hat: Float[Array, " steps"],

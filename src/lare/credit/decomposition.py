@@ -18,14 +18,13 @@ but the scale of r_hat. `normalise = false` is the published form: raw features,
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
-from pydantic import Field
 
 from lare.credit import closed_form, evidence
 from lare.credit.arel import AREL
@@ -35,8 +34,9 @@ from lare.credit.decoders import Bottleneck, Decoded, StepDecoder
 from lare.credit.diaster import Diaster
 from lare.credit.methods import Decoder, Method
 from lare.credit.prediction import Predictions, no_predictions
+from lare.credit.settings import CreditSettings
 from lare.credit.stas import STAS
-from lare.errors import Checked, LareError
+from lare.errors import LareError
 from lare.networks import start_adam
 from lare.normalise import (
     RunningMeanStd,
@@ -54,40 +54,6 @@ Network = StepDecoder | Bottleneck | AREL | STAS | Diaster | LinearDecoder
 
 SUM, AVERAGE = 0, 1
 """Forms that a score may have: the sum of something over the steps, or its average."""
-
-
-class CreditSettings(Checked):
-    """How the decoder is fitted."""
-
-    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
-    """Widths of the decoder's hidden layers."""
-    learning_rate: Annotated[float, Field(gt=0)] = 3e-4
-    """Adam's step size."""
-    weight_decay: Annotated[float, Field(ge=0)] = 0.0
-    """Times the weights, added to their gradient."""
-    normalise: bool = True
-    """Normalise features and returns by running statistics. The published form does not."""
-    sum_form: bool = False
-    """Fit the return R of an episode (Eq. 6 of the paper), not its mean R/T (the published code)."""
-    drawn_steps: Annotated[int, Field(ge=2)] = 64
-    """K: steps drawn from an episode by RRD and its kin."""
-    steps: Annotated[int, Field(ge=2)] = 256
-    """Steps in one update of the decoder: K steps of so many episodes, or whole episodes that make up about as many. Where all
-    episodes are equally long: of so many whole episodes, whatever is drawn from them."""
-    episodes: Annotated[int, Field(ge=1)] = 8
-    """diaster (single agents): whole episodes in one update of its decoder."""
-    score: Literal["auto", "sum", "average"] = "auto"
-    """Whether the score of an episode is a sum over its steps, or an average or a mark, which does not grow with them. `auto`: as
-    the task says or, where it says nothing, the form that has predicted returns better so far."""
-    optimism: Annotated[float, Field(ge=0)] = 0.0
-    """lare-bayes and others in closed form: so many posterior deviations of a proxy reward are added to what the algorithm is paid.
-    Steps that little is known of look better."""
-    encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
-    """Widths of the hidden layers of VIB's encoder."""
-    bottleneck: Annotated[int, Field(ge=1)] = 8
-    """Size of the code in the middle of VIB."""
-    divergence: Annotated[float, Field(ge=0)] = 5e-3
-    """Weight of the code's divergence beside the squared error of the mean (of the sum: T^2 times as much)."""
 
 
 class Episodes(NamedTuple):

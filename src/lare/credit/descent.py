@@ -7,18 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare.credit import losses
-from lare.credit.decomposition import (
-    CreditSettings,
-    Decomposition,
-    Episodes,
-    Network,
-    decode,
-    inputs,
-    over_agents,
-    unit,
-)
+from lare.credit.decomposition import Decomposition, Episodes, Network, decode, inputs, over_agents, unit
 from lare.credit.diaster import Diaster
 from lare.credit.methods import Fit
+from lare.credit.settings import CreditSettings
 from lare.networks import descend
 
 

@@ -13,9 +13,10 @@ from jaxtyping import Array, Bool, Float
 
 from lare.credit import closed_form, evidence
 from lare.credit.closed_form import LinearDecoder
-from lare.credit.decomposition import CreditSettings, Decomposition, Episodes, over_agents, proxy_rewards
+from lare.credit.decomposition import Decomposition, Episodes, over_agents, proxy_rewards
 from lare.credit.methods import Fit, Method
 from lare.credit.prediction import Predictions, remember, squared_errors
+from lare.credit.settings import CreditSettings
 
 BETTER = 0.95
 """Times the squared error of a sum's predictions must be that of an average's, before it is taken for one. Where all episodes are

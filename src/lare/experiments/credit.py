@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lare.credit.accuracy import RECENT
 from lare.credit.methods import Fit
 from lare.credit.returns import deviation
+from lare.credit.settings import RECENT
 from lare.data import replay
 from lare.experiments.watch import newest_episode
 from lare.run.directory import Run

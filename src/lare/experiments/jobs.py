@@ -8,7 +8,8 @@ from typing import Any
 import lare
 from lare.credit.methods import find_method
 from lare.errors import LareError
-from lare.latent.design import CANDIDATES, check_recorded
+from lare.latent.candidates import CANDIDATES
+from lare.latent.design import check_recorded
 from lare.run.checkpoint import saved_host
 from lare.run.decide import decide
 from lare.run.directory import CHECKPOINT, CONFIG, read_config, read_metrics

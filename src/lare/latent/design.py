@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lare.errors import LareError
+from lare.latent.candidates import CANDIDATES, MOST_CANDIDATES
 from lare.latent.function import LatentFunction, normal
 from lare.latent.sandbox.jailed import JailedProgram, WorkerFailed
 from lare.latent.verification.checks import Check, Failed, factors_of
@@ -19,11 +20,6 @@ from lare.llm.prompts import Kind, Message, Stage
 from lare.llm.recording import Recorder
 from lare.llm.reply import MalformedReply, parse
 from lare.tasks.spec import TaskSpec, the_role
-
-CANDIDATES = 5
-"""n of the paper."""
-
-MOST_CANDIDATES = 100
 
 ATTEMPTS = 5
 """How often a function is verified, the first time included, before the loop gives up."""

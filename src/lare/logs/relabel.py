@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import Reward, find_method
+from lare.credit.settings import CreditSettings
 from lare.errors import LareError
 from lare.latent.function import LatentFunction
 from lare.logs.episode import Logged, Paid

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import Reward, find_method
+from lare.credit.settings import CreditSettings
 from lare.errors import LareError, shortened
 from lare.latent.function import LatentFunction
 from lare.plugs.config import CreditConfig, Space, check, layouts

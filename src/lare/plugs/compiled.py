@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from lare.credit import closed_form, decomposition, descent, returns
-from lare.credit.decomposition import CreditSettings, Decomposition, Episodes
+from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import METHODS
+from lare.credit.settings import CreditSettings
 from lare.normalise import Scale, magnitude, observe_scale
 
 

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lare.credit.basis import MOST_ENTRIES, Basis
-from lare.credit.decomposition import SUM, CreditSettings, forms_of
+from lare.credit.decomposition import SUM, forms_of
 from lare.credit.methods import Decoder, Encoder, Fit, Method, Reward
+from lare.credit.settings import CreditSettings
 from lare.errors import LareError, shortened
 from lare.latent.function import LatentFunction
 from lare.plugs.layout import Layout, layout_of

@@ -5,8 +5,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Int
 
-from lare.credit.decomposition import CreditSettings, Episodes
+from lare.credit.decomposition import Episodes
 from lare.credit.methods import Fit
+from lare.credit.settings import CreditSettings
 from lare.plugs.store import Episode, Store
 
 

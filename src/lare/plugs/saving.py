@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
+from lare.credit.settings import CreditSettings
 from lare.errors import LareError, shortened
 from lare.files import write_atomically
 from lare.foreign import read_json, read_text

@@ -6,17 +6,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, create_model, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
-from lare.algorithms.ppo import PPOSettings
-from lare.algorithms.qmix import QMIXSettings
-from lare.algorithms.sac import SACSettings
+from lare.algorithms.settings import PPOSettings, QMIXSettings, SACSettings, TD3Settings
 from lare.algorithms.table import ALGORITHMS, DDPG, IPPO, PPO, VDN, AlgorithmSettings, Consumes, Name
-from lare.algorithms.td3 import TD3Settings
-from lare.credit.accuracy import RECENT
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
-from lare.data.replay import room
+from lare.credit.settings import RECENT, CreditSettings
 from lare.errors import Checked
-from lare.latent.design import CANDIDATES
+from lare.latent.candidates import CANDIDATES
 from lare.tasks.spec import Judges, TaskSpec
 
 LARGEST_SEED = 2**31 - 1
@@ -193,6 +188,8 @@ class ResolvedSettings(Checked):
 
     def rows(self, longest: int) -> int:
         """Rows of each environment to make room for, where an episode has up to `longest` steps."""
+        from lare.data.replay import room  # here: the command line reads this file, and needs no JAX for it
+
         needed = room(self.rollout_steps, longest)
         wanted = self.capacity // self.environments if self.rereads else needed + RECENT // self.environments
         return min(wanted, max(needed, 2 * self.steps // self.environments + 2))

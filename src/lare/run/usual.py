@@ -4,8 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 from lare.algorithms.table import ALGORITHMS, Name
-from lare.credit.decomposition import CreditSettings
 from lare.credit.methods import find_method
+from lare.credit.settings import CreditSettings
 from lare.run.settings import ResolvedSettings, Settings
 from lare.tasks.env import EnvSpec
 

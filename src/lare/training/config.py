@@ -7,8 +7,9 @@ import numpy as np
 
 from lare.algorithms.table import Algorithm, AlgorithmSettings, Consumes, Noise
 from lare.credit.basis import Basis
-from lare.credit.decomposition import SUM, CreditSettings, forms_of
+from lare.credit.decomposition import SUM, forms_of
 from lare.credit.methods import Decoder, Encoder, Method
+from lare.credit.settings import CreditSettings
 from lare.tasks.env import EnvSpec
 from lare.tasks.spec import JudgedFrom
 

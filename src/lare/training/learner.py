@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare.credit import accuracy, decomposition, descent, prediction
-from lare.credit.accuracy import RECENT
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Encoder, Fit, Reward
+from lare.credit.settings import RECENT
 from lare.data import replay
 from lare.data.replay import Replay, StoredSteps
 from lare.data.sampling import CreditSample, sample_packed, sample_padded, sample_parts

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare.algorithms import sac, td3
-from lare.algorithms.critics import OffPolicySettings, Transitions
+from lare.algorithms.critics import Transitions
+from lare.algorithms.settings import OffPolicySettings, SACSettings
 from lare.credit.decomposition import Decomposition
 from lare.data import replay
 from lare.data.replay import Index, Replay, StoredSteps
@@ -39,7 +40,7 @@ def settings_of(config: TrainConfig) -> OffPolicySettings:
 
 def module_of(config: TrainConfig) -> Any:
     """The algorithm's module."""
-    return sac if isinstance(config.hyperparameters, sac.SACSettings) else td3
+    return sac if isinstance(config.hyperparameters, SACSettings) else td3
 
 
 def init(key: PRNGKeyArray, config: TrainConfig) -> Any:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar, Shaped
 
 from lare.algorithms import ppo
+from lare.algorithms.settings import PPOSettings
 from lare.data import replay
 from lare.data.trajectory import Trajectory
 from lare.training import learner as common
@@ -17,9 +18,9 @@ from lare.training.config import TrainConfig
 from lare.training.learner import Learner, Paid
 
 
-def settings_of(config: TrainConfig) -> ppo.PPOSettings:
+def settings_of(config: TrainConfig) -> PPOSettings:
     """The algorithm's hyperparameters."""
-    assert isinstance(config.hyperparameters, ppo.PPOSettings)
+    assert isinstance(config.hyperparameters, PPOSettings)
     return config.hyperparameters
 
 

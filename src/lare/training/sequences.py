@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare.algorithms import qmix
 from lare.algorithms.recurrent import Recurrent
+from lare.algorithms.settings import QMIXSettings
 from lare.credit.decomposition import Decomposition
 from lare.data import replay
 from lare.data.replay import Index, Replay
@@ -50,9 +51,9 @@ class Actor(NamedTuple):
     epsilon: Float[Array, ""]
 
 
-def settings_of(config: TrainConfig) -> qmix.QMIXSettings:
+def settings_of(config: TrainConfig) -> QMIXSettings:
     """The algorithm's hyperparameters."""
-    assert isinstance(config.hyperparameters, qmix.QMIXSettings)
+    assert isinstance(config.hyperparameters, QMIXSettings)
     return config.hyperparameters
 
 

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from lare import compilation
 from lare.credit.closed_form import LARGEST_CHOICE
 from lare.credit.methods import Fit, Method, Reward, find_method
 from lare.errors import LareError
-from lare.latent.design import CANDIDATES, design
+from lare.latent.candidates import CANDIDATES
+from lare.latent.design import design
 from lare.latent.function import LatentFunction, load, per_role
 from lare.latent.improve import Model
 from lare.run.decide import decide
@@ -70,7 +72,7 @@ def train(
     in_vain = list(set_in_vain(given, resolved, task).values())
     said = in_vain[:1] if len(in_vain) < 2 else [f"{in_vain[0]} (and {len(in_vain) - 1} more)"]
     with locked(run), enough_memory(run):
-        return begin(run, model, tensorboard, listeners, *said)
+        return begin(run, model, tensorboard, told_by(listeners), *said)
 
 
 def chosen_functions(
@@ -141,31 +143,45 @@ def resume(
         if not run.has_checkpoint():
             if run.metrics():  # what has been measured is never taken back
                 raise LareError(f"{run.directory} has no checkpoint any more: there is nothing to go on from")
-            return begin(run, model, tensorboard, listeners)
+            return begin(run, model, tensorboard, told_by(listeners))
+        told = told_by(listeners)
+        prepare(run, told)
         restored, messages = sessions.restore(run)
         run.truncate(restored.metrics_length)
-        return finish(restored, model, tensorboard, listeners, *messages)
+        return finish(restored, model, tensorboard, told, *messages)
 
 
-def begin(
-    run: Run, model: Model | None, tensorboard: bool, listeners: Sequence[Listener] | None, *messages: str
-) -> Run:
+def told_by(listeners: Sequence[Listener] | None) -> list[Listener]:
+    """The listeners that were given, or the terminal."""
+    return [Terminal()] if listeners is None else list(listeners)
+
+
+def prepare(run: Run, told: Sequence[Listener]) -> None:
+    """What comes before the first compilation, and a word on how long it takes."""
+    for listener in told:
+        listener.said(
+            f"preparing {run.directory}: compiling takes about half a minute, or some ten seconds where it was done before"
+        )
+    compilation.keep()
+
+
+def begin(run: Run, model: Model | None, tensorboard: bool, told: list[Listener], *messages: str) -> Run:
     """From the first step on. The untrained learner is saved, so that there is a checkpoint whatever happens."""
+    prepare(run, told)
     started = sessions.start(run)
     started.save()
-    return finish(started, model, tensorboard, listeners, *messages)
+    return finish(started, model, tensorboard, told, *messages)
 
 
 def finish(
     session: Session,
     model: Model | None,
     tensorboard: bool,
-    listeners: Sequence[Listener] | None,
+    told: list[Listener],
     *messages: str,
 ) -> Run:
     """Run a session to its end, or until the user stops it."""
     run, settings = session.run, session.settings
-    told: list[Listener] = [Terminal()] if listeners is None else list(listeners)
     clock, explained = Clock(session.step), False
 
     def say(line: str) -> None:

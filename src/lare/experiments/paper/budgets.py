@@ -4,10 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from lare.algorithms.ppo import PPOSettings
-from lare.algorithms.qmix import QMIXSettings
+from lare.algorithms.settings import PPOSettings, QMIXSettings
 from lare.algorithms.table import ALGORITHMS, Consumes
-from lare.credit.decomposition import CreditSettings
+from lare.credit.settings import CreditSettings
 
 Name = Literal["smoke", "laptop", "paper"]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lare.algorithms.table import Name
-from lare.credit.decomposition import CreditSettings
+from lare.credit.settings import CreditSettings
 from lare.experiments.scores import ERROR, RETURN, SUMMED_RETURN
 
 OURS = "ours"
