@@ -236,11 +236,11 @@ def test_the_ablation_without_pre_verification_keeps_what_runs(command):
         ("train --resume runs/none", "runs/none is not a run: there is no config.json in it"),
         (
             "train Reacher-v4 --resume runs/none",
-            "--resume goes on with the run's own settings: give it no task and no other settings",
+            "--resume goes on with the run's own settings: give it no task and no other setting than --steps",
         ),
         (
             "train --resume runs/none --seed 1",
-            "--resume goes on with the run's own settings: give it no task and no other settings",
+            "--resume goes on with the run's own settings: give it no task and no other setting than --steps",
         ),
         ("train Reacher-v4 --function none.py", "the function file none.py is not there"),
         ("train Reacher-v4 --steps 120", "steps = 120 is not a multiple of rollout_steps = 50: take 100"),

@@ -138,7 +138,8 @@ class At:
     def stopped(self): ...
 
     def said(self, message):
-        if " makes no difference to " not in message:  # settings of `small` serve every algorithm
+        # Settings of `small` serve every algorithm, and every run is prepared.
+        if " makes no difference to " not in message and not message.startswith("preparing "):
             self.messages.append(message)
 
     def stepped(self, step):
@@ -158,7 +159,8 @@ class Ear:
     def stopped(self): ...
 
     def said(self, message):
-        self.heard.append(message)
+        if not message.startswith("preparing "):
+            self.heard.append(message)
 
 
 class Says:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from lare.deploy.export import export as export
     from lare.errors import LareError as LareError
     from lare.experiments.evaluation import evaluate_run as evaluate_run
-    from lare.experiments.evaluation import policy_of as policy_of
+    from lare.experiments.policy import policy_of as policy_of
     from lare.experiments.report import write_report as write_report
     from lare.latent.design import design as design
     from lare.latent.function import LatentFunction as LatentFunction
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 HOMES = {
     "LareError": "lare.errors",
     "evaluate_run": "lare.experiments.evaluation",
-    "policy_of": "lare.experiments.evaluation",
+    "policy_of": "lare.experiments.policy",
     "write_report": "lare.experiments.report",
     "export": "lare.deploy.export",
     "design": "lare.latent.design",

@@ -9,7 +9,8 @@ import pytest
 import lare
 from lare.errors import LareError
 from lare.experiments import evaluation
-from lare.experiments.evaluation import acting, evaluate_run, policy_of
+from lare.experiments.evaluation import evaluate_run
+from lare.experiments.policy import policy_of
 from lare.experiments.video import check_video, write_video
 from lare.tasks.gymnasium import GymnasiumEnv
 from lare.tasks.spec import read_task
@@ -60,7 +61,7 @@ def test_more_episodes_than_there_are_environments_begin_each_from_a_start_of_it
 
 def test_no_episodes(small, tmp_path):
     run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
-    with pytest.raises(LareError, match="episodes = 0: at least one is needed"):
+    with pytest.raises(LareError, match="episodes = 0: a whole number, 1 or more"):
         evaluate_run(run, 0)
 
 
@@ -96,7 +97,7 @@ def test_the_policy_of_a_choice_gives_what_the_environment_takes(small, tmp_path
     run = lare.train(spec, small(method="dense", algorithm="ppo"), out=tmp_path / "run", listeners=[])
     policy, observation = policy_of(run), np.eye(4, dtype=np.float32)[2]
     assert gymnasium.make("toys/Pick-v0").action_space.contains(np.int64(policy(observation)))
-    assert policy(observation) == int(np.argmax(acting(run)(observation)))
+    assert policy(observation) == int(np.argmax(policy.row(observation)))
 
 
 def test_many_agents_have_no_single_policy(small_many, tmp_path):

@@ -11,7 +11,16 @@ import pytest
 
 from lare.errors import LareError
 from lare.latent import function as module
-from lare.latent.function import HEADER, LatentFunction, LatentRewardError, load, normal, read_source, verified
+from lare.latent.function import (
+    HEADER,
+    LatentFunction,
+    LatentRewardError,
+    check_task,
+    load,
+    normal,
+    read_source,
+    verified,
+)
 from lare.latent.verification.checks import CHECKS, Check
 from lare.latent.verification.verify import Verdict
 from toys import PHI, phi, toy_spec
@@ -174,11 +183,33 @@ def test_a_function_of_ones_own_needs_no_record(chase, sound, tmp_path, trusting
     assert load(tmp_path / "mine.py", chase) == sound
 
 
+def test_a_function_of_another_task_is_refused_until_the_file_says_otherwise(function, chase, tmp_path):
+    other = chase.model_copy(update={"name": "Depot"})
+    function.save(tmp_path / "phi.py")
+    with pytest.raises(
+        LareError, match=r"phi\.py was written for the task 'Chase', and this is 'Depot': .* \"# lare: task: Chase\"$"
+    ):
+        load(tmp_path / "phi.py", other)
+    with pytest.raises(
+        LareError, match=r"^the latent function was written for the task 'Chase', and this is 'Depot': "
+    ):
+        check_task(function, other)
+    text = (tmp_path / "phi.py").read_text()
+    (tmp_path / "phi.py").write_text(text.replace("# lare: task: Chase\n", ""))
+    assert load(tmp_path / "phi.py", other).task == "Depot"
+
+
+def test_the_header_says_who_wrote_it_where_there_is_no_record(function, chase, tmp_path):
+    function.save(tmp_path / "phi.py")
+    (tmp_path / "phi.json").unlink()
+    assert load(tmp_path / "phi.py", chase).model == function.model
+
+
 def test_a_source_is_read_without_a_look_into_it(function, tmp_path):
     function.save(tmp_path / "phi.py")
-    assert read_source(tmp_path / "phi.py") == read_source(tmp_path / "phi.json") == (SOURCE, False)
+    assert read_source(tmp_path / "phi.py") == read_source(tmp_path / "phi.json") == (SOURCE, False, "Chase")
     (tmp_path / "mine.py").write_text("\ufeff\n\nno Python\n", encoding="utf-8")
-    assert read_source(tmp_path / "mine.py") == ("no Python", False)
+    assert read_source(tmp_path / "mine.py") == ("no Python", False, None)
     with pytest.raises(LareError, match=r"the function file .* is not there"):
         read_source(tmp_path / "none.py")
     (tmp_path / "book.py").write_bytes(b"#" * (2 << 20))

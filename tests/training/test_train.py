@@ -24,10 +24,12 @@ from lare.errors import LareError
 from lare.latent.function import verified
 from lare.run import checkpoint
 from lare.run.checkpoint import saved_host
+from lare.run.decide import decide
 from lare.run.directory import FORMAT, open_run
 from lare.source import source
 from lare.tasks.environment import EnvironmentFault
 from lare.training import session as sessions
+from lare.training.session import load_actor
 from lare.training.train import Interrupted
 from toys import PHI, At, figures, pick_spec, toy_spec
 
@@ -77,7 +79,7 @@ def test_a_run_says_what_was_set_in_vain(small, tmp_path):
             heard.append(message)
 
     lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[Listener(-1, None)])
-    assert heard[0].startswith("fit_updates makes no difference to dense (and ")
+    assert heard[1].startswith("fit_updates makes no difference to dense (and ")
 
 
 def test_the_isolation_stands_in_the_config(small, phi, tmp_path):
@@ -170,6 +172,76 @@ def test_resuming_a_finished_run_changes_nothing(small, tmp_path):
     run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
     before = figures(run)
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == before
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "method"), [("td3", "lare-bayes"), ("td3", "diaster"), ("sac", "rrdu"), ("ppo", "rd"), ("qmix", "rd")]
+)
+def test_an_extended_run_is_a_run_that_was_longer_from_the_start(algorithm, method, small, phi, tmp_path):
+    """Bit for bit, where nothing falls over the whole run and both have replays of one size."""
+    spec = pick_spec() if algorithm == "qmix" else toy_spec()
+    ppo = {"anneal": False, "hidden": (8,), "minibatch_size": 16, "epochs": 2}
+    settings = small(method=method, algorithm=algorithm, ppo=ppo, capacity=200)
+    given = needed(method, phi)
+    whole = lare.train(spec, settings, function=given, out=tmp_path / "whole", listeners=[])
+    half = settings.model_copy(update={"steps": 120})
+    run = lare.train(spec, half, function=given, out=tmp_path / "run", listeners=[])
+    longer = lare.resume(run.directory, steps=settings.steps, listeners=[])
+    assert figures(longer) == figures(whole)
+    assert longer.config.ended_at == (120,)
+    assert open_run(run.directory).config == longer.config
+    with np.load(whole.checkpoint / "best.npz") as a, np.load(longer.checkpoint / "best.npz") as b:
+        for name in a.files:
+            np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+@pytest.mark.parametrize("method", ["lare-bayes", "rrdu"])
+def test_a_replay_that_grows_holds_what_it_held(method, small, phi, tmp_path):
+    """Programs for arrays of other sizes round otherwise: the same but for that."""
+    half, settings = small(method=method, steps=120), small(method=method)
+    assert [decide(one, toy_spec()).rows(20) for one in (half, settings)] == [242, 482]
+    given = needed(method, phi)
+    whole = lare.train(toy_spec(), settings, function=given, out=tmp_path / "whole", listeners=[])
+    run = lare.train(toy_spec(), half, function=given, out=tmp_path / "run", listeners=[])
+    longer = lare.resume(run.directory, steps=240, listeners=[])
+    for one, other in zip(figures(longer), figures(whole), strict=True):
+        known = {name: value for name, value in other.items() if value is not None}
+        assert one.keys() == other.keys()
+        assert {name: one[name] for name in known} == pytest.approx(known, rel=0.02, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("steps", "message"),
+    [
+        (48, r"^steps = 48: the run makes 60 anyway, and it can only be made longer$"),
+        (70, r"^steps = 70 is not a multiple of rollout_steps = 12: take 72$"),
+    ],
+)
+def test_steps_that_a_run_cannot_be_extended_to(steps, message, small, tmp_path):
+    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    with pytest.raises(LareError, match=message):
+        lare.resume(run.directory, steps=steps, listeners=[])
+    assert open_run(run.directory).config == run.config
+
+
+def test_tensorboard_goes_on_where_a_run_had_it(small, tmp_path):
+    settings = small(method="dense", steps=60, seeds=1)
+    run = lare.train(toy_spec(), settings, out=tmp_path / "run", tensorboard=True, listeners=[])
+    assert len(list((run.directory / "tensorboard").rglob("events*"))) == 1
+    lare.resume(run.directory, steps=120, listeners=[])
+    assert len(list((run.directory / "tensorboard").rglob("events*"))) == 2
+
+
+def test_the_best_policy_is_kept_beside_the_last(small, tmp_path):
+    """Of each seed, that of the first of its highest evaluations."""
+    run = lare.train(toy_spec(), small(method="dense", seeds=3), out=tmp_path / "run", listeners=[])
+    _, _, since = load_actor(run, of_best=True)
+    for place, seed in enumerate(run.seeds):
+        lines = [line for line in run.metrics() if line["seed"] == seed]
+        assert since[place] == max(lines, key=lambda line: line["evaluation/return"])["step"]
+    last, best = (lare.evaluate_run(run, 3, best=which)["Chase"] for which in (False, True))
+    assert [np.array_equal(a, b) for a, b in zip(last, best, strict=True)] == (since == 240).tolist()
+    assert not np.all(since == 240)
 
 
 def test_resuming_before_the_first_checkpoint_starts_anew(small, tmp_path):

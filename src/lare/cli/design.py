@@ -161,13 +161,13 @@ def policy_that_plays(run: Path | None, spec: "TaskSpec") -> "Callable[[np.ndarr
     """The policy of a run, if there is one."""
     if run is None:
         return None
-    from lare.experiments.evaluation import acting
+    from lare.experiments.policy import Policy
     from lare.run.directory import open_run
 
     opened = open_run(run)
     if opened.config.task.environment != spec.environment:
         raise LareError(f"{run} is a run of {opened.config.task.name}: its policy cannot play {spec.name}")
-    return acting(opened)
+    return Policy(opened, 0, best=False).row
 
 
 def check_design(

@@ -1,5 +1,6 @@
 """Latent functions: the request, a task of one's own, verification."""
 
+import math
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -8,11 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare.cli.terminal import Data, Kind, Task, say, steps_of, write_new
+from lare.cli.terminal import Data, Kind, Task, progress, say, steps_of, write_new
 from lare.errors import LareError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lare.latent.function import LatentFunction
     from lare.tasks.new import Draft
+    from lare.tasks.play import Episode, Policy
+    from lare.tasks.spec import TaskSpec
 
 
 def prompt(task: Task, kind: Kind = "factors") -> None:
@@ -85,8 +91,12 @@ def verify(
     task: Annotated[str, tyro.conf.arg(metavar="TASK")],
     kind: Kind = "factors",
     data: Data = None,
+    fit: int = 0,
+    policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
 ) -> None:
     """Verify a function: what it may contain, and what it must do. It runs in a process without rights.
+
+    With --fit it also says how much of the returns of some episodes its factors explain, and what each of them counts.
 
     Exit status 0: it passes. 1: it does not, and every reason is printed. 2: it could not be tried.
 
@@ -96,15 +106,23 @@ def verify(
         kind: what it is to return: several factors, or one reward.
         data: logged episodes whose steps it is tried on, instead of random ones of the environment: a directory, a Parquet file,
             or the id of a local data set of Minari's.
+        fit: so many episodes, 20 or more, are played by random actions, or are the first of --data.
+        policy: a run whose policy plays the episodes for --fit, instead of random actions.
     """
-    from lare.latent.function import read_source
+    from lare.cli.design import policy_that_plays
+    from lare.latent.function import LatentFunction, read_source
     from lare.latent.verification.verify import verify as verify_source
-    from lare.tasks.spec import load_task, read_task
+    from lare.tasks.spec import load_task, read_task, the_role
 
-    source, changed = read_source(file)
+    source, changed, written_for = read_source(file)
+    if policy is not None and (not fit or data is not None):
+        raise LareError("--policy plays the episodes for --fit, where there is no --data: say how many")
+    spec = load_task(task) if data is None else read_task(task)
+    plays = policy_that_plays(policy, spec)
     if changed:
         say("note    the source is not the one that was saved: its hash is another")
-    spec = load_task(task) if data is None else read_task(task)
+    if written_for not in (None, the_role(spec).name):
+        say(f"note    it was written for the task {written_for!r}")
     verdict = verify_source(source, spec, kind, steps_of(data, spec))
     for check in verdict.checks:
         say(f"{'passed' if check.passed else 'FAILED'}  {check.name}")
@@ -116,3 +134,34 @@ def verify(
         say(f"It ran in {verdict.isolation}.")
     if not verdict.passed:
         sys.exit(1)
+    if fit:
+        role = the_role(spec)
+        function = LatentFunction(role.name, kind, source, verdict.size, verdict.checks)
+        say_what_returns_say(function, role, episodes_for(role, data, fit, plays))
+
+
+def episodes_for(role: "TaskSpec", data: str | None, count: int, policy: "Policy | None") -> "Sequence[Episode]":
+    """Episodes of a log, or of the environment."""
+    if data is not None:
+        from lare.logs.steps import logged_episodes
+
+        return logged_episodes(data, role, count)
+    from lare.tasks.play import episodes_of
+
+    progress(f"playing {count} episodes by {'random actions' if policy is None else 'the policy'}")
+    return episodes_of(role, count, policy)
+
+
+def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes: "Sequence[Episode]") -> None:
+    """How well the factors tell the returns of some episodes."""
+    from lare.training.reflect import told_by_returns
+
+    found = told_by_returns(function, role, episodes)
+    for line in found.sentences:
+        say(line)
+    if not found.sentences:
+        say(f"All {len(episodes)} episodes returned the same: they say nothing of the factors.")
+    elif math.isfinite(found.r2):
+        say(
+            f"R² of the returns, each predicted before it was seen: {found.r2:.2f} (1: exactly; 0: no better than their mean)"
+        )

@@ -42,7 +42,8 @@ def train(
             OpenAI-compatible endpoint.
         base_url: the endpoint (OpenAI's, or that of OPENAI_BASE_URL, unless given).
         out: the run directory, which must not exist; runs/TASK-METHOD-ALGORITHM-sSEED unless given.
-        resume: a run directory to go on with, from its last checkpoint and with its own settings.
+        resume: a run directory to go on with, from its last checkpoint and with its own settings. With --steps, a finished run
+            goes on for longer.
         tensorboard: write TensorBoard events into the run directory too (needs the extra lare-rl[tensorboard]).
         wandb: send the metrics of each seed to a project of Weights & Biases too (needs the extra lare-rl[wandb]).
         mlflow: send the metrics of each seed to an experiment of MLflow too (needs the extra lare-rl[mlflow]).
@@ -54,12 +55,14 @@ def train(
     from lare.training.train import check_given
 
     if resume is not None:
-        if (task, function, out, settings) != (None, (), None, DEFAULTS):
-            raise LareError("--resume goes on with the run's own settings: give it no task and no other settings")
+        if (task, function, out, settings.model_copy(update={"steps": None})) != (None, (), None, DEFAULTS):
+            raise LareError(
+                "--resume goes on with the run's own settings: give it no task and no other setting than --steps"
+            )
         config = open_run(resume).config
         asked = model_of(model, base_url, config.task.name)
         listeners = listeners_of(wandb, mlflow, config.settings)
-        run = lare.resume(resume, model=asked, tensorboard=tensorboard, listeners=listeners)
+        run = lare.resume(resume, steps=settings.steps, model=asked, tensorboard=tensorboard, listeners=listeners)
     elif task is None:
         raise LareError("say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR")
     else:
@@ -117,20 +120,22 @@ def model_of(model: str | None, base_url: str | None, task: str) -> "Model | Non
     return LiveModel(model, base_url, None, Budget(REQUESTS, BUDGET), said=progress)
 
 
-def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -> None:
+def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: Path | None = None) -> None:
     """Evaluate the policy of a run by its true return, from starts that no evaluation of the run has used.
 
     Args:
         run: a run directory.
         episodes: episodes for each seed. A single agent acts without noise, many as their algorithm is evaluated.
+        best: play the policy of each seed's best evaluation, instead of the last one.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
-    from lare.experiments.evaluation import evaluate_run
+    from lare.experiments.evaluation import evaluation_of
     from lare.experiments.statistics import mean_and_deviation, plus_minus
     from lare.experiments.video import check_video, record_video
     from lare.run.directory import open_run
     from lare.tasks.table import env_spec
     from lare.training.explain import explanation_of
+    from lare.training.session import load_actor
 
     opened = open_run(run)
     if video is not None:
@@ -139,14 +144,20 @@ def evaluate(run: RunDirectory, episodes: int = 10, video: Path | None = None) -
             if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
                 os.environ.setdefault("MUJOCO_GL", "egl")  # which needs no screen
             progress("filming an episode; without a graphics card that may take minutes")
-        record_video(opened, video)
+        record_video(opened, video, best)
         say(f"wrote {video}")
-    returns = evaluate_run(opened, episodes)
+    found, (_, _, since) = evaluation_of(opened, episodes, best), load_actor(opened, best)
     counted = f"{episodes} episodes" if episodes != 1 else "1 episode"
-    for team, of_team in returns.items():
-        for seed, of_seed in zip(opened.seeds, of_team, strict=True):
-            named = f"{team}, " if len(returns) > 1 else ""
-            say(f"{named}seed {seed}: return {plus_minus(*mean_and_deviation(of_seed))} over {counted}")
+    roles = opened.config.task.roles
+    for team, role in enumerate(roles):
+        for place, seed in enumerate(opened.seeds):
+            named = f"{role.name}, " if len(roles) > 1 else ""
+            of_seed = plus_minus(*mean_and_deviation(found.returns[place, :, team]))
+            of_best = f" (the policy of step {since[place]:,})" if best else ""
+            say(f"{named}seed {seed}: return {of_seed} over {counted}{of_best}")
+    for name, values in found.measures.items():
+        for seed, of_seed in zip(opened.seeds, values, strict=True):
+            say(f"seed {seed}: {name} {plus_minus(*mean_and_deviation(of_seed))}")
     for line in explanation_of(opened):
         say(line)
 
@@ -163,7 +174,12 @@ def report(runs: RunDirectories, out: Path | None = None) -> None:
     say(f"wrote {write_report(list(runs), out)}")
 
 
-def export(run: RunDirectory, out: Annotated[Path, tyro.conf.arg(metavar="DIR")], seed: int | None = None) -> None:
+def export(
+    run: RunDirectory,
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")],
+    seed: int | None = None,
+    best: bool = False,
+) -> None:
     """Write policy and rewards for programs that have neither LaRe nor JAX.
 
     Both are written as NumPy arrays with a loader and, with the extra lare-rl[onnx], as ONNX.
@@ -172,11 +188,12 @@ def export(run: RunDirectory, out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
         run: a run directory.
         out: the directory to write, which must not exist.
         seed: whose policy and decoder; the first seed's unless given.
+        best: the policy of the seed's best evaluation, instead of the last one.
     """
     import lare
     from lare.run.directory import open_run
 
-    found = lare.export(open_run(run), out, seed)
+    found = lare.export(open_run(run), out, seed, best)
     say(f"wrote {', '.join(found.functions)} to {found.directory}; exported.py there says how to call them")
     for name, why in found.apart.items():
         progress(f"{name} takes the factors of phi as an input, for phi has no translation: it has {why}")

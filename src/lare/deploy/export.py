@@ -21,13 +21,12 @@ from lare.deploy.policy import policy
 from lare.deploy.reward import reward, unexported
 from lare.deploy.rows import Untranslatable
 from lare.errors import LareError
-from lare.experiments.evaluation import choices
+from lare.experiments.policy import choices, opened
 from lare.files import write_atomically
 from lare.run.directory import Run, function_file
 from lare.source import source
-from lare.training.compiled import compiled
 from lare.training.seeds import of_seed
-from lare.training.session import load_learner
+from lare.training.session import load_actor, load_learner
 
 TEXT, LOADER = "export.json", "exported.py"
 
@@ -46,18 +45,25 @@ class Exported(NamedTuple):
     """Whether there are ONNX files: the package `onnx` is installed."""
 
 
-def export(run: Run, out: str | Path, seed: int | None = None) -> Exported:
-    """Write the policy and the proxy rewards of a seed (the first, unless given) to a directory that must not exist.
+def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best: bool = False) -> Exported:
+    """Write the policy and the proxy rewards of a seed to a directory that must not exist.
 
     Policies are deterministic. Rewards are those of the last checkpoint's decoder, in the unit of the true rewards.
+
+    Args:
+        run: the run, or its directory.
+        out: the directory.
+        seed: one of the run's; the first, unless given.
+        best: the policy of the seed's best evaluation, instead of the last one.
 
     Raises:
         LareError: there is no such seed, no checkpoint, or the directory exists or cannot be written.
     """
-    out = Path(out)
+    out, run = Path(out), opened(run)
     place = run.place_of(seed)
-    config, learner, host, _ = load_learner(run)
-    actor = jax.tree.map(lambda leaf: leaf[place], compiled(config).actor(learner, host["step"]))
+    config, learner, _, _ = load_learner(run)
+    _, actors, since = load_actor(run, best)
+    actor = jax.tree.map(lambda leaf: leaf[place], actors)
     start = choices(run).start if config.env.discrete and config.env.agents == 1 else 0
     graphs = {"policy": policy(actor, config, start)}
     credit = of_seed(learner, place).credit
@@ -85,7 +91,7 @@ def export(run: Run, out: str | Path, seed: int | None = None) -> Exported:
         "method": run.config.settings.method,
         "algorithm": run.config.settings.algorithm,
         "seed": run.seeds[place],
-        "step": host["step"],
+        "step": int(since[place]),
     }
     for name, graph in graphs.items():
         text[name] = described(graph)

@@ -12,7 +12,7 @@ from PIL import Image
 
 from lare.errors import LareError
 from lare.experiments import agents
-from lare.experiments.evaluation import acting
+from lare.experiments.policy import Policy
 from lare.experiments.watch import watch
 from lare.run.directory import Run
 from lare.tasks.env import HostEnv
@@ -27,8 +27,8 @@ FRAME = {"width": 320, "height": 320}
 """Pixels of a MuJoCo film: its usual 480 by 480 take twice as long, and as much room."""
 
 
-def record_video(run: Run, path: str | Path) -> None:
-    """Film one episode of the first seed's policy, as a .gif, or as an .mp4 with the extra `lare-rl[video]`.
+def record_video(run: Run, path: str | Path, best: bool = False) -> None:
+    """Film one episode of the first seed's policy, the last or the best, as a .gif, or as an .mp4 with the extra `lare-rl[video]`.
 
     Agents of particle tasks wear their credit, as number and colour.
 
@@ -38,6 +38,8 @@ def record_video(run: Run, path: str | Path) -> None:
     path = Path(path)
     check_video(path)
     if env_spec(run.config.task).agents > 1:
+        if best:
+            raise LareError("a film of many agents shows their credit, and so the last policy: leave --best out")
         pictures = agents.frames(run, watch(run))
         if pictures is None:
             raise LareError(f"{run.config.task.name} steps on the host, where only single agents are filmed")
@@ -49,18 +51,18 @@ def record_video(run: Run, path: str | Path) -> None:
         fps = environment.environment.metadata.get("render_fps", 30)
         # Browsers play a GIF at 50 frames a second at most, and a frame may take long where there is no graphics card.
         every = max(1, round(fps / 25)) if path.suffix == ".gif" else 1
-        write_video(path, list(drawn(run, environment, every)), every / fps)
+        write_video(path, list(drawn(run, environment, every, best)), every / fps)
 
 
-def drawn(run: Run, environment: HostEnv, every: int) -> Iterator[np.ndarray]:
+def drawn(run: Run, environment: HostEnv, every: int, best: bool) -> Iterator[np.ndarray]:
     """Pictures of every so many steps of an episode. Raises `LareError` where this machine draws none."""
-    act = acting(run)
+    policy = Policy(run, 0, best)
     shown = environment.reset(episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
     ended, step = False, 0
     while not ended:
         if step % every == 0:
             yield picture(environment, run)
-        shown = environment.step(act(shown.observation[0])[None])
+        shown = environment.step(policy.row(shown.observation[0])[None])
         ended, step = bool(shown.terminated or shown.truncated), step + 1
 
 

@@ -10,7 +10,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -304,14 +304,20 @@ def split_header(text: str) -> tuple[list[str], str]:
     return header, "\n".join(lines[len(header) :])
 
 
-def read_source(path: str | Path) -> tuple[str, bool]:
-    """The source of a function file, not yet looked into, and whether it was changed since it was saved.
+class SavedSource(NamedTuple):
+    """A function file, not yet looked into."""
 
-    Raises:
-        LareError: it cannot be read.
-    """
+    source: str
+    changed: bool
+    """Whether it was changed since it was saved."""
+    task: str | None
+    """That it was written for, where it says so."""
+
+
+def read_source(path: str | Path) -> SavedSource:
+    """The source of a function file. Raises `LareError` where it cannot be read."""
     header, source = split_header(read_text(source_file(path)))
-    return normal(source), was_changed(header, source)
+    return SavedSource(normal(source), was_changed(header, source), said_of("task", header))
 
 
 Given = TypeVar("Given")
@@ -339,21 +345,43 @@ def load(path: str | Path, task: TaskSpec, steps: Steps | None = None) -> Latent
     """
     source_path = source_file(path)
     header, source = split_header(read_text(source_path))
-    kind: Kind = "reward" if f"{HEADER}kind: reward" in header else "factors"
+    written_for = said_of("task", header)
+    if written_for not in (None, task.name):
+        raise LareError(
+            f"{source_path} was written for the task {written_for!r}, and this is {task.name!r}: choose another function or, if "
+            f'this one is right for both, remove its line "{HEADER}task: {written_for}"'
+        )
+    kind: Kind = "reward" if said_of("kind", header) == "reward" else "factors"
     try:
         function = verified(source, task, kind, steps)
     except LareError as error:
         raise LareError(f"{source_path}: {error}") from error
+    function = replace(function, model=said_of("model", header) or function.model)
     function = with_provenance(function, source_path.with_suffix(".json"))
     if was_changed(header, source) and not function.changed:
         function = replace(function, model=function.model + CHANGED)
     return function
 
 
+def said_of(what: str, header: Sequence[str]) -> str | None:
+    """What the header that `save` has written says of something, where it says so."""
+    start = f"{HEADER}{what}: "
+    return next((line.removeprefix(start).strip() for line in header if line.startswith(start)), None)
+
+
 def was_changed(header: Sequence[str], source: str) -> bool:
     """Whether the header that `save` has written speaks of another source."""
-    said = [line.removeprefix(f"{HEADER}sha256: ").strip() for line in header if line.startswith(f"{HEADER}sha256: ")]
-    return bool(said) and said[0] != hashlib.sha256(normal(source).encode()).hexdigest()
+    said = said_of("sha256", header)
+    return said is not None and said != hashlib.sha256(normal(source).encode()).hexdigest()
+
+
+def check_task(function: LatentFunction, task: TaskSpec) -> None:
+    """Raise `LareError` where a function was written for another task than it is given for."""
+    if function.task != task.name:
+        raise LareError(
+            f"the latent function was written for the task {function.task!r}, and this is {task.name!r}: choose another one or, if "
+            f"this one is right for both, say so by dataclasses.replace(function, task={task.name!r})"
+        )
 
 
 def with_provenance(function: LatentFunction, record: Path) -> LatentFunction:

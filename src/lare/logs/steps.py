@@ -1,4 +1,4 @@
-"""Steps of a log that a function is tried on, where there is no environment."""
+"""Steps and episodes of a log that a function is tried on, where there is no environment."""
 
 import itertools
 from typing import Any
@@ -7,6 +7,7 @@ import numpy as np
 
 from lare.latent.verification.verify import STEPS, Steps
 from lare.logs.source import open_logs
+from lare.tasks.play import Episode
 from lare.tasks.spec import TaskSpec
 
 EPISODES = 64
@@ -35,3 +36,19 @@ def logged_steps(source: Any, task: TaskSpec, count: int = STEPS) -> Steps:
     observation, action = (np.concatenate(part) for part in zip(*parts, strict=True))
     chosen = np.unique(np.linspace(0, len(action) - 1, min(count, len(action))).astype(int))
     return observation[chosen], action[chosen]
+
+
+def logged_episodes(source: Any, task: TaskSpec, count: int) -> list[Episode]:
+    """The first whole episodes of a log, `count` of them or as many as it has. Raises `LareError` where it cannot be read."""
+    whole = (episode for episode in open_logs(source, task).episodes() if episode.whole)
+    return [
+        Episode(
+            episode.before[:, None],
+            episode.action[:, None],
+            episode.after[:, None],
+            np.ones((len(episode), 1), bool),
+            episode.paid[:, None],
+            episode.paid,
+        )
+        for episode in itertools.islice(whole, count)
+    ]

@@ -13,7 +13,7 @@ from lare.credit.decomposition import SUM, forms_of
 from lare.credit.methods import Decoder, Encoder, Fit, Method, Reward
 from lare.credit.settings import CreditSettings
 from lare.errors import LareError, shortened
-from lare.latent.function import LatentFunction
+from lare.latent.function import LatentFunction, check_task
 from lare.plugs.layout import Layout, layout_of
 from lare.tasks.spec import Judges, TaskSpec
 from lare.tasks.table import env_spec
@@ -159,6 +159,8 @@ def check(config: CreditConfig) -> None:
         raise LareError(f"{name} needs a phi of the kind {method.kind!r}, and this one is of the kind {phi.kind!r}")
     if phi is not None and config.task is None:
         raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")
+    if phi is not None and config.task is not None:
+        check_task(phi, config.task)
     if method.reward is Reward.DESIGNED and config.judges == "both":
         raise LareError(f"{name} is one reward a step: it judges the observation before or after, not both")
     if method.for_one_only and config.agents > 1:

@@ -27,8 +27,11 @@ from lare.foreign import read_json
 
 STATE = "state.npz"
 
-BY_ROW = ".replay.columns"
-"""The part of the state that is saved by row."""
+REPLAY = ".replay."
+"""The part of the state that holds what was met."""
+
+BY_ROW = f"{REPLAY}columns"
+"""The part of it that is saved by row."""
 
 DAMAGED = (
     *(
@@ -207,12 +210,27 @@ def fill(template: Some, state: Mapping[str, np.ndarray]) -> Some:
     filled = []
     for path, leaf in leaves:
         name = jax.tree_util.keystr(path)
+        if name in known and name.startswith(REPLAY):
+            state = {**state, name: grown(state[name], leaf.shape)}
         if name in known and state[name].shape != leaf.shape:
             raise ValueError(f"{name} has shape {state[name].shape}, not {leaf.shape}")
         if name in known and state[name].dtype != leaf.dtype:
             raise ValueError(f"{name} holds {state[name].dtype}, not {leaf.dtype}")
         filled.append(jnp.asarray(state[name]) if name in known else leaf)
     return jax.tree.unflatten(structure, filled)
+
+
+def grown(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """An array of a replay that was smaller, with zeros behind; any other as it is.
+
+    A run that is to go on for longer may have a larger replay. The smaller one had room for every step, so that nothing in it
+    stands anywhere else than it would in the larger.
+    """
+    seeds_envs, rows, rest = array.shape[:2], array.shape[2:3], array.shape[3:]
+    if not rows or (seeds_envs, rest) != (shape[:2], shape[3:]) or rows > shape[2:3]:
+        return array
+    behind = np.zeros((*seeds_envs, shape[2] - rows[0], *rest), array.dtype)
+    return np.concatenate([array, behind], axis=2)
 
 
 def with_rows(learner: Some, directory: Path, segments: list[dict[str, Any]]) -> Some:

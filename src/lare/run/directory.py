@@ -14,7 +14,7 @@ import os
 import platform
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -69,6 +69,8 @@ class Config(Checked):
     """What stands around the latent function while training."""
     versions: dict[str, str]
     machine: str
+    ended_at: tuple[int, ...] = ()
+    """The steps that it was to make before it was extended, each time that it was."""
 
 
 def describe(task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction]) -> Config:
@@ -185,6 +187,25 @@ class Run:
         path = self.directory / FAILED_BATCH
         write_atomically(path, lambda file: np.savez(file, allow_pickle=False, observation=observation, action=action))
         return path
+
+    def extended(self, steps: int) -> "Run":
+        """The run with more steps to make; config.json says so from now on.
+
+        Raises:
+            LareError: they are not more, or no whole number of iterations.
+        """
+        config = self.config
+        if steps < config.settings.steps:
+            raise LareError(
+                f"steps = {steps}: the run makes {config.settings.steps} anyway, and it can only be made longer"
+            )
+        if steps == config.settings.steps:
+            return self
+        settings = ResolvedSettings(**{**dict(config.settings), "steps": steps})
+        longer = config.model_copy(update={"settings": settings, "ended_at": (*config.ended_at, config.settings.steps)})
+        text = longer.model_dump_json(indent=1) + "\n"
+        write_atomically(self.directory / CONFIG, lambda file: file.write(text.encode()))
+        return replace(self, config=longer)
 
     def truncate(self, length: int) -> None:
         """Take back the lines that were written after a checkpoint; they come again.

@@ -1,5 +1,6 @@
 """What episodes of a policy gave."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,3 +34,14 @@ class Evaluation:
                 if spec.agents > 1:
                     found[f"evaluation/summed_return{suffix}"] = self.sums[..., place].mean(axis=1)
         return found
+
+
+def together(parts: Sequence[Evaluation]) -> Evaluation:
+    """Evaluations of the same seeds, as one."""
+
+    def joined(arrays: Iterable[np.ndarray]) -> np.ndarray:
+        return np.concatenate(list(arrays), axis=1)
+
+    measures = {name: joined(part.measures[name] for part in parts) for name in parts[0].measures}
+    returns, sums, lengths = (joined(getattr(part, name) for part in parts) for name in ("returns", "sums", "lengths"))
+    return Evaluation(returns, sums, lengths, measures)

@@ -6,6 +6,7 @@ The episodes are played for it before training, or are those that a run has stor
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -67,7 +68,24 @@ def reflect(
     return improve(function, role, model, judge, rounds, record, said)
 
 
+class Told(NamedTuple):
+    """What the returns of some episodes say of a function."""
+
+    r2: float
+    """Of the returns, each predicted by the factors before it was seen; NaN where they are all the same."""
+    sentences: list[str]
+    """Those that a user reads; none where the returns are all the same."""
+    ranges: list[str]
+    """Of each factor's values, a line each."""
+
+
 def evidence_of(function: LatentFunction, role: TaskSpec, episodes: Sequence[Episode]) -> Evidence:
+    """The same, for a language model. Raises `LareError` as `told_by_returns`."""
+    found = told_by_returns(function, role, episodes)
+    return Evidence(found.r2, "\n".join([*found.ranges, *found.sentences]))
+
+
+def told_by_returns(function: LatentFunction, role: TaskSpec, episodes: Sequence[Episode]) -> Told:
     """What the returns of some episodes say of a function.
 
     Raises:
@@ -84,11 +102,9 @@ def evidence_of(function: LatentFunction, role: TaskSpec, episodes: Sequence[Epi
     basis = Basis(size, rows[0].shape[-1] - size, extended=True)
     alive, returns = [one.alive for one in episodes], np.array([one.total for one in episodes])
     found = judge_rows(rows, alive, returns, basis, role.score)
-    names, every = (
-        function.columns_by(role.judges),
-        np.concatenate([z[there] for z, there in zip(factors, alive, strict=True)]),
-    )
-    return Evidence(found.r2, "\n".join([*ranges(names, every), *said_of(found, names, role, basis)]))
+    names = function.columns_by(role.judges)
+    every = np.concatenate([z[there] for z, there in zip(factors, alive, strict=True)])
+    return Told(found.r2, said_of(found, names, role, basis), ranges(names, every))
 
 
 def factors_of(function: LatentFunction, role: TaskSpec, episode: Episode) -> Float[np.ndarray, "steps rows factors"]:

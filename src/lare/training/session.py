@@ -10,14 +10,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import find_method
 from lare.data.trajectory import Trajectory
 from lare.errors import LareError
 from lare.latent.improve import Model
+from lare.run import best as best_policies
 from lare.run import checkpoint
+from lare.run.best import Best
 from lare.run.directory import Run
 from lare.run.settings import ResolvedSettings
 from lare.tasks.env import JaxEnv, Timestep
@@ -70,6 +72,8 @@ class Session:
     """Whether the decoders' first fit has been made."""
     latest: dict[str, Float[Array, " seeds"]] = field(default_factory=dict)
     """What the last updates measured."""
+    best: Best | None = None
+    """Of the evaluations so far; None before the first, and where several teams learn, which are each other's measure."""
 
     @property
     def settings(self) -> ResolvedSettings:
@@ -115,8 +119,18 @@ class Session:
     def report(self, rate: float) -> list[dict[str, Any]]:
         """Evaluate, always from the same starts; one line of metrics.jsonl for each seed."""
         evaluation = self.collector.evaluate(self.actor, self.settings.evaluation_episodes)
+        if len(self.config.env.teams) == 1:
+            self.keep_best(evaluation.returns[..., 0].mean(axis=1))
         measured = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest
         return lines(self.run.seeds, self.step, measured, rate)
+
+    def keep_best(self, score: Float[np.ndarray, " seeds"]) -> None:
+        """Keep the policies of the seeds that have never been evaluated better."""
+        before = self.best or best_policies.none_yet(len(self.run.seeds))
+        found = best_policies.better_of(before, score, self.step, self.actor)
+        if np.any(found.score > before.score):
+            best_policies.save(self.run.checkpoint, found)
+        self.best = found
 
     def save(self, anew: bool = False) -> None:
         """Write a checkpoint; `anew` where stored rows have changed."""
@@ -142,6 +156,8 @@ class Session:
         """Put everything around the learner back to a checkpoint; returns what is to be said about it."""
         self.step, self.metrics_length, self.fitted = host["step"], host["metrics_length"], host.get("fitted", False)
         self.latest = {name: jnp.asarray(values) for name, values in part(arrays, "latest/").items()}
+        if (self.run.checkpoint / best_policies.FILE).exists():
+            self.best = best_policies.load(self.run.checkpoint, actor_shape(self.run, self.config), self.run.seeds)
         dropped, messages = self.collector.restore(part(arrays, "collector/"))
         if dropped.any():
             self.learner = drop(self.learner, jnp.asarray(dropped))
@@ -165,6 +181,25 @@ def load_learner(run: Run) -> tuple[TrainConfig, Learner, dict[str, Any], dict[s
     """The training state of a run's last checkpoint, and what stood with it."""
     config = config_for(run)
     return config, *checkpoint.load(run.checkpoint, learner_shape(run, config))
+
+
+def load_actor(run: Run, of_best: bool = False) -> tuple[TrainConfig, Any, Int[np.ndarray, " seeds"]]:
+    """What is needed to act as a run acts at last or, of each seed, as in its best evaluation; and since which step it does.
+
+    Raises:
+        LareError: it has not been saved.
+    """
+    if of_best:
+        config = config_for(run)
+        found = best_policies.load(run.checkpoint, actor_shape(run, config), run.seeds)
+        return config, jax.tree.map(jnp.asarray, found.actor), found.step
+    config, learner, host, _ = load_learner(run)
+    return config, compiled(config).actor(learner, host["step"]), np.full(len(run.seeds), host["step"])
+
+
+def actor_shape(run: Run, config: TrainConfig) -> Any:
+    """What is needed to act, with the shapes of its arrays in their place."""
+    return jax.eval_shape(lambda learner: compiled(config).actor(learner, 0), learner_shape(run, config))
 
 
 def learner_shape(run: Run, config: TrainConfig) -> Learner:

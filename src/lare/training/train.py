@@ -12,7 +12,7 @@ from lare.credit.methods import Fit, Method, Reward, find_method
 from lare.errors import LareError
 from lare.latent.candidates import CANDIDATES
 from lare.latent.design import design
-from lare.latent.function import LatentFunction, load, per_role
+from lare.latent.function import LatentFunction, check_task, load, per_role
 from lare.latent.improve import Model
 from lare.run.decide import decide
 from lare.run.directory import Run, create, default_directory, isolation, locked, open_run
@@ -27,6 +27,10 @@ from lare.training.session import Session
 
 Given = LatentFunction | str | Path
 """A latent function, or the path of its file."""
+
+
+EVENTS = "tensorboard"
+"""Where the run directory has them."""
 
 
 class Interrupted(LareError):
@@ -91,6 +95,8 @@ def chosen_functions(
         check_given(settings)
         each = per_role([given] if isinstance(given, Given) else given, task)
         functions = [one if isinstance(one, LatentFunction) else load(one, role) for one, role in each]
+        for function, role in zip(functions, task.roles, strict=True):
+            check_task(function, role)
     for function in functions:
         check_size(method, function.size_by(settings.judged_by(task)))
     return tuple(functions)
@@ -124,22 +130,33 @@ def check_size(method: Method, factors: int) -> None:
 def resume(
     directory: str | Path,
     *,
+    steps: int | None = None,
     model: Model | None = None,
     tensorboard: bool = False,
     listeners: Sequence[Listener] | None = None,
 ) -> Run:
-    """Go on with a run that was stopped or killed, from its last checkpoint to its end.
+    """Go on with a run that was stopped or killed, from its last checkpoint to its end; or beyond it.
 
     On the CPU the metrics are then, bit for bit, those of a run that never stopped (but for the times).
 
+    Args:
+        directory: of the run.
+        steps: environment steps of each seed that the run is to have made at its end, where that is more than was asked for at
+            first. What falls over the whole run (`ppo.anneal`) falls over the longer one from now on.
+        model: whom `reflect_every` asks.
+        tensorboard: also write TensorBoard events. They go on by themselves where the run has some.
+        listeners: who is told of the progress; the terminal, unless given.
+
     Raises:
-        LareError: it is not a run, or its checkpoint is not there any more; and as `train`.
+        LareError: it is not a run, or its checkpoint is not there any more, or `steps` are fewer; and as `train`.
     """
+    run = open_run(directory)
+    tensorboard = tensorboard or (run.directory / EVENTS).is_dir()
     if tensorboard:
         summary_writer()
-    run = open_run(directory)
     check_model(run.config.settings, model)
     with locked(run), enough_memory(run):
+        run = run if steps is None else run.extended(steps)
         if not run.has_checkpoint():
             if run.metrics():  # what has been measured is never taken back
                 raise LareError(f"{run.directory} has no checkpoint any more: there is nothing to go on from")
@@ -190,7 +207,7 @@ def finish(
 
     try:
         if tensorboard:
-            told.append(TensorBoard(run.directory / "tensorboard", session.step, run.seeds))
+            told.append(TensorBoard(run.directory / EVENTS, session.step, run.seeds))
         for listener in told:
             introduce(session, listener, messages)
         with stop_requests() as stop:

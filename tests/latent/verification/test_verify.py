@@ -68,7 +68,7 @@ ORDER = ["gate", *CHECKS]
                 "E-FLOW line 4: a decision depends on values of the batch: use np.where instead of if, and, or, max, min",
                 "E-LOOP: it makes 65 turns for 64 rows and 1032 for 1031: no loop over the batch, use whole arrays",
                 "E-ROWS line 3: numbers of two rows meet: compute along axis=1, never over the batch",
-                "E-BATCH: a step has other factors when the batch is in another order",
+                "E-BATCH: a step has other factors in a batch of 3 than in one of 256",
                 "E-EMPTY: a batch without rows: "
                 "E-RUN line 3: IndexError: index 0 is out of bounds for axis 0 with size 0",
             ],
@@ -275,8 +275,27 @@ def test_agents_that_have_left_have_no_random_steps():
     np.testing.assert_array_equal(action.sum(axis=1), 1)
 
 
+@pytest.mark.parametrize(
+    ("judges", "times"),
+    [("before", [14, 14, 14, 14, 14]), ("after", [0, 14, 14, 14, 14, 14]), ("both", [8, 14, 14, 14, 14, 6])],
+)
+def test_random_steps_are_judged_as_the_task_says_and_reach_the_end(judges, times):
+    task = toy_spec(
+        name="toy", environment="pettingzoo/parallel_toys:Toy", observation_size=2, action_size=3, judges=judges
+    )
+    observation, _ = random_steps(task, steps=70)  # an observation says how much of an episode of five steps is over
+    assert np.bincount(observation[:, 1].astype(int)).tolist() == times
+
+
+def test_a_step_before_the_last_is_left_out_rather_than_the_end(chase):
+    longer = toy_spec(max_episode_steps=1000)
+    every, (observation, action) = random_steps(longer, steps=1000), random_steps(longer, steps=50)
+    np.testing.assert_array_equal(observation[[0, -1]], every[0][[0, -1]])
+    np.testing.assert_array_equal(action[[0, -1]], every[1][[0, -1]])
+
+
 def test_an_agent_that_never_acts_cannot_be_judged():
     late = {"name": "toy", "environment": "pettingzoo/parallel_toys:Toy", "observation_size": 2, "action_size": 3}
     team = toy_spec(**late, arguments={"joins": {"a_1": 9}}, agents=("a_1",), team="late")
-    with pytest.raises(LareError, match=r"^no agent of toy acted in 200 steps of random actions$"):
+    with pytest.raises(LareError, match=r"^no agent of toy acted in 5120 steps of random actions$"):
         random_steps(team, steps=10)

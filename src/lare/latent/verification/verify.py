@@ -21,8 +21,8 @@ from lare.tasks.table import make_host_env
 
 STEPS = 256
 """Random steps that a function is tried on."""
-PATIENCE = 20
-"""Environment steps, at most, for each of them: agents that have left have none."""
+LONGEST_PLAY = 20 * STEPS
+"""Environment steps, at most, until that many are found and an episode has ended: agents that have left have none."""
 
 
 Steps = tuple[Float[np.ndarray, "steps observation"], Float[np.ndarray, "steps action"]]
@@ -117,32 +117,38 @@ def tried_on(task: TaskSpec, steps: Steps | None) -> Steps:
     return found[0], found[1]
 
 
-def random_steps(
-    task: TaskSpec, steps: int = STEPS, seed: int = 0
-) -> tuple[Float[np.ndarray, "steps observation"], Float[np.ndarray, "steps action"]]:
-    """Steps of the task under uniformly random actions (the paper's pre-collected random state-action pairs)."""
+def random_steps(task: TaskSpec, steps: int = STEPS, seed: int = 0) -> Steps:
+    """Steps of whole episodes under uniformly random actions (the paper's pre-collected random state-action pairs).
+
+    Observations are those that the task says are judged, that before or that after a step; with `both`, of either kind. Where
+    more steps were played than are asked for, they are taken at equal distances, from the first to the last.
+    """
     return known_steps(task.model_dump_json(), steps, seed)
 
 
 @functools.lru_cache(maxsize=8)
-def known_steps(
-    task: str, steps: int, seed: int
-) -> tuple[Float[np.ndarray, "steps observation"], Float[np.ndarray, "steps action"]]:
+def known_steps(task: str, steps: int, seed: int) -> Steps:
     """The same by the task as JSON. Read-only: they are given to everybody who asks."""
     role = TaskSpec.model_validate_json(task)
     with contextlib.closing(make_host_env(role)) as env:
         team, random = team_of(role, env.spec), np.random.default_rng(seed)
-        played = (step for number in itertools.count() for step in steps_of(env, None, random, seed + number))
-        found, count = [], 0
-        for before, action, _ in itertools.islice(played, PATIENCE * steps):
-            acted = slice(None) if role.judged_from == "state" else before.alive[team.agents]
-            found.append([rows[acted] for rows in rows_of(role, team, before, action)])
-            count += len(found[-1][0])
-            if count >= steps:
+        found, count, played = [], 0, 0
+        for number in itertools.count():
+            for before, action, after in steps_of(env, None, random, seed + number):
+                acted = slice(None) if role.judged_from == "state" else before.alive[team.agents]
+                for shown in {"before": [before], "after": [after], "both": [before, after]}[role.judges]:
+                    found.append([rows[acted] for rows in rows_of(role, team, shown, action)])
+                    count += len(found[-1][0])
+                played += 1
+                if played == LONGEST_PLAY:
+                    break
+            if count >= steps or played >= LONGEST_PLAY:  # at the end of an episode: functions are tried on it too
                 break
-    observation, action = (np.concatenate(part)[:steps].astype(np.float32) for part in zip(*found, strict=True))
-    if not len(observation):
-        raise LareError(f"no agent of {role.name} acted in {PATIENCE * steps} steps of random actions")
+    every = [np.concatenate(part).astype(np.float32) for part in zip(*found, strict=True)]
+    if not count:
+        raise LareError(f"no agent of {role.name} acted in {played} steps of random actions")
+    chosen = np.linspace(0, count - 1, min(steps, count)).astype(int)
+    observation, action = every[0][chosen], every[1][chosen]
     for array in (observation, action):
         array.setflags(write=False)
     return observation, action

@@ -1,0 +1,112 @@
+"""The policy of a finished (or stopped) run, for a program of one's own."""
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from lare.errors import LareError
+from lare.run.directory import Run, open_run
+from lare.tasks.env import in_units
+from lare.tasks.gymnasium import GymnasiumEnv
+from lare.tasks.spaces import OneHot
+from lare.tasks.table import env_spec
+from lare.training.compiled import compiled, new_memory
+from lare.training.session import load_actor
+
+
+class Policy:
+    """A deterministic policy: from one observation to one action of the environment, or from a batch of them to a batch.
+
+    Where it remembers its episode (`qmix`, `vdn`), observations come one at a time, in order, and `reset` begins a new episode.
+    """
+
+    def __init__(self, run: Run, place: int, best: bool):
+        self.env = env_spec(run.config.task)
+        if self.env.agents > 1:
+            raise LareError(f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy")
+        self.config, actors, _ = load_actor(run, best)
+        self.actor = jax.tree.map(lambda leaf: leaf[place : place + 1], actors)
+        self.act = compiled(self.config).act
+        self.choices = choices(run) if self.env.discrete else None
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new episode."""
+        self.memory = new_memory(self.config, 1, 1)
+
+    def __call__(self, observation: Any) -> Any:
+        """The action for an observation (n,), or the actions for a batch (batch, n).
+
+        Raises:
+            LareError: observations are of another size, or a policy that remembers its episode is given a batch.
+        """
+        rows, single = self.rows(observation)
+        found = self.in_units(rows)
+        if self.choices is not None:
+            numbers = [self.choices.number(row) for row in found]
+            return numbers[0] if single else np.array(numbers)
+        return found[0] if single else found
+
+    def row(self, observation: Any) -> Float[np.ndarray, " action"]:
+        """The action for one observation in the environment's units; of a choice, a row with a single 1."""
+        return self.in_units(self.rows(observation)[0])[0]
+
+    def in_units(self, rows: Float[np.ndarray, "batch observation"]) -> Float[np.ndarray, "batch action"]:
+        """The actions in the environment's units; of a choice, a row with a single 1."""
+        count, remembers = len(rows), bool(jax.tree.leaves(self.memory))
+        if remembers and count > 1:
+            raise LareError(
+                f"the policy of {self.config.algorithm.name} remembers its episode: give it one observation at a time"
+            )
+        memory = self.memory if remembers else new_memory(self.config, 1, count)
+        available, new = np.ones((1, count, 1, self.env.action_size), bool), np.zeros((1, count), bool)
+        action, self.memory = self.act(self.actor, memory, rows[None, :, None], available, None, new)
+        return in_units(np.asarray(action)[0, :, 0], self.env)
+
+    def rows(self, given: Any) -> tuple[Float[np.ndarray, "batch observation"], bool]:
+        """Observations as rows, and whether it was a single one."""
+        size = self.env.observation_size
+        try:
+            rows = np.asarray(given, np.float32)
+        except (TypeError, ValueError):
+            raise LareError(
+                f"an observation is {size} numbers: no array can be made of {type(given).__name__}"
+            ) from None
+        if rows.ndim not in (1, 2) or rows.shape[-1] != size or not rows.size:
+            raise LareError(
+                f"an observation is {size} numbers, and a batch has rows of them: the shape is {rows.shape}"
+            )
+        return np.atleast_2d(rows), rows.ndim == 1
+
+
+def policy_of(run: Run | str | Path, seed: int | None = None, best: bool = False) -> Policy:
+    """The deterministic policy of a seed, from one observation to one action of the environment, or from a batch to a batch.
+
+    Observations that are not one row of numbers are to be flattened first (`gymnasium.spaces.flatten`).
+
+    Args:
+        run: the run, or its directory.
+        seed: one of the run's; the first, unless given.
+        best: the policy of the seed's best evaluation, instead of the last one.
+
+    Raises:
+        LareError: it is a run of many agents, or has no such seed, or no checkpoint.
+    """
+    run = opened(run)
+    return Policy(run, run.place_of(seed), best)
+
+
+def opened(run: Run | str | Path) -> Run:
+    """A run, by itself or by its directory."""
+    return run if isinstance(run, Run) else open_run(run)
+
+
+def choices(run: Run) -> OneHot:
+    """The actions of a run's environment, which are a choice."""
+    with closing(GymnasiumEnv(run.config.task)) as env:
+        assert isinstance(env.environment.action_space, OneHot)
+        return env.environment.action_space
