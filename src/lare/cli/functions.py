@@ -110,7 +110,7 @@ def verify(
         policy: a run whose policy plays the episodes for --fit, instead of random actions.
     """
     from lare.cli.design import policy_that_plays
-    from lare.latent.function import LatentFunction, read_source
+    from lare.latent.function import of_verdict, read_source
     from lare.latent.verification.verify import verify as verify_source
     from lare.tasks.spec import load_task, read_task, the_role
 
@@ -136,7 +136,7 @@ def verify(
         sys.exit(1)
     if fit:
         role = the_role(spec)
-        function = LatentFunction(role.name, kind, source, verdict.size, verdict.checks)
+        function = of_verdict(source, role, kind, verdict)
         say_what_returns_say(function, role, episodes_for(role, data, fit, plays))
 
 

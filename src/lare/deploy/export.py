@@ -21,9 +21,9 @@ from lare.deploy.policy import policy
 from lare.deploy.reward import reward, unexported
 from lare.deploy.rows import Untranslatable
 from lare.errors import LareError
-from lare.experiments.policy import choices, opened
+from lare.experiments.policy import choices
 from lare.files import write_atomically
-from lare.run.directory import Run, function_file
+from lare.run.directory import Run, as_run, function_file
 from lare.source import source
 from lare.training.seeds import of_seed
 from lare.training.session import load_actor, load_learner
@@ -59,7 +59,7 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
     Raises:
         LareError: there is no such seed, no checkpoint, or the directory exists or cannot be written.
     """
-    out, run = Path(out), opened(run)
+    out, run = Path(out), as_run(run)
     place = run.place_of(seed)
     config, learner, _, _ = load_learner(run)
     _, actors, since = load_actor(run, best)

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
-from lare.experiments.policy import opened
-from lare.run.directory import Run
+from lare.run.directory import Run, as_run
 from lare.tasks.env import HostEnv
 from lare.tasks.spec import check_against_environment
 from lare.tasks.table import make_env, make_host_env
@@ -40,7 +39,7 @@ def evaluate_run(
     Raises:
         LareError: there is nothing to evaluate, or the task's environment has changed.
     """
-    run = opened(run)
+    run = as_run(run)
     returns = evaluation_of(run, episodes, best).returns
     return {role.name: returns[..., place] for place, role in enumerate(run.config.task.roles)}
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
-from lare.run.directory import Run, open_run
+from lare.run.directory import Run, as_run
 from lare.tasks.env import in_units
 from lare.tasks.gymnasium import GymnasiumEnv
 from lare.tasks.spaces import OneHot
@@ -96,13 +96,8 @@ def policy_of(run: Run | str | Path, seed: int | None = None, best: bool = False
     Raises:
         LareError: it is a run of many agents, or has no such seed, or no checkpoint.
     """
-    run = opened(run)
+    run = as_run(run)
     return Policy(run, run.place_of(seed), best)
-
-
-def opened(run: Run | str | Path) -> Run:
-    """A run, by itself or by its directory."""
-    return run if isinstance(run, Run) else open_run(run)
 
 
 def choices(run: Run) -> OneHot:

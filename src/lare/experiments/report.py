@@ -30,19 +30,20 @@ TOP = "True rewards, for a million steps of the best public TD3,"
 """What the upper ends of `REFERENCES` are."""
 
 
-def write_report(runs: Sequence[str | Path], out: str | Path | None = None) -> Path:
+def write_report(runs: Run | str | Path | Sequence[Run | str | Path], out: str | Path | None = None) -> Path:
     """Draw the report of one or more runs; returns where it was written.
 
     Args:
-        runs: run directories, finished or not.
+        runs: one run or several, or their directories; finished or not.
         out: the file; report.html in the first run's directory unless given.
 
     Raises:
         LareError: one of them is no run, or has nothing to show yet, or the file cannot be written.
     """
-    if not runs:
+    every = [runs] if isinstance(runs, (Run, str, Path)) else list(runs)
+    if not every:
         raise LareError("say which runs to report on")
-    opened = [read_run(Path(directory)) for directory in runs]
+    opened = [one if isinstance(one, Run) else read_run(Path(one)) for one in every]
     for run in opened:
         if not run.metrics():
             raise LareError(f"{run.directory} has no evaluation yet: there is nothing to report")

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lare.errors import LareError
+from lare.errors import LareError, shortened
 from lare.latent.candidates import CANDIDATES, MOST_CANDIDATES
-from lare.latent.function import LatentFunction, normal
+from lare.latent.function import LatentFunction, normal, of_verdict
 from lare.latent.sandbox.jailed import JailedProgram, WorkerFailed
 from lare.latent.verification.checks import Check, Failed, factors_of
 from lare.latent.verification.verify import Steps, Verdict, tried_on, verify
@@ -19,7 +19,7 @@ from lare.llm.model import Model, recorded_model
 from lare.llm.prompts import Kind, Message, Stage
 from lare.llm.recording import Recorder
 from lare.llm.reply import MalformedReply, parse
-from lare.tasks.spec import TaskSpec, the_role
+from lare.tasks.spec import TaskSpec, as_task, the_role
 
 ATTEMPTS = 5
 """How often a function is verified, the first time included, before the loop gives up."""
@@ -144,8 +144,9 @@ class Conversation:
     def made(self, attempt: Attempt) -> LatentFunction:
         """The artifact of an attempt."""
         verdict = attempt.verdict
-        made = LatentFunction(self.task.name, self.kind, attempt.source, verdict.size, verdict.checks, self.model.name)
-        return self.with_exchanges(made)
+        return self.with_exchanges(
+            replace(of_verdict(attempt.source, self.task, self.kind, verdict), model=self.model.name)
+        )
 
     def with_exchanges(self, function: LatentFunction) -> LatentFunction:
         """A function with all that was said up to now."""
@@ -176,7 +177,7 @@ def run_once(source: str, task: TaskSpec, kind: Kind, steps: Steps | None = None
 
 
 def design(
-    task: TaskSpec,
+    task: TaskSpec | str | Path,
     kind: Kind = "factors",
     model: Model | None = None,
     draw: int = 0,
@@ -194,6 +195,8 @@ def design(
         xi           <- M(task, role, xi_1..n, err)         Eq. 4: correct, while there are errors
 
     Args:
+        task: a name, a path, or a spec.
+        kind: several factors, or one reward.
         model: whom to ask; without one, the shipped recordings.
         draw: which of the shipped recordings answers (0 to 4). Nothing to do with a training seed.
         candidates: n; with 1 (the paper's ablation without self-prompting), the single candidate is the function and
@@ -208,7 +211,9 @@ def design(
         DesignFailed: no attempt passed. `DesignBroken` where the model could not be asked any more, `DesignStopped` after Ctrl-C.
         LareError: the model cannot answer, the environment does not run, or each team of the task has a function of its own.
     """
-    the_role(task)
+    task = the_role(as_task(task))
+    if model is not None and not isinstance(model, Model):
+        raise LareError(f"a model has a name and a method reply(messages, sample): {shortened(model)} has not")
     if not 1 <= candidates <= MOST_CANDIDATES:
         raise LareError(f"candidates = {candidates}: from 1 to {MOST_CANDIDATES}")
     model = model or recorded_model(task.name, kind, draw)

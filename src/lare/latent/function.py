@@ -20,11 +20,11 @@ from lare.foreign import read_json, read_text
 from lare.latent.language.names import factor_meanings, names_of
 from lare.latent.sandbox.jailed import ROWS, SIZES, JailedProgram, WorkerFailed
 from lare.latent.verification.checks import Check, Failed, factors_of, same
-from lare.latent.verification.verify import Steps, verify
+from lare.latent.verification.verify import Steps, Verdict, verify
 from lare.llm.key import without_key
 from lare.llm.prompts import Kind
 from lare.llm.recording import Exchange
-from lare.tasks.spec import Judges, TaskSpec
+from lare.tasks.spec import Judges, TaskSpec, as_task, the_role
 
 WITNESSES = 3
 """Rows that a sentinel computes again."""
@@ -149,6 +149,8 @@ class LatentFunction:
     model: str = "none: written by hand"
     exchanges: tuple[dict[str, Any], ...] = ()
     """Every request and its replies: `stage`, `messages`, `replies`."""
+    sizes: tuple[int, int] | None = None
+    """Numbers of an observation and of an action, as it was verified."""
 
     @property
     def digest(self) -> str:
@@ -192,15 +194,42 @@ class LatentFunction:
             self.evaluators[sizes] = Evaluator(self.source, self.names, *sizes)
         return self.evaluators[sizes]
 
-    def __call__(
-        self, observation: Float[np.ndarray, "batch observation"], action: Float[np.ndarray, "batch action"]
-    ) -> Float[np.ndarray, "batch factors"]:
-        """The factors of a batch of steps. They are computed in a process of their own, never in this one.
+    def __call__(self, observation: Any, action: Any) -> Float[np.ndarray, "*batch factors"]:
+        """The factors of a batch of steps, or of a single one. They are computed in a process of their own, never in this one.
+
+        Args:
+            observation: (batch, observation size), or a single row (observation size,).
+            action: (batch, action size), or (action size,).
 
         Raises:
+            LareError: the arrays are not of the task's sizes, or not as many observations as actions.
             LatentRewardError: the function failed, or gave the wrong shape or a number that is not finite.
         """
-        return self.evaluator(observation.shape[1], action.shape[1])(observation, action)
+        rows, single = self.rows(observation, action)
+        factors = self.evaluator(rows[0].shape[1], rows[1].shape[1])(*rows)
+        return factors[0] if single else factors
+
+    def rows(self, observation: Any, action: Any) -> tuple[tuple[np.ndarray, np.ndarray], bool]:
+        """Both as rows of numbers, and whether there was a single row of each."""
+        found = []
+        for name, given, size in zip(
+            ("observation", "action"), (observation, action), self.sizes or (None, None), strict=True
+        ):
+            try:
+                array = np.asarray(given, np.float32)
+            except (TypeError, ValueError):
+                raise LareError(f"{name}s are arrays of numbers: no array can be made of {shortened(given)}") from None
+            if array.ndim not in (1, 2) or size not in (None, array.shape[-1]):
+                wanted = name if size is None else f"{size}"
+                raise LareError(
+                    f"{name}s are of shape (batch, {wanted}), or ({wanted},) of a single step: the shape is {array.shape}"
+                )
+            found.append(array)
+        single = {array.ndim for array in found} == {1}
+        shown, taken = (np.atleast_2d(array) for array in found)
+        if len(shown) != len(taken):
+            raise LareError(f"there are {len(shown)} observations and {len(taken)} actions: each step has one of both")
+        return (shown, taken), single
 
     def of_steps(
         self,
@@ -282,11 +311,20 @@ def verified(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps |
     verdict = verify(source, task, kind, steps)
     if not verdict.passed:
         raise LareError(f"the function does not fit task {task.name!r}: {verdict.errors}")
-    return LatentFunction(task.name, kind, source, verdict.size, verdict.checks)
+    return of_verdict(source, task, kind, verdict)
+
+
+def of_verdict(source: str, task: TaskSpec, kind: Kind, verdict: Verdict) -> LatentFunction:
+    """A function that has passed, or of which nothing but that it runs is asked."""
+    role = the_role(task)
+    sizes = role.observation_size, role.action_size
+    return LatentFunction(role.name, kind, source, verdict.size, verdict.checks, sizes=sizes)
 
 
 def source_file(path: str | Path) -> Path:
     """The Python file of a function that was saved. Raises `LareError` where there is none."""
+    if not isinstance(path, (str, Path)):
+        raise LareError(f"a latent function is read from the path of its file; it is {shortened(path)}")
     path = Path(path)
     source_path = path.with_suffix(".py") if path.suffix == ".json" else path
     if not source_path.is_file():
@@ -331,19 +369,19 @@ def per_role(given: Sequence[Given], task: TaskSpec) -> list[tuple[Given, TaskSp
     return list(zip(given, task.roles, strict=True))
 
 
-def load(path: str | Path, task: TaskSpec, steps: Steps | None = None) -> LatentFunction:
+def load(path: str | Path, task: TaskSpec | str | Path, steps: Steps | None = None) -> LatentFunction:
     """Read a function that `save` or a person wrote, and verify it again, whoever wrote it.
 
     Args:
         path: of the function, .py or .json.
-        task: that it is for.
+        task: that it is for: a name, a path, or a spec.
         steps: observations and actions that it is tried on, where there is no environment: (n, observation size) and
             (n, action size).
 
     Raises:
         LareError: it cannot be read, or does not pass for this task.
     """
-    source_path = source_file(path)
+    source_path, task = source_file(path), as_task(task)
     header, source = split_header(read_text(source_path))
     written_for = said_of("task", header)
     if written_for not in (None, task.name):

@@ -19,7 +19,7 @@ from lare.latent.function import LatentFunction
 from lare.logs.episode import Logged, Paid
 from lare.logs.source import Source, open_logs
 from lare.plugs.assigner import CreditAssigner
-from lare.tasks.spec import TaskSpec
+from lare.tasks.spec import TaskSpec, as_task
 
 PIECE = 8192
 """Steps that are paid for at a time: `phi` answers for many as fast as for few."""
@@ -118,7 +118,7 @@ def relabel(
     *,
     method: str | None = None,
     phi: LatentFunction | None = None,
-    task: TaskSpec | None = None,
+    task: TaskSpec | str | Path | None = None,
     hold_out: float = 0.1,
     settings: CreditSettings | None = None,
     updates: int = UPDATES,
@@ -135,7 +135,7 @@ def relabel(
         out: a path or, for a data set of Minari's, an id. It is written whole or not at all.
         method: how credit is assigned; unless given, `lare-bayes` with a `phi`, and `bayes` without.
         phi: a function that judges the steps; it needs its `task`.
-        task: what `phi` was designed for, the time limit, and of how many choices actions are.
+        task: a name, a path, or a spec: what `phi` was designed for, the time limit, and of how many choices actions are.
         hold_out: share of the whole episodes that nothing is fitted to, so that they can tell how good the rewards are.
         settings: of the decoder.
         updates: of a decoder that descends a gradient.
@@ -152,6 +152,7 @@ def relabel(
         raise LareError(f"hold_out = {hold_out}: a share from 0 to 0.9")
     if not 0 < memory < math.inf or updates < 1:
         raise LareError(f"memory = {memory} and updates = {updates} must be more than 0")
+    task = None if task is None else as_task(task, playable=False)
     logs = open_logs(source, task)
     logs.check_out(out, overwrite)
     name = method or ("bayes" if phi is None else "lare-bayes")

@@ -1,6 +1,7 @@
 """Steps and episodes of a log that a function is tried on, where there is no environment."""
 
 import itertools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,18 +9,19 @@ import numpy as np
 from lare.latent.verification.verify import STEPS, Steps
 from lare.logs.source import open_logs
 from lare.tasks.play import Episode
-from lare.tasks.spec import TaskSpec
+from lare.tasks.spec import TaskSpec, as_task
 
 EPISODES = 64
 """The first ones, from which steps are taken."""
 
 
-def logged_steps(source: Any, task: TaskSpec, count: int = STEPS) -> Steps:
+def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = STEPS) -> Steps:
     """Steps from all over the first episodes of a log: for `steps=` of `design`, `load_function` and `verified`.
 
     Args:
         source: as of `relabel`.
-        task: says which observation is judged, that before or that after a step; with `both`, the one after.
+        task: a name, a path, or a spec. It says which observation is judged, that before or that after a step; with `both`, the
+            one after.
         count: of steps, about. Fewer where the log has fewer.
 
     Returns:
@@ -28,7 +30,7 @@ def logged_steps(source: Any, task: TaskSpec, count: int = STEPS) -> Steps:
     Raises:
         LareError: the log cannot be read.
     """
-    parts = []
+    task, parts = as_task(task, playable=False), []
     for episode in itertools.islice(open_logs(source, task).episodes(), EPISODES):
         observation = episode.before if task.judges == "before" else episode.after
         places = np.unique(np.linspace(0, len(episode) - 1, min(count, len(episode))).astype(int))

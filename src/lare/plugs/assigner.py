@@ -27,7 +27,7 @@ from lare.plugs.learner import CHUNK, PIECE, WAITING, Learner
 from lare.plugs.payment import payment
 from lare.plugs.store import Store
 from lare.run.usual import MANY_AGENTS
-from lare.tasks.spec import Judges, TaskSpec
+from lare.tasks.spec import Judges, TaskSpec, as_task
 
 SAMPLE = 256
 """Steps, about, that `phi` is tried on when it is read again."""
@@ -41,7 +41,7 @@ class CreditAssigner:
         method: str = "lare-bayes",
         phi: LatentFunction | None = None,
         *,
-        task: TaskSpec | None = None,
+        task: TaskSpec | str | Path | None = None,
         observation_space: Space | None = None,
         action_space: Space | None = None,
         judges: Judges | None = None,
@@ -59,7 +59,7 @@ class CreditAssigner:
         Args:
             method: a row of the table. `dense` and `episodic` assign no credit.
             phi: for the methods that need one, whose names begin with `lare-`, and for `llm-reward`.
-            task: where `phi` was designed for one. Gives the spaces and `judges`, unless they are given.
+            task: where `phi` was designed for one: a name, a path, or a spec. Gives the spaces and `judges`, unless they are given.
             observation_space: of a single environment and a single agent, or how many numbers an observation has.
             action_space: the same of actions. Actions are those that the environment takes, in its units.
             judges: which observation the factors judge a step by.
@@ -76,6 +76,7 @@ class CreditAssigner:
         Raises:
             LareError: method, function, task and spaces do not go together.
         """
+        task = None if task is None else as_task(task, playable=False)
         decoder = settings or (CreditSettings() if agents == 1 else MANY_AGENTS)
         if decoder.score == "auto" and task is not None and task.score is not None:
             decoder = decoder.model_copy(update={"score": task.score})

@@ -24,7 +24,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from lare.errors import Checked, LareError
+from lare.errors import Checked, LareError, shortened
 from lare.files import write_atomically
 from lare.foreign import read_json, read_text
 from lare.latent.function import LatentFunction, LatentRewardError, load, per_role
@@ -331,6 +331,15 @@ def open_run(directory: str | Path) -> Run:
             raise LareError(f"{place} is not the function that this run was trained with: its hash changed")
         functions.append(function)
     return Run(directory, config, tuple(functions), since)
+
+
+def as_run(given: Run | str | Path) -> Run:
+    """A run by itself, or by its directory. Raises `LareError` as `open_run`, and where it is neither."""
+    if isinstance(given, Run):
+        return given
+    if isinstance(given, (str, Path)):
+        return open_run(given)
+    raise LareError(f"a run is its directory, or what lare.train and lare.open_run give; it is {shortened(given)}")
 
 
 @contextlib.contextmanager

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from lare.errors import Checked, LareError, did_you_mean
+from lare.errors import Checked, LareError, did_you_mean, shortened
 from lare.foreign import LARGEST_SETTINGS, read_text, read_toml
 
 Judges = Literal["before", "after", "both"]
@@ -120,6 +120,23 @@ class TaskSpec(Checked):
 def shipped_tasks() -> list[str]:
     """Names of the tasks that come with the package."""
     return sorted(entry.name.removesuffix(".toml") for entry in SHIPPED.iterdir() if entry.name.endswith(".toml"))
+
+
+def as_task(given: TaskSpec | str | Path, playable: bool = True) -> TaskSpec:
+    """A task by itself, by its shipped name, or by the path of its file.
+
+    Args:
+        given: one of these.
+        playable: whether its environment must be there, and be as the task says.
+
+    Raises:
+        LareError: it is none of these; and as `load_task`.
+    """
+    if isinstance(given, TaskSpec):
+        return given
+    if isinstance(given, (str, Path)):
+        return load_task(given) if playable else read_task(given)
+    raise LareError(f"a task is a shipped name, the path of a task file, or a lare.TaskSpec; it is {shortened(given)}")
 
 
 def load_task(task: str | Path) -> TaskSpec:

@@ -19,7 +19,7 @@ from lare.errors import LareError
 from lare.latent.function import LatentFunction
 from lare.latent.improve import Evidence, Model, improve
 from lare.tasks.play import Episode, Policy, episodes_of
-from lare.tasks.spec import TaskSpec, the_role
+from lare.tasks.spec import TaskSpec, as_task, the_role
 
 EPISODES = 40
 """That are played, where none are given."""
@@ -27,7 +27,7 @@ EPISODES = 40
 
 def reflect(
     function: LatentFunction,
-    task: TaskSpec,
+    task: TaskSpec | str | Path,
     model: Model,
     rounds: int = 1,
     *,
@@ -43,7 +43,7 @@ def reflect(
 
     Args:
         function: from `lare.design`, or by hand.
-        task: that it is for.
+        task: that it is for: a name, a path, or a spec.
         model: whom to ask.
         rounds: how often.
         episodes: whole episodes; 40 are played, unless given.
@@ -54,7 +54,7 @@ def reflect(
     Raises:
         LareError: rounds are less than 1, or each team of the task has a function of its own.
     """
-    role = the_role(task)
+    role = the_role(as_task(task))
     if rounds < 1:
         raise LareError(f"rounds = {rounds}: at least one")
 

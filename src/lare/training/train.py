@@ -9,15 +9,15 @@ import numpy as np
 from lare import compilation
 from lare.credit.closed_form import LARGEST_CHOICE
 from lare.credit.methods import Fit, Method, Reward, find_method
-from lare.errors import LareError
+from lare.errors import LareError, shortened
 from lare.latent.candidates import CANDIDATES
 from lare.latent.design import design
 from lare.latent.function import LatentFunction, check_task, load, per_role
 from lare.latent.improve import Model
 from lare.run.decide import decide
-from lare.run.directory import Run, create, default_directory, isolation, locked, open_run
+from lare.run.directory import Run, as_run, create, default_directory, isolation, locked
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain
-from lare.tasks.spec import TaskSpec, load_task
+from lare.tasks.spec import TaskSpec, as_task
 from lare.training import session as sessions
 from lare.training.collect_host import Diverged
 from lare.training.explain import described
@@ -67,8 +67,9 @@ def train(
     """
     if tensorboard:
         summary_writer()  # before anything is made
-    task = task if isinstance(task, TaskSpec) else load_task(task)
-    given = settings or Settings()
+    task = as_task(task)
+    given = checked_settings(settings)
+    told = told_by(listeners)
     resolved = decide(given, task)
     check_model(resolved, model)
     functions = chosen_functions(task, resolved, function)
@@ -76,7 +77,7 @@ def train(
     in_vain = list(set_in_vain(given, resolved, task).values())
     said = in_vain[:1] if len(in_vain) < 2 else [f"{in_vain[0]} (and {len(in_vain) - 1} more)"]
     with locked(run), enough_memory(run):
-        return begin(run, model, tensorboard, told_by(listeners), *said)
+        return begin(run, model, tensorboard, told, *said)
 
 
 def chosen_functions(
@@ -93,6 +94,11 @@ def chosen_functions(
         functions = [asked(role) for role in task.roles]
     else:
         check_given(settings)
+        if not isinstance(given, Given | Sequence):
+            raise LareError(
+                "a latent function is the path of its file, or what lare.design and lare.load_function give; it is "
+                f"{shortened(given)}: write its source to a file, which is verified"
+            )
         each = per_role([given] if isinstance(given, Given) else given, task)
         functions = [one if isinstance(one, LatentFunction) else load(one, role) for one, role in each]
         for function, role in zip(functions, task.roles, strict=True):
@@ -128,7 +134,7 @@ def check_size(method: Method, factors: int) -> None:
 
 
 def resume(
-    directory: str | Path,
+    directory: Run | str | Path,
     *,
     steps: int | None = None,
     model: Model | None = None,
@@ -140,7 +146,7 @@ def resume(
     On the CPU the metrics are then, bit for bit, those of a run that never stopped (but for the times).
 
     Args:
-        directory: of the run.
+        directory: of the run, or the run.
         steps: environment steps of each seed that the run is to have made at its end, where that is more than was asked for at
             first. What falls over the whole run (`ppo.anneal`) falls over the longer one from now on.
         model: whom `reflect_every` asks.
@@ -150,7 +156,7 @@ def resume(
     Raises:
         LareError: it is not a run, or its checkpoint is not there any more, or `steps` are fewer; and as `train`.
     """
-    run = open_run(directory)
+    run, told = as_run(directory), told_by(listeners)
     tensorboard = tensorboard or (run.directory / EVENTS).is_dir()
     if tensorboard:
         summary_writer()
@@ -160,8 +166,7 @@ def resume(
         if not run.has_checkpoint():
             if run.metrics():  # what has been measured is never taken back
                 raise LareError(f"{run.directory} has no checkpoint any more: there is nothing to go on from")
-            return begin(run, model, tensorboard, told_by(listeners))
-        told = told_by(listeners)
+            return begin(run, model, tensorboard, told)
         prepare(run, told)
         restored, messages = sessions.restore(run)
         run.truncate(restored.metrics_length)
@@ -169,8 +174,24 @@ def resume(
 
 
 def told_by(listeners: Sequence[Listener] | None) -> list[Listener]:
-    """The listeners that were given, or the terminal."""
-    return [Terminal()] if listeners is None else list(listeners)
+    """The listeners that were given, or the terminal. Raises `LareError` where one cannot listen."""
+    told: list[Listener] = [Terminal()] if listeners is None else list(listeners)
+    for one in told:
+        if not isinstance(one, Listener):
+            raise LareError(
+                f"a listener has the methods started, stepped, evaluated, said and stopped (lare.training.progress.Listener): "
+                f"{shortened(one)} has not"
+            )
+    return told
+
+
+def checked_settings(given: Settings | None) -> Settings:
+    """The settings, or the usual ones. Raises `LareError` where they are something else."""
+    if given is None or isinstance(given, Settings):
+        return given or Settings()
+    raise LareError(
+        f"settings are a lare.Settings, as lare.Settings(method='rrdu', steps=100_000); they are {shortened(given)}"
+    )
 
 
 def prepare(run: Run, told: Sequence[Listener]) -> None:
