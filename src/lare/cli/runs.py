@@ -31,6 +31,7 @@ def train(
     tensorboard: bool = False,
     wandb: Annotated[str | None, tyro.conf.arg(metavar="PROJECT")] = None,
     mlflow: Annotated[str | None, tyro.conf.arg(metavar="EXPERIMENT")] = None,
+    watch: bool = False,
 ) -> None:
     """Train on a task's episodic rewards. Ctrl-C saves and leaves; --resume goes on.
 
@@ -47,11 +48,12 @@ def train(
         tensorboard: write TensorBoard events into the run directory too (needs the extra lare-rl[tensorboard]).
         wandb: send the metrics of each seed to a project of Weights & Biases too (needs the extra lare-rl[wandb]).
         mlflow: send the metrics of each seed to an experiment of MLflow too (needs the extra lare-rl[mlflow]).
+        watch: write verdict and curves to watch.html in the run directory after every evaluation, and open it in the browser.
     """
     import lare
     from lare.latent.function import CHANGED, load, per_role
     from lare.run.decide import decide
-    from lare.run.directory import open_run
+    from lare.run.directory import default_directory, open_run
     from lare.training.train import check_given
 
     if resume is not None:
@@ -61,7 +63,7 @@ def train(
             )
         config = open_run(resume).config
         asked = model_of(model, base_url, config.task.name)
-        listeners = listeners_of(wandb, mlflow, config.settings)
+        listeners = listeners_of(wandb, mlflow, config.settings, resume if watch else None)
         run = lare.resume(resume, steps=settings.steps, model=asked, tensorboard=tensorboard, listeners=listeners)
     elif task is None:
         raise LareError("say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR")
@@ -79,6 +81,7 @@ def train(
                     f"the function by {one.model.removesuffix(CHANGED)} is not the one that was saved: its hash is another"
                 )
         asked = model_of(model, base_url, spec.name)
+        out = out or default_directory(spec, resolved)
         run = lare.train(
             spec,
             settings,
@@ -86,13 +89,15 @@ def train(
             model=asked,
             out=out,
             tensorboard=tensorboard,
-            listeners=listeners_of(wandb, mlflow, resolved),
+            listeners=listeners_of(wandb, mlflow, resolved, out if watch else None),
         )
     say(f"finished {run.directory}; to see it: lare report {run.directory}")
 
 
-def listeners_of(wandb: str | None, mlflow: str | None, settings: ResolvedSettings) -> "list[Listener]":
-    """The terminal, and the tracking services that are asked for."""
+def listeners_of(
+    wandb: str | None, mlflow: str | None, settings: ResolvedSettings, watched: Path | None
+) -> "list[Listener]":
+    """The terminal, and the tracking services and the page that are asked for."""
     from lare.training.progress import Terminal
     from lare.training.trackers import MLflow, WeightsAndBiases
 
@@ -102,6 +107,11 @@ def listeners_of(wandb: str | None, mlflow: str | None, settings: ResolvedSettin
         told.append(WeightsAndBiases(project=wandb, config=kept))
     if mlflow is not None:
         told.append(MLflow(mlflow, parameters=kept))
+    if watched is not None:
+        from lare.experiments.live import PAGE, LivePage
+
+        told.append(LivePage(watched))
+        progress(f"to watch it: {watched / PAGE}")
     return told
 
 
@@ -141,8 +151,7 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
     if video is not None:
         check_video(video)
         if env_spec(opened.config.task).agents == 1:
-            if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
-                os.environ.setdefault("MUJOCO_GL", "egl")  # which needs no screen
+            draw_without_a_screen()
             progress("filming an episode; without a graphics card that may take minutes")
         record_video(opened, video, best)
         say(f"wrote {video}")
@@ -162,16 +171,25 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
         say(line)
 
 
-def report(runs: RunDirectories, out: Path | None = None) -> None:
+def draw_without_a_screen() -> None:
+    """Let MuJoCo draw where there is no screen."""
+    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+
+
+def report(runs: RunDirectories, out: Path | None = None, film: bool = False) -> None:
     """Draw a report of one or more runs: one HTML file that needs nothing else.
 
     Args:
         runs: run directories; their learning curves are laid over each other, named by method.
         out: the file to write; report.html in the (first) run's directory unless given.
+        film: film an episode of each run too, and show it in the page. Without a graphics card that may take minutes.
     """
     from lare.experiments.report import write_report
 
-    say(f"wrote {write_report(list(runs), out)}")
+    if film:
+        draw_without_a_screen()
+    say(f"wrote {write_report(list(runs), out, film)}")
 
 
 def export(

@@ -42,7 +42,7 @@ Curve = tuple[Float[np.ndarray, " evaluations"], Float[np.ndarray, "seeds evalua
 def svg(figure: Figure) -> str:
     text = io.StringIO()
     with matplotlib.rc_context(STYLE):
-        figure.savefig(text, format="svg", bbox_inches="tight", metadata={"Date": None})
+        figure.savefig(text, format="svg", bbox_inches="tight", metadata={"Date": None}, transparent=True)
     drawn = text.getvalue()
     return drawn[drawn.index("<svg") :]
 
@@ -58,28 +58,38 @@ def curves(
     by_name: Mapping[str, Curve],
     label: str,
     *,
-    from_zero: bool = False,
+    bottom: float | None = None,
+    lowest: float | None = None,
     marks: Mapping[str, float] | None = None,
     random_until: int = 0,
+    spreads: Mapping[str, Curve] | None = None,
 ) -> str:
     """Means over seeds as lines, the standard deviation over seeds as a band.
 
-    `marks` are values to measure by, each a dotted line with its name; the steps that random actions took are shaded.
+    Args:
+        by_name: the curves.
+        label: of the axis upwards.
+        bottom: where that axis begins.
+        lowest: where it begins at the least.
+        marks: values to measure by, each a dotted line with its name.
+        random_until: the steps that random actions took are shaded.
+        spreads: of single seeds, half the width of the band.
     """
-    figure, (axes,) = new_figure()
+    figure, (axes,) = new_figure(height=3.0)
     for (line, colour), (name, (steps, values)) in zip(cycle(LINES), by_name.items(), strict=False):
         mean = values.mean(axis=0)
         axes.plot(steps, mean, color=colour, linestyle=line, label=name)
-        if len(values) > 1:
-            spread = values.std(axis=0, ddof=1)
+        known = (spreads or {}).get(name)
+        if len(values) > 1 or known is not None:
+            spread = values.std(axis=0, ddof=1) if len(values) > 1 or known is None else known[1][0]
             axes.fill_between(steps, mean - spread, mean + spread, color=colour, alpha=0.18, linewidth=0)
-    if from_zero:
-        axes.set_ylim(bottom=0)
+    if bottom is not None or (lowest is not None and axes.get_ylim()[0] < lowest):
+        axes.set_ylim(bottom=lowest if bottom is None else bottom)
     for name, value in (marks or {}).items():
         axes.axhline(value, color="#888888", linewidth=1, linestyle=":")
         axes.annotate(name, (1, value), (0, 2), axes.get_yaxis_transform(), "offset points", ha="right", fontsize=9)
     if random_until:
-        axes.axvspan(0, random_until, color="#eeeeee", linewidth=0, zorder=0)
+        axes.axvspan(0, random_until, color="#888888", alpha=0.15, linewidth=0, zorder=0)
     axes.set(xlabel="environment steps", ylabel=label)
     axes.xaxis.set_major_formatter(in_thousands)
     if len(by_name) > 1:

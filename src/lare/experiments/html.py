@@ -7,13 +7,14 @@ from importlib.resources import files
 from pathlib import Path
 
 from lare.errors import LareError
+from lare.files import replace
 
 PAGE = """<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
+{refresh}<title>{title}</title>
 <style>
 {style}</style>
 </head>
@@ -24,11 +25,17 @@ PAGE = """<!doctype html>
 """
 
 
-def write_page(path: Path, title: str, body: str) -> Path:
-    """One HTML file that needs nothing else. Raises `LareError` where it cannot be written."""
+def write_page(path: Path, title: str, body: str, refresh: int | None = None) -> Path:
+    """One HTML file that needs nothing else; a browser reads it again after `refresh` seconds.
+
+    Raises:
+        LareError: it cannot be written. What was there is as it was.
+    """
+    again = "" if refresh is None else f'<meta http-equiv="refresh" content="{refresh}">\n'
     style = (files("lare.experiments") / "report.css").read_text(encoding="utf-8")
+    page = PAGE.format(title=escape(title), style=style, body=body, refresh=again).encode()
     try:
-        path.write_text(PAGE.format(title=escape(title), style=style, body=body), encoding="utf-8")
+        replace(path, lambda file: file.write(page))
     except OSError as error:
         raise LareError(f"the report {path} cannot be written: {error.strerror}") from error
     return path

@@ -1,13 +1,18 @@
 """The report: one HTML file that needs nothing else, of one run or of several laid over each other."""
 
+import base64
 import json
+import re
+import time
 from collections.abc import Iterable, Sequence
+from contextlib import closing, suppress
 from html import escape
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from lare.credit.methods import find_method
 from lare.errors import LareError
@@ -15,27 +20,42 @@ from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
 from lare.experiments.credit import credit_of, factor_labels
 from lare.experiments.html import factor_table, function_text, note, table, write_page
-from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN, RETURN_R2
+from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN, RETURN_R2, RETURN_STD
 from lare.experiments.statistics import mean_and_deviation, plus_minus
+from lare.experiments.verdict import Facts, last_known, verdict
+from lare.experiments.video import record_video
 from lare.run.directory import Run, open_run, read_config
 from lare.run.settings import Settings
 from lare.run.usual import resolve
 from lare.source import source
+from lare.tasks.play import episode_of
 from lare.tasks.spec import TaskSpec
-from lare.tasks.table import env_spec
+from lare.tasks.table import env_spec, make_host_env
 from lare.tasks.trust import TRUSTED, is_trusted, module_of
 from lare.training.explain import explanation_of
+
+FILM, LARGEST_FILM = "film.gif", 64 << 20
+"""Of a run, in its directory; in bytes."""
+
+COMMAND = re.compile(r"`([^`]*)`")
+"""In a sentence."""
+
+RANDOM_EPISODES, PATIENCE = 10, 5.0
+"""Of random actions, at most; and seconds within which they begin."""
 
 TOP = "True rewards, for a million steps of the best public TD3,"
 """What the upper ends of `REFERENCES` are."""
 
 
-def write_report(runs: Run | str | Path | Sequence[Run | str | Path], out: str | Path | None = None) -> Path:
+def write_report(
+    runs: Run | str | Path | Sequence[Run | str | Path], out: str | Path | None = None, film: bool = False
+) -> Path:
     """Draw the report of one or more runs; returns where it was written.
 
     Args:
         runs: one run or several, or their directories; finished or not.
         out: the file; report.html in the first run's directory unless given.
+        film: film an episode of each run of a single agent, as `film.gif` in its directory; a page shows the film that is there.
 
     Raises:
         LareError: one of them is no run, or has nothing to show yet, or the file cannot be written.
@@ -51,10 +71,16 @@ def write_report(runs: Run | str | Path | Sequence[Run | str | Path], out: str |
     names = labels(opened)
     tasks = sorted({run.config.task.name for run in opened})
     title = f"{', '.join(tasks)}: {', '.join(names)}" if len(opened) < 4 else f"{', '.join(tasks)}: {len(opened)} runs"
-    parts = [f"<h1>{escape(title)}</h1>", summary(opened, names)]
+    if film:
+        for run in opened:
+            record_video(run, run.directory / FILM)
+    parts, tables = [f"<h1>{escape(title)}</h1>"], []
     for task in tasks:
         chosen = {name: run for name, run in zip(names, opened, strict=True) if run.config.task.name == task}
-        parts.extend(learning(task, chosen))
+        random = random_returns(next(iter(chosen.values())).config.task)
+        parts.extend(verdicts(chosen, random))
+        tables.extend(learning(task, chosen, random))
+    parts += [summary(opened, names), *tables]
     for name, run in zip(names, opened, strict=True):
         parts.extend(details(name, run))
     parts.append(note(f"Drawn by LaRe {source()}."))
@@ -71,6 +97,41 @@ def unknown_module(task: TaskSpec) -> str | None:
     """The module that a task's environment would import, unless this process has it, or the user names it."""
     module = module_of(task)
     return None if module is None or is_trusted(module) else module
+
+
+def random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
+    """True returns of random actions: up to ten episodes, or as many as begin within some seconds.
+
+    None where the environment is not to be imported for a report, or does not run.
+    """
+    found, until = [], time.monotonic() + PATIENCE
+    if unknown_module(task) is None:
+        with suppress(LareError), closing(make_host_env(task.roles[0])) as env:
+            while len(found) < RANDOM_EPISODES and time.monotonic() < until:
+                random = np.random.default_rng(len(found))
+                found.append(episode_of(env, task.roles[0], None, random, len(found)).total)
+    return np.array(found)
+
+
+def verdicts(runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> Iterable[str]:
+    """In words: what came of each run of a task."""
+    ends = {name: curve(run, RETURN) for name, run in runs.items()}
+    without = [name for name, run in runs.items() if run.config.settings.method == "episodic"]
+    at_the_end = {name: float(np.nanmean(found[1][:, -1])) for name, found in ends.items() if found is not None}
+    for name, run in runs.items():
+        if (found := ends[name]) is None:
+            continue
+        method, predicted = find_method(run.config.settings.method), curve(run, RETURN_R2)
+        facts = Facts(
+            *(name, *found, random),
+            at_the_end=next((at_the_end[one] for one in without if one != name), None),
+            return_r2=None if predicted is None else last_known(predicted[1]),
+            latent=method.latent,
+            directory=str(run.directory),
+            task=run.config.task.name,
+        )
+        said = COMMAND.sub(r"<code>\1</code>", escape(" ".join(verdict(facts))))
+        yield f'<p class="verdict"><strong>{escape(name)}.</strong> {said}</p>'
 
 
 def labels(runs: Sequence[Run]) -> list[str]:
@@ -123,38 +184,59 @@ def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
     return table(head, rows, range(2, 8)) + note(explained)
 
 
-def learning(task: str, runs: dict[str, Run]) -> Iterable[str]:
+def learning(task: str, runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> Iterable[str]:
     """Curves of one task, all its runs in each."""
     yield f"<h2>Learning {escape(task)}</h2>"
-    marks = {"random actions": REFERENCES[task][0]} if task in REFERENCES else {}
-    random = {run.config.settings.warmup for run in runs.values()}
-    random_until = random.pop() if len(random) == 1 else 0
+    marks = {"random actions": float(random.mean())} if len(random) else {}
+    marks |= reference(task, runs)
+    warmups = {run.config.settings.warmup for run in runs.values()}
+    random_until = warmups.pop() if len(warmups) == 1 else 0
+    yield '<div class="figures">'
     for key, title, unit in curves_of(next(iter(runs.values())).config.task):
         found = {name: points for name, run in runs.items() if (points := curve(run, key)) is not None}
         if found:
-            yield f"<h3>{escape(title[0].upper() + title[1:])}</h3>"
+            spreads = {name: points for name, run in runs.items() if (points := curve(run, RETURN_STD)) is not None}
+            yield f"<figure><figcaption>{escape(title[0].upper() + title[1:])}</figcaption>"
             yield figures.curves(
                 found,
                 unit,
-                from_zero=key.startswith(ERROR),
+                bottom=0.0 if key.startswith(ERROR) else None,
+                lowest=-1.0 if key.startswith(RETURN_R2) else None,
                 marks=marks if key == RETURN else None,
                 random_until=random_until,
+                spreads=spreads if key == RETURN else None,
             )
+            yield "</figure>"
+    yield "</div>"
     explained = [
-        "Line: mean over seeds. Band: ± one standard deviation over seeds."
+        "Line: mean over seeds. Band: ± one standard deviation over seeds"
+        + (
+            "; of a single seed, over the episodes of an evaluation."
+            if min(len(run.seeds) for run in runs.values()) == 1
+            else "."
+        )
         if max(len(run.seeds) for run in runs.values()) > 1
-        else "One seed: another one may end elsewhere.",
+        else "Band of the return: ± one standard deviation over the episodes of an evaluation.",
         *(["Grey: random actions, before the first update."] if random_until else []),
         *([f"{TOP} reach {REFERENCES[task][1]:,g}."] if task in REFERENCES else []),
     ]
     yield note(" ".join(explained))
 
 
+def reference(task: str, runs: dict[str, Run]) -> dict[str, float]:
+    """What true rewards reach, where that is known and not so far away that the curves would be flat beside it."""
+    if task not in REFERENCES:
+        return {}
+    ends = [np.nanmax(found[1]) for run in runs.values() if (found := curve(run, RETURN)) is not None]
+    low, high = REFERENCES[task]
+    return {"true rewards, a million steps": high} if max(ends, default=low) - low > (high - low) / 2 else {}
+
+
 def curves_of(task: TaskSpec) -> Iterable[tuple[str, str, str]]:
     """What is drawn over time: key of metrics.jsonl, title, unit; one of each team, where there are several."""
     teams = {f"_{role.team}": f", team of {role.team}" for role in task.teams} or {"": ""}
     for key, title, unit in (
-        (RETURN, "true return", "true return"),
+        (RETURN, "true return", "return"),
         *((f"evaluation/{name}", name, name) for name in task.measures),
         (ERROR, "mean |proxy - true reward|", "reward"),
         (CORRELATION, "correlation of proxy and true reward", "correlation"),
@@ -175,6 +257,7 @@ def details(name: str, run: Run) -> Iterable[str]:
             "and what credit and factors look like drawn."
         )
     elif run.has_checkpoint():
+        yield film_of(run)
         if said := explanation_of(run):
             yield "<h3>What the returns say</h3>"
             yield from paragraphs(said)
@@ -183,6 +266,15 @@ def details(name: str, run: Run) -> Iterable[str]:
         yield note("Its checkpoint is not there any more, and with it what credit and factors would be drawn from.")
     yield "<h3>Settings</h3>"
     yield settings_table(run)
+
+
+def film_of(run: Run) -> str:
+    """The film that `lare report --film` has made, inside the page; nothing where there is none."""
+    path = run.directory / FILM
+    if not path.is_file() or path.stat().st_size > LARGEST_FILM:
+        return ""
+    data = base64.b64encode(path.read_bytes()).decode()
+    return f'<img class="film" alt="one episode of the policy" src="data:image/gif;base64,{data}">'
 
 
 def paragraphs(lines: Iterable[str]) -> Iterable[str]:

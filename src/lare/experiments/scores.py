@@ -22,7 +22,7 @@ REFERENCES = {
 """Returns that count as 0 and as 1. 0: mean over 20 episodes of uniformly random actions. 1: TD3 on true rewards after a
 million steps, the upper end of what public benchmarks report."""
 
-RETURN = "evaluation/return"
+RETURN, RETURN_STD = "evaluation/return", "evaluation/return_std"
 """What is compared, unless something else is asked for."""
 
 SUMMED_RETURN = "evaluation/summed_return"

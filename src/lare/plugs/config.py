@@ -151,14 +151,14 @@ def check(config: CreditConfig) -> None:
         raise LareError(f"{name} assigns no credit: train on what the environment pays")
     if method.whole_episodes:
         raise LareError(f"{name} looks at whole episodes at once, not at steps that are sampled: `lare.train` has it")
+    if phi is not None and not isinstance(phi, LatentFunction):
+        raise LareError(f"phi is what lare.design and lare.load_function give; it is {shortened(phi)}")
     if method.latent and phi is None:
         raise LareError(f"{name} needs a phi; bayes, rd and rrdu need none")
     if phi is not None and not method.latent:
         raise LareError(f"{name} needs no phi: leave it out, or take lare-bayes")
     if phi is not None and phi.kind != method.kind:
         raise LareError(f"{name} needs a phi of the kind {method.kind!r}, and this one is of the kind {phi.kind!r}")
-    if phi is not None and not isinstance(phi, LatentFunction):
-        raise LareError(f"phi is what lare.design and lare.load_function give; it is {shortened(phi)}")
     if phi is not None and config.task is None:
         raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")
     if phi is not None and config.task is not None:

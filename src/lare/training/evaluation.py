@@ -23,7 +23,7 @@ class Evaluation:
     """What the task asks to be taken from the last step."""
 
     def metrics(self, spec: EnvSpec) -> dict[str, Float[np.ndarray, " seeds"]]:
-        """Means over the episodes, by the keys of metrics.jsonl; several teams have each its own."""
+        """Means over the episodes, and the deviation of returns, by the keys of metrics.jsonl; several teams have each its own."""
         found = {"evaluation/length": self.lengths.mean(axis=1)}
         found |= {f"evaluation/{name}": values.mean(axis=1) for name, values in self.measures.items()}
         for place, team in enumerate(spec.teams):
@@ -31,6 +31,7 @@ class Evaluation:
                 if suffix and len(spec.teams) == 1:
                     continue
                 found[f"evaluation/return{suffix}"] = self.returns[..., place].mean(axis=1)
+                found[f"evaluation/return_std{suffix}"] = self.returns[..., place].std(axis=1)
                 if spec.agents > 1:
                     found[f"evaluation/summed_return{suffix}"] = self.sums[..., place].mean(axis=1)
         return found

@@ -1,0 +1,63 @@
+"""A page that shows a run while it trains: the verdict and the curves, drawn anew after every evaluation."""
+
+import webbrowser
+from contextlib import suppress
+from html import escape
+from pathlib import Path
+
+from lare.errors import LareError
+from lare.experiments.html import note, write_page
+from lare.experiments.report import learning, random_returns, verdicts
+from lare.run.directory import read_measured
+from lare.training.progress import Metrics
+
+PAGE = "watch.html"
+"""In the run's directory."""
+
+REFRESH = 10
+"""Seconds after which a browser reads the page again."""
+
+
+class LivePage:
+    """Writes the page, and opens it in the browser when training begins. Tells nobody where it cannot be written."""
+
+    def __init__(self, directory: Path):
+        self.directory, self.running, self.random = directory, False, None
+
+    def started(self, name: str, step: int, steps: int) -> None:
+        self.running = True
+        self.draw()
+        webbrowser.open((self.directory / PAGE).resolve().as_uri())
+
+    def stepped(self, step: int) -> None: ...
+    def said(self, message: str) -> None: ...
+
+    def evaluated(self, metrics: Metrics) -> None:
+        self.draw()
+
+    def stopped(self) -> None:
+        if self.running:
+            self.running = False
+            self.draw()
+
+    def draw(self) -> None:
+        """Write the page as things are."""
+        with suppress(LareError):
+            run = read_measured(self.directory)
+            task, method = run.config.task, run.config.settings.method
+            if self.random is None:
+                self.random = random_returns(task)
+            title = f"{task.name}: {method}"
+            parts = [f"<h1>{escape(title)}</h1>"]
+            if metrics := run.metrics():
+                parts += [*verdicts({method: run}, self.random), *learning(task.name, {method: run}, self.random)]
+                done = metrics[-1]["step"]
+            else:
+                done = 0
+            state = f"read again every {REFRESH} seconds" if self.running else "not under way"
+            parts.append(
+                note(
+                    f"Step {done:,} of {run.config.settings.steps:,}; {state}. lare report draws credit and factors too."
+                )
+            )
+            write_page(self.directory / PAGE, title, "\n".join(parts), REFRESH if self.running else None)

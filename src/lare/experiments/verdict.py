@@ -1,0 +1,160 @@
+"""A run in words: did it learn, do the factors tell the score, and what to do next."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+NEXT_TO_NOTHING, MOSTLY = 0.1, 0.8
+"""R^2 of returns, below and above which proxy rewards say next to nothing, or nearly all, of the score."""
+
+FEW = 5
+"""Evaluations, below which nothing is said of a direction."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a verdict goes by."""
+
+    name: str
+    """Of the run, where several are shown."""
+    steps: Float[np.ndarray, " evaluations"]
+    returns: Float[np.ndarray, "seeds evaluations"]
+    """True returns, means over the episodes of an evaluation."""
+    random: Float[np.ndarray, " episodes"] = field(default_factory=lambda: np.zeros(0))
+    """True returns of random actions; none where they are not known."""
+    at_the_end: float | None = None
+    """The last return of a run that was trained on the return at the end alone, where one is shown beside it."""
+    return_r2: float | None = None
+    """How well returns were predicted before anything was fitted to them; None where nothing predicts them."""
+    latent: bool = False
+    """Whether the method has a phi."""
+    directory: str = "RUN"
+    task: str = "TASK"
+
+    @property
+    def last(self) -> float:
+        """The mean over the seeds at the end."""
+        return float(np.nanmean(self.returns[:, -1]))
+
+    @property
+    def spread(self) -> float:
+        """The deviation over the seeds at the end; 0 for one seed."""
+        return float(np.nanstd(self.returns[:, -1], ddof=1)) if len(self.returns) > 1 else 0.0
+
+
+def verdict(run: Facts) -> list[str]:
+    """A few sentences, the most important first; commands stand between backticks."""
+    if not np.isfinite(run.returns[:, -1]).any():
+        return ["Nothing can be said: the last evaluation gave no return."]
+    return [learned(run), *compared(run), *told(run), *todo(run)]
+
+
+def learned(run: Facts) -> str:
+    """Whether it is better than random actions."""
+    reached = f"The return is {shown(run.last)}" + (f" ± {shown(run.spread)}" if run.spread else "")
+    reached += f" after {int(run.steps[-1]):,} steps"
+    reached += f" (mean over {len(run.returns)} seeds)" if len(run.returns) > 1 else ""
+    if not len(run.random):
+        return f"{reached}."
+    by_chance = f"random actions get {shown(float(run.random.mean()))} ± {shown(float(run.random.std()))}"
+    if better_than_chance(run):
+        return f"It learned. {reached}; {by_chance}."
+    if run.last < run.random.mean() - 2 * run.random.std():
+        return f"It got worse than random actions. {reached}; {by_chance}."
+    return f"It has not learned yet. {reached}; {by_chance}."
+
+
+def better_than_chance(run: Facts) -> bool:
+    """Whether the return is above nearly all that random actions get, in the mean over the seeds."""
+    noise = max(float(run.random.std()), run.spread / math.sqrt(len(run.returns)), 1e-9)
+    return run.last > float(run.random.mean()) + 2 * noise
+
+
+def compared(run: Facts) -> list[str]:
+    """Beside training on the return at the end."""
+    if run.at_the_end is None:
+        return []
+    way = "more" if run.last > run.at_the_end else "no more"
+    return [f"That is {way} than training on the return at the end alone gives here ({shown(run.at_the_end)})."]
+
+
+def told(run: Facts) -> list[str]:
+    """Whether the proxy rewards tell the score."""
+    if run.return_r2 is None or not np.isfinite(run.return_r2):
+        return []
+    share, by = max(run.return_r2, 0.0), "factors and raw features" if run.latent else "raw features"
+    how = "next to nothing" if share < NEXT_TO_NOTHING else "nearly all" if share > MOSTLY else "a part"
+    return [
+        f"Its proxy rewards, from {by}, tell {how} of the score: R² of the last returns, before they were learned from, "
+        f"is {share:.2f}."
+    ]
+
+
+def todo(run: Facts) -> list[str]:
+    """What to do next."""
+    found = []
+    known = run.return_r2 is not None and np.isfinite(run.return_r2)
+    if known and (run.return_r2 or 0) < NEXT_TO_NOTHING:
+        other = f"`lare design {run.task} --reflect 2 --model NAME` asks for another phi; " if run.latent else ""
+        found.append(f"Next: the score is made of something else. {other}`--method bayes` goes without a phi.")
+    elif is_rising(run):
+        found.append(
+            f"Next: it was still rising. To go on: `lare train --resume {run.directory} --steps {2 * int(run.steps[-1])}`."
+        )
+    elif (best := fell_from(run)) is not None:
+        step, value = best
+        found.append(
+            f"Next: it was better before, {shown(value)} at step {step:,}. `lare evaluate {run.directory} --best` plays the best "
+            "policy of each seed."
+        )
+    elif len(run.random) and not better_than_chance(run):
+        good = known and (run.return_r2 or 0) > MOSTLY
+        what = "the proxy rewards are good, so it is up to the algorithm" if good else "it may need more steps"
+        found.append(f"Next: {what}: more `--steps`, or another `--algorithm` (`lare algorithms`).")
+    if len(run.returns) == 1:
+        found.append("One seed says little: another may end elsewhere (`--seeds 3`).")
+    return found
+
+
+def quarters(run: Facts) -> tuple[float, float, float] | None:
+    """The means of the last two quarters of the evaluations, and how much evaluations vary from one to the next."""
+    mean = np.nanmean(run.returns, axis=0)
+    if len(mean) < FEW:
+        return None
+    size = max(1, len(mean) // 4)
+    noise = float(np.nanmedian(np.abs(np.diff(mean[-2 * size :])))) if size > 1 else float(abs(mean[-1] - mean[-2]))
+    return float(mean[-2 * size : -size].mean()), float(mean[-size:].mean()), noise
+
+
+def is_rising(run: Facts) -> bool:
+    """Whether the last quarter is higher than the one before by more than evaluations vary."""
+    found = quarters(run)
+    return found is not None and found[1] - found[0] > found[2]
+
+
+def fell_from(run: Facts) -> tuple[int, float] | None:
+    """Step and value of the best evaluation, where the end is lower by more than evaluations vary."""
+    found = quarters(run)
+    if found is None:
+        return None
+    mean = np.nanmean(run.returns, axis=0)
+    best = int(np.nanargmax(mean))
+    start = float(run.random.mean()) if len(run.random) else float(mean[0])
+    top = float(mean[best])
+    fell = top - found[1] > max(0.15 * abs(top - start), 2 * found[2])
+    return (int(run.steps[best]), top) if fell else None
+
+
+def shown(value: float) -> str:
+    """A return: whole numbers where it is large."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def last_known(values: Float[np.ndarray, "seeds evaluations"]) -> float | None:
+    """The last evaluation's mean over the seeds, of the last evaluation in which one is known."""
+    for column in values.T[::-1]:
+        if len(known := column[np.isfinite(column)]):
+            return float(known.mean())
+    return None

@@ -1,0 +1,96 @@
+"""A run in words."""
+
+import numpy as np
+import pytest
+
+from lare.experiments.verdict import Facts, last_known, verdict
+
+STEPS = np.arange(1, 9) * 1000.0
+RISING = np.array([[0.0, 10, 20, 30, 40, 50, 60, 70]])
+FLAT = np.array([[50.0, 51, 50, 51, 50, 51, 50, 51]])
+FELL = np.array([[0.0, 40, 90, 92, 60, 40, 30, 31]])
+CHANCE = np.array([-1.0, 0, 1])
+
+
+def said(returns, random=CHANCE, **facts):
+    return verdict(
+        Facts("lare-bayes", STEPS, np.asarray(returns, float), random, directory="runs/x", task="Toy", **facts)
+    )
+
+
+@pytest.mark.parametrize(
+    ("returns", "facts", "sentences"),
+    [
+        (
+            np.vstack([RISING, RISING + 2]),
+            {"return_r2": 0.97, "latent": True, "at_the_end": 12.0},
+            [
+                "It learned. The return is 71 ± 1.41 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 0.816.",
+                "That is more than training on the return at the end alone gives here (12).",
+                "Its proxy rewards, from factors and raw features, tell nearly all of the score: R² of the last returns, before "
+                "they were learned from, is 0.97.",
+                "Next: it was still rising. To go on: `lare train --resume runs/x --steps 16000`.",
+            ],
+        ),
+        (
+            FLAT - 50,
+            {"return_r2": -3.0, "latent": True},
+            [
+                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 0.816.",
+                "Its proxy rewards, from factors and raw features, tell next to nothing of the score: R² of the last returns, "
+                "before they were learned from, is 0.00.",
+                "Next: the score is made of something else. `lare design Toy --reflect 2 --model NAME` asks for another phi; "
+                "`--method bayes` goes without a phi.",
+                "One seed says little: another may end elsewhere (`--seeds 3`).",
+            ],
+        ),
+        (
+            FLAT - 50,
+            {"return_r2": 0.9},
+            [
+                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 0.816.",
+                "Its proxy rewards, from raw features, tell nearly all of the score: R² of the last returns, before they were "
+                "learned from, is 0.90.",
+                "Next: the proxy rewards are good, so it is up to the algorithm: more `--steps`, or another `--algorithm` "
+                "(`lare algorithms`).",
+                "One seed says little: another may end elsewhere (`--seeds 3`).",
+            ],
+        ),
+        (
+            FELL,
+            {"at_the_end": 40.0},
+            [
+                "It learned. The return is 31 after 8,000 steps; random actions get 0 ± 0.816.",
+                "That is no more than training on the return at the end alone gives here (40).",
+                "Next: it was better before, 92 at step 4,000. `lare evaluate runs/x --best` plays the best policy of each seed.",
+                "One seed says little: another may end elsewhere (`--seeds 3`).",
+            ],
+        ),
+        (
+            FLAT - 1000,
+            {},
+            [
+                "It got worse than random actions. The return is -949 after 8,000 steps; random actions get 0 ± 0.816.",
+                "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
+                "One seed says little: another may end elsewhere (`--seeds 3`).",
+            ],
+        ),
+        (np.full((1, 8), np.nan), {}, ["Nothing can be said: the last evaluation gave no return."]),
+    ],
+)  # fmt: skip
+def test_what_is_said(returns, facts, sentences):
+    assert said(returns, **facts) == sentences
+
+
+def test_without_random_play_the_return_alone_is_said():
+    assert said(FLAT, np.zeros(0))[0] == "The return is 51 after 8,000 steps."
+
+
+def test_of_few_evaluations_no_direction_is_said():
+    few = Facts("x", STEPS[:3], RISING[:, :3], CHANCE)
+    assert not any(sentence.startswith("Next") for sentence in verdict(few))
+
+
+def test_the_last_value_that_is_known():
+    assert last_known(np.array([[1.0, 2, np.nan], [1, 4, np.nan]])) == 3
+    assert last_known(np.full((2, 3), np.nan)) is None
