@@ -7,17 +7,19 @@ from pathlib import Path
 
 import pytest
 
+from lare.errors import pip_install
+
 MODULES = {
-    "lare.plugs.sb3": ("stable_baselines3", "lare.plugs.sb3 needs an extra: pip install 'lare-rl[sb3]'"),
-    "lare.plugs.torchrl": ("torchrl", "lare.plugs.torchrl needs an extra: pip install 'lare-rl[torchrl]'"),
-    "lare.plugs.pettingzoo": ("pettingzoo", "lare.plugs.pettingzoo needs an extra: pip install 'lare-rl[pettingzoo]'"),
+    "lare.plugs.sb3": ("stable_baselines3", f"lare.plugs.sb3 needs an extra: {pip_install('sb3')}"),
+    "lare.plugs.torchrl": ("torchrl", f"lare.plugs.torchrl needs an extra: {pip_install('torchrl')}"),
+    "lare.plugs.pettingzoo": ("pettingzoo", f"lare.plugs.pettingzoo needs an extra: {pip_install('pettingzoo')}"),
     "lare.tasks.particles.pettingzoo": (
         "pettingzoo",
-        "lare.tasks.particles.pettingzoo needs an extra: pip install 'lare-rl[particles]'",
+        f"lare.tasks.particles.pettingzoo needs an extra: {pip_install('particles')}",
     ),
-    "lare.logs.parquet": ("pyarrow", "a Parquet file needs an extra: pip install 'lare-rl[parquet]'"),
-    "lare.logs.huggingface": ("datasets", "a Hugging Face data set needs an extra: pip install 'lare-rl[datasets]'"),
-    "lare.logs.minari": ("minari", "a Minari data set needs an extra: pip install 'lare-rl[minari]'"),
+    "lare.logs.parquet": ("pyarrow", f"a Parquet file needs an extra: {pip_install('parquet')}"),
+    "lare.logs.huggingface": ("datasets", f"a Hugging Face data set needs an extra: {pip_install('datasets')}"),
+    "lare.logs.minari": ("minari", f"a Minari data set needs an extra: {pip_install('minari')}"),
 }
 
 PROGRAM = """
@@ -42,4 +44,11 @@ def test_a_library_that_is_missing_is_one_line():
 @pytest.mark.parametrize("message", [message for _, message in MODULES.values()])
 def test_the_extra_is_there(message):
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
-    assert message.partition("[")[2].partition("]")[0] in project["project"]["optional-dependencies"]
+    assert message.rpartition("[")[2].partition("]")[0] in project["project"]["optional-dependencies"]
+
+
+def test_a_checkout_installs_itself_and_everybody_else_from_an_index(tmp_path):
+    (tmp_path / "pyproject.toml").touch()
+    assert pip_install("llm", tmp_path / "src" / "lare") == f"pip install --editable '{tmp_path}[llm]'"
+    assert pip_install("llm", tmp_path / "site-packages" / "lare") == "pip install 'lare-rl[llm]'"
+    assert pip_install("llm", tmp_path / "other" / "src" / "lare") == "pip install 'lare-rl[llm]'"

@@ -8,7 +8,7 @@ run = lare.train(task, lare.Settings(steps=100_000), function=phi)
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from lare.deploy.export import export as export

@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
@@ -21,9 +22,17 @@ class LareError(Exception):
     """What the command line exits with."""
 
 
+def pip_install(extra: str, package: Path = Path(__file__).parent) -> str:
+    """The command that installs an extra: of the checkout that this package is in, or of the package index."""
+    checkout = package.parents[1]
+    if package.parent.name == "src" and (checkout / "pyproject.toml").is_file():
+        return f"pip install --editable '{checkout}[{extra}]'"
+    return f"pip install 'lare-rl[{extra}]'"
+
+
 def needs_extra(what: str, extra: str) -> LareError:
     """What to say where a library that only some users have is not installed."""
-    return LareError(f"{what} needs an extra: pip install 'lare-rl[{extra}]'")
+    return LareError(f"{what} needs an extra: {pip_install(extra)}")
 
 
 class Checked(BaseModel):

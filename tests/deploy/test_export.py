@@ -16,6 +16,7 @@ from lare.credit import decomposition
 from lare.credit.methods import METHODS
 from lare.data import replay
 from lare.deploy import onnx
+from lare.errors import pip_install
 from lare.latent.function import verified
 from lare.tasks.env import in_units
 from lare.tasks.spec import read_task
@@ -262,7 +263,7 @@ def test_the_command_line(run, command, monkeypatch, tmp_path):
     assert said == "wrote policy, reward to first; exported.py there says how to call them\n"
     monkeypatch.setattr(onnx, "is_installed", lambda: False)
     status, _, noted = command("export", run.directory, "--out", "second")
-    assert noted == "without the package onnx, no .onnx files were written: pip install 'lare-rl[onnx]'\n"
+    assert noted == f"without the package onnx, no .onnx files were written: {pip_install('onnx')}\n"
     assert not list((tmp_path / "second").glob("*.onnx"))
     status, _, noted = command("export", run.directory, "--out", "second")
     assert (status, noted) == (2, "lare: second exists, and is not overwritten; choose another --out\n")

@@ -20,6 +20,7 @@ import lare
 from lare import LareError
 from lare.credit.methods import METHODS
 from lare.credit.settings import CreditSettings
+from lare.errors import pip_install
 from lare.plugs.sb3 import CreditCallback, CreditDictReplayBuffer, CreditNStepReplayBuffer, CreditReplayBuffer
 from toys import Chase, Pick, toy_spec
 
@@ -591,12 +592,12 @@ def test_a_number_that_is_not_finite():
     [
         (
             "sys.modules['stable_baselines3'] = None",
-            "lare.plugs.sb3 needs an extra: pip install 'lare-rl[sb3]'",
+            f"lare.plugs.sb3 needs an extra: {pip_install('sb3')}",
         ),
         (
             "import stable_baselines3; stable_baselines3.__version__ = '2.8.0'",
             "lare.plugs.sb3 needs stable-baselines3 2.9 or later, and 2.8.0 is installed: "
-            "pip install --upgrade 'lare-rl[sb3]'",
+            f"{pip_install('sb3')} --upgrade",
         ),
     ],
 )

@@ -507,7 +507,7 @@ def test_an_environment_that_cannot_be_made(environment, message):
 def test_pettingzoo_is_an_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "pettingzoo", None)
     monkeypatch.delitem(sys.modules, "parallel_toys")
-    with pytest.raises(LareError, match=r"\(PettingZoo is an extra: pip install 'lare-rl\[pettingzoo\]'\)$"):
+    with pytest.raises(LareError, match=r"\(PettingZoo is an extra: pip install .*\[pettingzoo\]'\)$"):
         make(task())
 
 

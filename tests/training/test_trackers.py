@@ -5,7 +5,7 @@ import builtins
 import pytest
 
 import lare
-from lare.errors import LareError
+from lare.errors import LareError, pip_install
 from lare.training.trackers import MLflow, WeightsAndBiases
 from toys import toy_spec
 
@@ -66,8 +66,8 @@ def test_wandb_has_every_number_of_every_seed(small, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("listener", "library", "message"),
     [
-        (WeightsAndBiases, "wandb", "Weights & Biases needs an extra: pip install 'lare-rl[wandb]'"),
-        (MLflow, "mlflow", "MLflow needs an extra: pip install 'lare-rl[mlflow]'"),
+        (WeightsAndBiases, "wandb", f"Weights & Biases needs an extra: {pip_install('wandb')}"),
+        (MLflow, "mlflow", f"MLflow needs an extra: {pip_install('mlflow')}"),
     ],
 )
 def test_a_library_that_is_missing_is_one_line(listener, library, message, monkeypatch):

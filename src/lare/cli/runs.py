@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from lare.cli.design import BUDGET, REQUESTS
 from lare.cli.terminal import RunDirectories, RunDirectory, progress, say, show
-from lare.errors import LareError
+from lare.errors import LareError, pip_install
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain
 
 if TYPE_CHECKING:
@@ -218,7 +218,7 @@ def export(
     if found.left_out:
         progress(f"there is no reward function: {found.left_out}")
     if not found.onnx:
-        progress("without the package onnx, no .onnx files were written: pip install 'lare-rl[onnx]'")
+        progress(f"without the package onnx, no .onnx files were written: {pip_install('onnx')}")
 
 
 def cross_play(

@@ -8,6 +8,7 @@ from html import escape
 import numpy as np
 from jaxtyping import Float
 
+from lare.errors import pip_install
 from lare.experiments import figures
 from lare.experiments.agents import Sample, frames, sample
 from lare.experiments.credit import correlations, factor_labels
@@ -71,7 +72,7 @@ def neighbourhoods(taken: Sample) -> Iterable[str]:
     try:
         from sklearn.manifold import TSNE
     except ImportError:
-        yield note("With pip install 'lare-rl[tsne]' a t-SNE picture of observations and factors would stand here.")
+        yield note(f"After {pip_install('tsne')} a t-SNE picture of observations and factors would stand here.")
         return
     chosen = np.random.default_rng(0).permutation(len(taken.reward))[:PICTURED]
 

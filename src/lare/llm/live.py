@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from lare.errors import LareError
+from lare.errors import LareError, pip_install
 from lare.foreign import read_json
 from lare.legible import in_a_line
 from lare.llm.bounded import LARGEST_BODY, TIMEOUT, Elsewhere, TooMuch, bound, in_time, stay
@@ -102,7 +102,7 @@ class LiveModel:
         try:
             self.client = self.connect()
         except ImportError:
-            raise ModelFailed("a live model needs an extra: pip install 'lare-rl[llm]'") from None
+            raise ModelFailed(f"a live model needs an extra: {pip_install('llm')}") from None
         except Exception as error:
             raise ModelFailed(f"the endpoint {base_url!r} cannot be used: {scrubbed(error)}") from None
 

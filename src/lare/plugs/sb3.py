@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float, Int
 
-from lare.errors import LareError, needs_extra
+from lare.errors import LareError, needs_extra, pip_install
 from lare.plugs import saving
 from lare.plugs.assigner import CreditAssigner
 from lare.plugs.layout import layout_of
@@ -29,7 +29,7 @@ except ImportError:
 if [int(part) for part in re.findall(r"\d+", stable_baselines3.__version__)[:2]] < [2, 9]:
     raise LareError(
         f"lare.plugs.sb3 needs stable-baselines3 2.9 or later, and {stable_baselines3.__version__} is installed: "
-        "pip install --upgrade 'lare-rl[sb3]'"
+        f"{pip_install('sb3')} --upgrade"
     )
 
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer

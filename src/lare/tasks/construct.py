@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lare.errors import LareError, did_you_mean, shortened
+from lare.errors import LareError, did_you_mean, pip_install, shortened
 from lare.tasks.environment import fault
 from lare.tasks.spec import PETTINGZOO
 
@@ -54,7 +54,7 @@ def hint_at(error: BaseException) -> str:
     if not isinstance(error, ModuleNotFoundError):
         return ""
     if (error.name or "").partition(".")[0] == "pettingzoo":
-        return " (PettingZoo is an extra: pip install 'lare-rl[pettingzoo]')"
+        return f" (PettingZoo is an extra: {pip_install('pettingzoo')})"
     return " (a module in this folder is found with PYTHONPATH=.)"
 
 

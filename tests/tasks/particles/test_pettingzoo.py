@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from lare.errors import LareError
+from lare.errors import LareError, pip_install
 from lare.tasks.particles.pettingzoo import ParticleEnv
 from lare.tasks.particles.table import TASKS
 from lare.tasks.particles.task import STEPS
@@ -93,4 +93,4 @@ except lare.LareError as error:
     print(error)
 """
     printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert printed == "lare.tasks.particles.pettingzoo needs an extra: pip install 'lare-rl[particles]'\n"
+    assert printed == f"lare.tasks.particles.pettingzoo needs an extra: {pip_install('particles')}\n"

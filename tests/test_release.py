@@ -1,0 +1,80 @@
+"""What is released: a wheel and an sdist that work without the checkout."""
+
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import lare
+
+ROOT = Path(__file__).parents[1]
+MAIN_JOB = """
+import sys
+import lare
+from lare.cli import main
+assert "site-packages" not in lare.__file__ and "src" not in lare.__file__.split("/"), lare.__file__
+phi = lare.design(lare.load_task("Reacher-v4"))
+td3 = {"hidden": (8,), "batch_size": 8, "warmup": 100}
+settings = lare.Settings(steps=200, evaluate_every=100, evaluation_episodes=1, td3=td3)
+run = lare.train("Reacher-v4", settings, function=phi, out="run", listeners=[])
+sys.argv = ["lare", "report", "run"]
+main()
+"""
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Both, by the name of their kind. What is built is what git knows of, with the changes that it has."""
+    out = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True)
+    (wheel,), (sdist,) = out.glob("*.whl"), out.glob("*.tar.gz")
+    return {"wheel": wheel, "sdist": sdist}
+
+
+def test_the_wheel_does_the_main_job_without_the_checkout(built, tmp_path):
+    with zipfile.ZipFile(built["wheel"]) as archive:
+        archive.extractall(tmp_path / "installed")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
+    done = subprocess.run(
+        [sys.executable, "-c", MAIN_JOB], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (0, "wrote run/report.html\n"), done.stderr
+
+
+def test_the_wheel_holds_the_package_and_its_data_alone(built):
+    with zipfile.ZipFile(built["wheel"]) as archive:
+        names = archive.namelist()
+        metadata = archive.read(f"lare_rl-{lare.__version__}.dist-info/METADATA").decode()
+    assert {name.split("/")[0] for name in names} == {"lare", f"lare_rl-{lare.__version__}.dist-info"}
+    every = {str(path.relative_to(ROOT / "src")) for path in (ROOT / "src" / "lare").rglob("*") if path.is_file()}
+    assert {name for name in every if "__pycache__" not in name} <= set(names)
+    for line in ("License-Expression: MIT", "Requires-Python: >=3.11", "Project-URL: Paper, "):
+        assert line in metadata
+
+
+def test_the_sdist_holds_what_the_tests_need_and_no_results(built):
+    with tarfile.open(built["sdist"]) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {
+        "pyproject.toml",
+        "README.md",
+        "LICENSE",
+        "CITATION.cff",
+        "Makefile",
+        "tests/conftest.py",
+        "src/lare/py.typed",
+    } <= names
+    assert not any(name.startswith("benchmarks/results") for name in names)
+
+
+def test_one_version_is_everywhere():
+    assert f"version: {lare.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.search(
+        rf"^## {re.escape(lare.__version__)} ", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
