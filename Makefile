@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check setup clean
+.PHONY: demo test check docs setup clean
 
 demo: setup ## Train HalfCheetah on episodic rewards with recorded replies, and draw the report
 	@if [ -e runs/demo ]; then $(BIN)/lare train --resume runs/demo; \
@@ -19,6 +19,10 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+docs: setup ## The documentation as a site, in site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "to read it: $(BIN)/mkdocs serve, or open site/index.html"
+
 setup: $(VENV)/installed
 
 $(VENV)/installed: pyproject.toml
@@ -29,4 +33,4 @@ $(VENV)/installed: pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) site .pytest_cache .ruff_cache .hypothesis
