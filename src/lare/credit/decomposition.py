@@ -8,8 +8,8 @@ x is what the method's encoder gives (the factors z = phi(s, a), or raw features
 R/T. Where there are many agents, every one has proxy rewards of its own, R is the mean over the agents of their returns,
 and what is fitted to it is the mean over the agents of r_hat: the same equations, credit over time and among agents.
 
-Many agents' r_hat has another factor of sqrt(nT): R/T is the mean of nT rewards, and what comes to few of them now and then
-is so much larger than their mean. Adam moves an output by the same step whatever its unit is, and the decoder of many is
+Many agents' r_hat has another factor of sqrt(nT): R/T is the mean of nT rewards, and a reward that few of them get now and then
+is that much larger than their mean. Adam moves an output by the same step whatever its unit is, and the decoder of many is
 seldom fitted: without the factor it would take dozens of updates of the policy to reach the size of a rare reward.
 
 Since features and targets are normalised by statistics in the state, scaling the return, or any factor, changes nothing

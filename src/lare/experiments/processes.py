@@ -141,9 +141,10 @@ def in_a_process(job: Job, cores: list[int], running: Running) -> str | None:
 
 
 def main() -> None:
-    """What `in_a_process` starts: one run, told in the first line of standard input. The end of it is that of who asked.
+    """The program that `in_a_process` starts. It trains one run, which the first line of standard input describes.
 
-    What went wrong goes to standard output too. Whatever else is printed there belongs to the log.
+    It ends when its parent ends, which it sees by the end of standard input. Errors go to standard output. Everything else
+    that is printed goes to the log.
     """
     answer = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())

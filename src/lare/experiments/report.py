@@ -48,7 +48,7 @@ TOP = "True rewards, for a million steps of the best public TD3,"
 
 
 def write_report(
-    runs: Run | str | Path | Sequence[Run | str | Path], out: str | Path | None = None, film: bool = False
+    runs: Run | str | Path | Iterable[Run | str | Path], out: str | Path | None = None, film: bool = False
 ) -> Path:
     """Draw the report of one or more runs; returns where it was written.
 

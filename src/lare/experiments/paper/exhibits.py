@@ -95,8 +95,8 @@ VIB = Contender("bottleneck", "vib-rrdu")
 
 WHOLE = "Episodes of fewer than 64 steps are taken whole: RRD and RRD-unbiased are RD on Reacher-v4 (the paper: 64 steps of 50)."
 ONE_DRAW = (
-    "One draw of the language model each, and so one function against another: what seeds decide here is decided of these two. "
-    "`candidates` has more draws."
+    "One draw of the language model each, and so one function against another: the seeds compare these two functions, not two "
+    "ways to write functions. `candidates` has more draws."
 )
 
 FEW_EPISODES = {"credit": CreditSettings(steps=800)}

@@ -327,7 +327,7 @@ class Expressions(ast.NodeVisitor):
     def visit_Compare(self, node: ast.Compare) -> None:
         sides = [node.left, *node.comparators]
         for operator, pair in zip(node.ops, itertools.pairwise(sides), strict=True):
-            # NumPy has one True and one False: whoever is one of them would tell a value.
+            # NumPy has one object True and one object False, so that `is` would compare values, as == does.
             if isinstance(operator, ast.Is | ast.IsNot) and not any(map(is_singleton, pair)):
                 self.refuse("E-CONSTRUCT", node, "is and is not stand beside None, True or False only: use ==")
         self.visit_all(sides)

@@ -56,7 +56,7 @@ KEPT = (
     *(ast.While, ast.Try, ast.TryStar, ast.AsyncFor, ast.AsyncWith, ast.Set, ast.SetComp),
     *(ast.Yield, ast.YieldFrom, ast.Await),
 )
-"""Of these, what stands in them stays when they go, and so has to be right."""
+"""The code inside of these is checked too: who mends the program removes the `while` or the `try`, and often keeps the code in it."""
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""What a program is given in place of Python's and NumPy's own: nothing grows beyond all bounds without a loop, and nothing
+"""Functions that a program gets in place of Python's and NumPy's own: no single call can make an array of any size, and nothing
 becomes something else than numbers.
 
 What can grow that way are `*` and `**` on integers, and whatever joins or repeats sequences. Arrays of objects and strings would

@@ -193,7 +193,7 @@ def finfo(dtype: Any) -> SimpleNamespace:
 
 
 def careful_functions() -> Mapping[str, Callable[..., Any]]:
-    """The NumPy functions of the language, for `Program`. Some of them would forget whom their arguments were."""
+    """The NumPy functions of the language, for `Program`: the result is hidden where an argument is. NumPy's own may lose that mark."""
     names = DOTTED.keys() - TELLING - CALLED_TYPES
     functions = {
         name: careful(only_numbers(resolve(name), name), SHAPING.get(name.removeprefix("numpy."), ()))
