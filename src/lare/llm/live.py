@@ -41,7 +41,7 @@ RETRIED = {408, 409, 429}
 
 HOPELESS = ("UnsupportedProtocol", "InvalidURL", "LocalProtocolError", "Elsewhere")
 NOT_SENT = ("Connect", *HOPELESS)
-"""Beginnings of the names of errors. HOPELESS: asking again gives the same error. NOT_SENT: the request did not reach the server."""
+"""Beginnings of names of errors. HOPELESS: asking again gives the same one. NOT_SENT: the request did not reach the server."""
 
 PLAIN = {"Accept-Encoding": "identity"}
 """What is not packed needs no room to be unpacked."""

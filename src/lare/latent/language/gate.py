@@ -56,7 +56,7 @@ KEPT = (
     *(ast.While, ast.Try, ast.TryStar, ast.AsyncFor, ast.AsyncWith, ast.Set, ast.SetComp),
     *(ast.Yield, ast.YieldFrom, ast.Await),
 )
-"""The code inside of these is checked too: who mends the program removes the `while` or the `try`, and often keeps the code in it."""
+"""The code inside of these is checked too: a repair often removes the `while` or the `try` alone."""
 
 
 @dataclass

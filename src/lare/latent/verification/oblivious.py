@@ -193,7 +193,7 @@ def finfo(dtype: Any) -> SimpleNamespace:
 
 
 def careful_functions() -> Mapping[str, Callable[..., Any]]:
-    """The NumPy functions of the language, for `Program`: the result is hidden where an argument is. NumPy's own may lose that mark."""
+    """The NumPy functions of the language, for `Program`: a result is hidden where an argument is. NumPy alone would lose that."""
     names = DOTTED.keys() - TELLING - CALLED_TYPES
     functions = {
         name: careful(only_numbers(resolve(name), name), SHAPING.get(name.removeprefix("numpy."), ()))
