@@ -25,7 +25,7 @@ REPETITIONS = 2000
 """Of the bootstrap."""
 
 FEW = {2: ("two", "one of two"), 3: ("three", "three of four")}
-"""Numbers n of seeds, or of draws, that are too few for a 95% interval: one bootstrap sample in n^n repeats the lowest seed n times,
+"""Numbers n of seeds, or of draws, that are too few for a 95% interval: one bootstrap sample in n^n is the lowest seed n times,
 and that is more than 2.5% of them."""
 
 Scores = Float[np.ndarray, "runs tasks *steps"]
