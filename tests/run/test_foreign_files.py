@@ -66,7 +66,7 @@ def run(tmp_path):
         (b"\xff", "cannot be read: 'utf-8' codec can't decode byte 0xff in position 0: invalid start byte"),
         (b'{"format": ' + b"9" * 5000 + b"}", "a number of 5000 digits"),
         (b'{"format": 3}', "the key 'lare' is missing (and 8 more)"),
-        (b'{"format": 2, "lare": "0.1"}', "the run is of another version of LaRe (0.1), whose files this one does not read: "
+        (b'{"format": 1, "lare": "0.1"}', "the run is of another version of LaRe (0.1), whose files this one does not read: "
                                          "use that version, or train it anew"),
     ],
 )  # fmt: skip

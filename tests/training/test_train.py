@@ -25,7 +25,8 @@ from lare.latent.function import verified
 from lare.run import checkpoint
 from lare.run.checkpoint import saved_host
 from lare.run.decide import decide
-from lare.run.directory import FORMAT, open_run
+from lare.run.directory import open_run
+from lare.run.formats import FORMAT
 from lare.source import source
 from lare.tasks.environment import EnvironmentFault
 from lare.training import session as sessions

@@ -29,6 +29,7 @@ from lare.files import write_atomically
 from lare.foreign import read_json, read_text
 from lare.latent.function import LatentFunction, LatentRewardError, load, per_role
 from lare.run.checkpoint import STATE, saved_host
+from lare.run.formats import FORMAT, migrated
 from lare.run.settings import ResolvedSettings
 from lare.source import source
 from lare.tasks.spec import Judges, TaskSpec
@@ -47,9 +48,6 @@ LARGEST_CONFIG, LARGEST_METRICS = 8 << 20, 512 << 20
 
 LARGEST_STEP = 2**53
 """Of the whole numbers in metrics.jsonl; beyond it a float is another number."""
-
-FORMAT = 3
-"""Of config.json and of the checkpoint. What stands in them changed with every number."""
 
 
 class Config(Checked):
@@ -266,12 +264,7 @@ def read_config(directory: Path) -> Config:
         values = read_json(read_text(path, LARGEST_CONFIG))
         if not isinstance(values, dict):
             raise LareError("it is JSON, but not an object")
-        if values.get("format") != FORMAT:
-            raise LareError(
-                f"the run is of another version of LaRe ({values.get('lare', 'unknown')}), whose files this one does not read: "
-                "use that version, or train it anew"
-            )
-        return Config(**values)
+        return Config(**migrated(values))
     except (LareError, OSError, ValueError, TypeError) as error:
         raise LareError(f"{path}: {error}") from error
 
