@@ -1,5 +1,6 @@
 """The command line, in this process: what it prints, and that a mistake is one line and exit status 2."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -143,9 +144,32 @@ def test_design_writes_the_function_once(command, tmp_path):
 def test_verify_prints_each_check(command, phi, spec_file):
     status, out, err = command("verify", phi, "--task", spec_file())
     assert (status, err) == (0, "")
-    *checks, last = out.splitlines()
+    first, *checks, last = out.splitlines()
+    assert first == "for Chase: observations of 2 numbers, actions of 1"
     assert checks == [f"passed  {name}" for name in ("gate", *CHECKS)]
     assert last.startswith("It ran in a process of its own (")
+
+
+def test_verify_says_how_much_of_the_score_the_factors_explain(command, phi, spec_file):
+    status, out, err = command("verify", phi, "--task", spec_file(), "--fit", "30")
+    assert (status, err) == (0, "playing 30 episodes by random actions\n")
+    found = re.search(
+        r"^Returns of episodes not seen yet, predicted by the factors: R² = (\d\.\d+) ", out, re.MULTILINE
+    )
+    assert found
+    assert float(found[1]) > 0.9
+    assert "And fitted to all 30 episodes:\nThe factors explain " in out
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--fit", "10"], "fit = 10: fewer than 20 episodes say too little of a function"),
+        (["--policy", "run"], "--policy plays the episodes for --fit, where there is no --data: say how many"),
+    ],
+)
+def test_a_fit_that_says_nothing_is_refused_at_once(command, phi, spec_file, more, message):
+    assert command("verify", phi, "--task", spec_file(), *more) == (2, "", f"lare: {message}\n")
 
 
 def test_verify_prints_every_error(command, spec_file, tmp_path):
@@ -153,6 +177,7 @@ def test_verify_prints_every_error(command, spec_file, tmp_path):
     status, out, err = command("verify", "bad.py", "--task", spec_file())
     assert (status, err) == (1, "")
     assert out.splitlines() == [
+        "for Chase: observations of 2 numbers, actions of 1",
         "FAILED  gate",
         "        E-IMPORT line 1: import os: only `import numpy as np` and `import math` are available",
         "        E-CALL line 3: open is not a function that is available",

@@ -90,7 +90,8 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 def first_problem(error: ValidationError, known: Iterable[str] = ()) -> str:
     """The first thing that pydantic found wrong, in one line, and how many more there are; `known` keys are what was meant."""
-    problems = error.errors()
+    # A key that is wrong says more than that another one is missing.
+    problems = sorted(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
     where, what = ".".join(str(part) for part in first["loc"]), first["msg"].removeprefix("Value error, ")
     if first["type"] == "missing":

@@ -26,7 +26,7 @@ def found(**changes):
     return Explanation(**(values | changes))
 
 
-SHARES = "What goes with each factor: its share of the variation, and what a step pays more for one standard deviation of it:"
+SHARES = "For each factor: its share of the variation, and by how much a step's reward rises with one standard deviation of it:"
 FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
 
 
@@ -79,7 +79,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             [
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
                 SHARES,
-                "- speed: 95%, +0.15 ± 0.1 (not in a straight line)",
+                "- speed: 95%, +0.15 ± 0.1 (its effect is curved)",
                 "- cost: 4%, +0.02 ± 0.1",
             ],
         ),

@@ -41,7 +41,7 @@ def test_a_better_function_takes_its_place(settings, tmp_path):
     assert (run.function.source, run.since) == (RIGHT, 600)
     said = [line for line in ear.heard if line.startswith("reflection")]
     assert [line.endswith(("kept", "not better")) for line in said] == [False, True, False, True]
-    assert "What goes with each factor" in model.asked[1][-1]["content"]
+    assert "For each factor: its share" in model.asked[1][-1]["content"]
     before, after = (
         [line["credit/correlation"] for line in run.metrics() if line["step"] == step] for step in (600, 900)
     )

@@ -66,7 +66,9 @@ def test_a_run_says_what_is_random_and_what_is_done_already(small, tmp_path):
     assert heard.messages == [f"the first {warmup:,} steps are random (td3.warmup): the policy is not trained yet"]
     heard = At(-1, None)
     lare.resume(tmp_path / "run", listeners=[heard])
-    assert heard.messages == ["nothing is left to do: it had come to its end"]
+    assert heard.messages == [
+        "nothing is left to do: it has made its 180 steps; more --steps (steps=... in Python) make it longer"
+    ]
     heard = At(-1, None)
     lare.train(toy_spec(), small(steps=24, evaluate_every=24, method="dense"), out=tmp_path / "few", listeners=[heard])
     assert heard.messages == ["all 24 steps are random (td3.warmup): the policy is not trained yet"]

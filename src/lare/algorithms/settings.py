@@ -52,7 +52,7 @@ class SACSettings(OffPolicySettings):
 
 
 class PPOSettings(Checked):
-    """Hyperparameters of PPO; what `lare train` uses where nothing is said stands in `table.py`."""
+    """Hyperparameters of PPO."""
 
     hidden: tuple[Annotated[int, Field(ge=1)], ...] = (64, 64)
     """Widths of the hidden layers of actor and critic."""

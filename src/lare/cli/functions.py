@@ -110,11 +110,14 @@ def verify(
         policy: a run whose policy plays the episodes for --fit, instead of random actions.
     """
     from lare.cli.design import policy_that_plays
+    from lare.credit.words import FEWEST
     from lare.latent.function import of_verdict, read_source
     from lare.latent.verification.verify import verify as verify_source
     from lare.tasks.spec import load_task, read_task, the_role
 
     source, changed, written_for = read_source(file)
+    if fit and fit < FEWEST:
+        raise LareError(f"fit = {fit}: fewer than {FEWEST} episodes say too little of a function")
     if policy is not None and (not fit or data is not None):
         raise LareError("--policy plays the episodes for --fit, where there is no --data: say how many")
     spec = load_task(task) if data is None else read_task(task)
@@ -123,7 +126,9 @@ def verify(
         say("note    the source is not the one that was saved: its hash is another")
     if written_for not in (None, the_role(spec).name):
         say(f"note    it was written for the task {written_for!r}")
+    role = the_role(spec)
     verdict = verify_source(source, spec, kind, steps_of(data, spec))
+    say(f"for {role.name}: observations of {role.observation_size} numbers, actions of {role.action_size}")
     for check in verdict.checks:
         say(f"{'passed' if check.passed else 'FAILED'}  {check.name}")
         for line in check.message.splitlines():
@@ -135,7 +140,6 @@ def verify(
     if not verdict.passed:
         sys.exit(1)
     if fit:
-        role = the_role(spec)
         function = of_verdict(source, role, kind, verdict)
         say_what_returns_say(function, role, episodes_for(role, data, fit, plays))
 
@@ -157,11 +161,13 @@ def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes:
     from lare.training.reflect import told_by_returns
 
     found = told_by_returns(function, role, episodes)
-    for line in found.sentences:
-        say(line)
     if not found.sentences:
         say(f"All {len(episodes)} episodes returned the same: they say nothing of the factors.")
     elif math.isfinite(found.r2):
         say(
-            f"R² of the returns, each predicted before it was seen: {found.r2:.2f} (1: exactly; 0: no better than their mean)"
+            f"Returns of episodes not seen yet, predicted by the factors: R² = {found.r2:.2f} (1: exactly; 0: no better than their "
+            "mean)."
         )
+        say(f"And fitted to all {len(episodes)} episodes:")
+    for line in found.sentences:
+        say(line)

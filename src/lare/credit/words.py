@@ -77,11 +77,11 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
         )
     else:
         said.append(
-            "What goes with each factor: its share of the variation, and what a step pays more for one standard deviation of it:"
+            "For each factor: its share of the variation, and by how much a step's reward rises with one standard deviation of it:"
         )
         said += [
             f"- {factors[i]}: {found.share[i]:.0%}, {found.weight[i]:+.3g} ± {found.deviation[i]:.1g}"
-            + (" (not in a straight line)" if is_bent(found, i) else "")
+            + (" (its effect is curved)" if is_bent(found, i) else "")
             for i in np.argsort(-found.share, kind="stable").tolist()
         ]
     if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:

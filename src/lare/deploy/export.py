@@ -61,6 +61,8 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
     """
     out, run = Path(out), as_run(run)
     place = run.place_of(seed)
+    if out.exists():
+        raise LareError(f"{out} exists, and is not overwritten; choose another --out")
     config, learner, _, _ = load_learner(run)
     _, actors, since = load_actor(run, best)
     actor = jax.tree.map(lambda leaf: leaf[place], actors)

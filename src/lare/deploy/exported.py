@@ -105,7 +105,7 @@ def reward(before, action, after, name="reward", **more):
     given = {"before": before, "action": action, "after": after, **more}
     if "factors" in described(name)["inputs"]:
         given["factors"] = factors(before, action, after, name)
-    return load(name)(**{key: given[key] for key in described(name)["inputs"]})["r_hat"]
+    return load(name)(**{key: given[key] for key in described(name)["inputs"] if key in given})["r_hat"]
 
 
 def factors(before, action, after, name="reward"):

@@ -71,13 +71,15 @@ def correlations(
 
 
 def factor_correlations(learner: Learner, config: TrainConfig) -> Float[np.ndarray, " factors"]:
-    """Of a single agent's factors with its true reward, over the newest steps; nothing for many agents."""
+    """Of a single agent's factors with its true reward, over the newest steps. NaN where only returns are known, none for many."""
     if not config.method.latent or config.judged_rows > 1 or config.env.agents > 1:
         return np.zeros(0)
     buffer = learner.replay
     known = int(jnp.min(buffer.transitions - jax.vmap(replay.oldest_transition)(buffer)))
     count = min(RECENT, known)
     steps = jax.vmap(lambda one: replay.read(one, replay.newest(one, count)))(buffer)
-    reward = np.asarray(steps.before["reward"]).ravel()
+    reward, last = np.asarray(steps.before["reward"]).ravel(), np.asarray(steps.last).ravel()
     factors = np.asarray(steps.before["factors"]).reshape(len(reward), -1)
+    if not reward[~last].any():  # paid at the end only: what each step is worth is not known
+        return np.full(factors.shape[1], np.nan)
     return correlations(factors, reward)

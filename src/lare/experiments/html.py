@@ -58,7 +58,7 @@ def factor_table(labels: Iterable[tuple[str, str]], correlations: Iterable[float
         (name, meaning, "-" if math.isnan(value) else f"{value:.2f}")
         for (name, meaning), value in zip(labels, correlations, strict=True)
     ]
-    return table(("factor", "meaning, in the model's words", "correlation with the true reward"), rows, (2,))
+    return table(("factor", "meaning, by the comments in phi", "correlation with the true reward"), rows, (2,))
 
 
 def note(text: str) -> str:
@@ -68,4 +68,5 @@ def note(text: str) -> str:
 
 def function_text(model: str, digest: str, source: str) -> str:
     """A latent function, to be read."""
-    return note(f"By {model}. SHA-256 {digest}.") + f"<pre>{escape(source)}</pre>"
+    by = "Written by hand" if model.startswith("none: written by hand") else f"By {model}"
+    return note(f"{by}. SHA-256 {digest}.") + f"<pre>{escape(source)}</pre>"

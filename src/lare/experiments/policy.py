@@ -80,6 +80,8 @@ class Policy:
             raise LareError(
                 f"an observation is {size} numbers, and a batch has rows of them: the shape is {rows.shape}"
             )
+        if not np.isfinite(rows).all():
+            raise LareError("an observation holds a number that is not finite")
         return np.atleast_2d(rows), rows.ndim == 1
 
 

@@ -68,6 +68,8 @@ def write_report(
         if not run.metrics():
             raise LareError(f"{run.directory} has no evaluation yet: there is nothing to report")
     path = Path(out) if out is not None else opened[0].directory / "report.html"
+    if not path.parent.is_dir():
+        raise LareError(f"the report {path} cannot be written: there is no folder {path.parent}")
     names = labels(opened)
     tasks = sorted({run.config.task.name for run in opened})
     title = f"{', '.join(tasks)}: {', '.join(names)}" if len(opened) < 4 else f"{', '.join(tasks)}: {len(opened)} runs"
@@ -253,8 +255,8 @@ def details(name: str, run: Run) -> Iterable[str]:
     yield f"<p>{escape(method.summary[0].upper() + method.summary[1:])}. Source: {escape(method.source)}.</p>"
     if module := unknown_module(run.config.task):
         yield note(
-            f"Its environment is of the module {module}, which is not imported for a report. {TRUSTED}={module} has it imported, "
-            "and what credit and factors look like drawn."
+            f"Its environment is of the module {module}, which is not imported for a report. Set {TRUSTED}={module} to have it "
+            "imported: pictures of credit and factors then appear here."
         )
     elif run.has_checkpoint():
         yield film_of(run)
@@ -294,7 +296,7 @@ def one_agent_details(run: Run) -> Iterable[str]:
         steps = figures.window(len(credit.reward))
         yield note(
             "The last training episode of the first seed, exploration included, judged by the newest decoder: "
-            f"steps {steps.start} to {steps.stop}, and all of its steps as points. "
+            f"the curves show steps {steps.start} to {steps.stop}, the points all steps. "
             f"Return {credit.reward.sum():.1f}, sum of the proxy rewards {credit.proxy.sum():.1f}."
             + (
                 ""

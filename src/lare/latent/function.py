@@ -233,18 +233,20 @@ class LatentFunction:
 
     def of_steps(
         self,
-        before: Float[np.ndarray, "batch observation"],
-        action: Float[np.ndarray, "batch action"],
-        after: Float[np.ndarray, "batch observation"],
+        before: Any,
+        action: Any,
+        after: Any,
         judges: Judges,
-    ) -> Float[np.ndarray, "batch factors"]:
+    ) -> Float[np.ndarray, "*batch factors"]:
         """The factors of steps by the observations that are judged; by both, one behind the other.
 
         Raises:
-            LatentRewardError: as when called.
+            LareError: as when called, or `judges` is none of these.
         """
+        if judges not in ("before", "after", "both"):
+            raise LareError(f"judges = {shortened(judges)}: it is before, after or both")
         judged = {"before": [before], "after": [after], "both": [before, after]}[judges]
-        return np.concatenate([self(observation, action) for observation in judged], axis=1)
+        return np.concatenate([self(observation, action) for observation in judged], axis=-1)
 
     def size_by(self, judges: Judges) -> int:
         """How many factors `of_steps` gives."""
@@ -381,8 +383,9 @@ def load(path: str | Path, task: TaskSpec | str | Path, steps: Steps | None = No
     Raises:
         LareError: it cannot be read, or does not pass for this task.
     """
-    source_path, task = source_file(path), as_task(task)
+    source_path, task = source_file(path), as_task(task, playable=steps is None)
     header, source = split_header(read_text(source_path))
+    source = normal(source)
     written_for = said_of("task", header)
     if written_for not in (None, task.name):
         raise LareError(
@@ -390,10 +393,10 @@ def load(path: str | Path, task: TaskSpec | str | Path, steps: Steps | None = No
             f'this one is right for both, remove its line "{HEADER}task: {written_for}"'
         )
     kind: Kind = "reward" if said_of("kind", header) == "reward" else "factors"
-    try:
-        function = verified(source, task, kind, steps)
-    except LareError as error:
-        raise LareError(f"{source_path}: {error}") from error
+    verdict = verify(source, task, kind, steps)
+    if not verdict.passed:
+        raise LareError(f"{source_path}: the function does not fit task {task.name!r}: {verdict.errors}")
+    function = of_verdict(source, task, kind, verdict)
     function = replace(function, model=said_of("model", header) or function.model)
     function = with_provenance(function, source_path.with_suffix(".json"))
     if was_changed(header, source) and not function.changed:

@@ -66,7 +66,8 @@ class Settings(Checked):
     fit_every: Count | None = None
     """ppo and ippo, and every algorithm with diaster: iterations for each time that the decoder is fitted; 10 for ippo, else 1."""
     fit_updates: Count | None = None
-    """The same: gradient steps of the decoder then; 500 for ppo, 50 for ippo, one for 50 environment steps with diaster."""
+    """For the same algorithms: gradient steps of the decoder each time; 500 for ppo, 50 for ippo, one for 50 environment steps with
+    diaster."""
     first_fit: Literal["held-out", "published"] | None = None
     """ippo: how long the decoder's first fit goes on. held-out: until the error on held-out episodes stops falling. published:
     fit_updates, as every later one. held-out, unless given."""

@@ -29,7 +29,7 @@ SENTENCE = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
 FIGURE = re.compile(r"^```\{.*?^```|<[^<>\n]+>", re.MULTILINE | re.DOTALL)
 NOISE = re.compile(r"^!\[|^:?-{3,}|^```|^\s*$")
-SCORE = '# score = "sum" # or "average", or a mark: it does not grow with the steps. Without it, training finds out'
+SCORE = '# score = "average" # a mark, or a mean over the steps; "sum": it grows with their number. Without it, training finds out'
 ELSEWHERE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.IGNORECASE)
 """What says nothing without a page around it."""
 

@@ -286,7 +286,9 @@ def introduce(session: Session, listener: Listener, messages: Sequence[str]) -> 
         which = f"the first {settings.warmup:,}" if settings.warmup < settings.steps else f"all {settings.steps:,}"
         listener.said(f"{which} steps are random ({settings.algorithm}.warmup): the policy is not trained yet")
     if session.step >= settings.steps:
-        listener.said("nothing is left to do: it had come to its end")
+        listener.said(
+            f"nothing is left to do: it has made its {settings.steps:,} steps; more --steps (steps=... in Python) make it longer"
+        )
     listener.started(f"{run.config.task.name} {settings.method}", session.step, settings.steps)
 
 
