@@ -4,8 +4,8 @@
     python benchmarks/offline.py RUN
 
 The log is all that the run met while it learned: 60 episodes, from random play on. `lare relabel` sees the return of each
-episode only. The learner is TD3+BC, `examples/offline_td3_bc.py`, with seeds 0 to 2 for each kind of rewards. The return of the
-last evaluation, and how well the proxy rewards agree with the true ones, go to results/offline.json.
+episode only. The learner is TD3+BC, `examples/offline_td3_bc.py`, with seeds 0 to 2 for each kind of rewards. The returns of
+all evaluations, and how well the proxy rewards agree with the true ones, go to results/offline.json.
 """
 
 import sys
@@ -57,9 +57,9 @@ def agreement(log: Path) -> float:
     return float(np.corrcoef(r_hat, true)[0, 1])
 
 
-def scores(log: Path, rewards: str, environment: str) -> list[float]:
-    """The last return of each seed."""
-    return [td3_bc(str(log), rewards, UPDATES, environment, seed)[-1] for seed in SEEDS]
+def scores(log: Path, rewards: str, environment: str) -> list[list[float]]:
+    """The returns of each seed, every 10,000 updates."""
+    return [td3_bc(str(log), rewards, UPDATES, environment, seed) for seed in SEEDS]
 
 
 def main(run: str) -> None:
