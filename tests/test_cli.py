@@ -41,7 +41,7 @@ def test_tasks_are_listed(command):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("train Task --steps 1e5", "--steps 1e5: not of the kind INT; see lare train --help"),
+        ("train Task --steps 1e5", "--steps 1e5: not a whole number, as 10000; see lare train --help"),
         ("train Task --step 9", "unrecognized options: --step, 9 (did you mean '--steps'?); see lare train --help"),
         ("trian", "unrecognized options: trian (did you mean 'train'?); see lare --help"),
         ("evaluate a b", "unrecognized options: b; see lare evaluate --help"),

@@ -117,7 +117,11 @@ def test_what_is_not_documented_must_be_filled_in(tmp_path):
 @pytest.mark.parametrize(
     ("environment", "message"),
     [
-        ("Nowhere-v0", "environment 'Nowhere-v0' cannot be made: Environment `Nowhere` doesn't exist."),
+        (
+            "Nowhere-v0",
+            "environment 'Nowhere-v0' cannot be made: Environment `Nowhere` doesn't exist. (one of your own is "
+            "MODULE:Nowhere-v0, where MODULE registers it)",
+        ),
         ("a b", "environment 'a b' cannot be made: "),
         ("toys/Told-v0:x", "environment 'toys/Told-v0:x' cannot be made: "),
         ("nowhere:Told-v0", "environment 'nowhere:Told-v0' cannot be made: No module named 'nowhere'."),

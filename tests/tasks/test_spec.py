@@ -193,7 +193,6 @@ def test_a_file_that_is_no_spec_is_refused(tmp_path, content, message):
         ("cheetah", " (did you mean 'HalfCheetah-v4'?)"),
         ("chess", ""),
         ("", ""),
-        ("/", ""),
     ],
 )
 def test_an_unknown_task_is_refused(task, hint):
@@ -284,3 +283,8 @@ def test_arguments_that_a_run_cannot_keep(tmp_path, value):
 def test_a_name_too_long_for_a_file():
     with pytest.raises(LareError, match="no task 'xxx"):
         load_task("x" * 300)
+
+
+def test_a_folder_is_no_task(tmp_path):
+    with pytest.raises(LareError, match=r" is a folder, and a task is a file \(\.toml\) or a shipped name "):
+        read_task(str(tmp_path))

@@ -12,6 +12,8 @@ import tyro
 from lare.errors import LareError, did_you_mean
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+NUMBERS = {"INT": "not a whole number, as 10000", "FLOAT": "not a number, as 0.5"}
+"""What is said of tyro's names of kinds."""
 CONTINUED = re.compile(r"\n {8,}")
 """Where the text of an argument goes on; tyro would break the line there."""
 
@@ -56,7 +58,8 @@ def in_one_line(box: str, commands: Mapping[str, object]) -> str:
         known = [*re.findall(r"(?<!\S)--[\w.-]+", " ".join(more)), *commands]
         return f"unrecognized options: {found[1]}{found[2] or ''}{did_you_mean(found[1], known)}"
     if found := re.fullmatch(r"Error parsing (\S+): no type matching (.+) could be instantiated from \['(.*)'\]", said):
-        return f"{found[1]} {found[3]}: not of the kind {found[2].replace('{None}|', '')}"
+        kind = found[2].replace("{None}|", "")
+        return f"{found[1]} {found[3]}: {NUMBERS.get(kind, f'not of the kind {kind}')}"
     return re.sub(r"'None', |, 'None'", "", said)
 
 

@@ -92,6 +92,8 @@ def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) 
             hint, library = "", os.environ.get("MUJOCO_GL")
             if library and isinstance(error, AttributeError):
                 hint = f" (is MUJOCO_GL={library} installed?)"
+            if isinstance(error, gymnasium.error.NameNotFound) and ":" not in environment:
+                hint = f" (one of your own is MODULE:{environment}, where MODULE registers it)"
             if isinstance(error, ModuleNotFoundError):
                 hint = " (a module in this folder is found with PYTHONPATH=.)"
             raise fault(f"environment {environment!r} cannot be made", error, hint) from error

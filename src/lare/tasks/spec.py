@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os.path
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -174,6 +175,10 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     else:
         if task.endswith(".toml"):
             raise LareError(f"there is no task file {task}")
+        if task and os.path.isdir(task):
+            raise LareError(
+                f"{task} is a folder, and a task is a file (.toml) or a shipped name (lare tasks lists them)"
+            )
         hint = did_you_mean(task, shipped_tasks())
         raise LareError(
             f"no task {task!r}{hint}: neither a file nor one of the shipped tasks, {', '.join(shipped_tasks())}"
