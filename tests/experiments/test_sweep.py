@@ -250,7 +250,7 @@ def test_how_a_process_ended(file, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("tasks", "task"), "the key 'tasks' is missing (and 1 more)"),
+        (("tasks", "task"), "there is no key 'task' (did you mean 'tasks'?) (and 1 more)"),
         (('"dense"', '"dence"'), "no method 'dence' (did you mean 'dense'?); the methods are "),
         (('["Reacher-v4"]', "[]"), "tasks = []: tuple should have at least 1 item after validation, not 0"),
         (("seeds = 2", "seed = -1"), "seed = -1: input should be greater than or equal to 0"),
