@@ -155,14 +155,15 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
             progress("filming an episode; without a graphics card that may take minutes")
         record_video(opened, video, best)
         say(f"wrote {video}")
-    found, (_, _, since) = evaluation_of(opened, episodes, best), load_actor(opened, best)
+    found = evaluation_of(opened, episodes, best)
+    since = load_actor(opened, of_best=True)[2] if best else None
     counted = f"{episodes} episodes" if episodes != 1 else "1 episode"
     roles = opened.config.task.roles
     for team, role in enumerate(roles):
         for place, seed in enumerate(opened.seeds):
             named = f"{role.name}, " if len(roles) > 1 else ""
             of_seed = plus_minus(*mean_and_deviation(found.returns[place, :, team]))
-            of_best = f" (the policy of step {since[place]:,})" if best else ""
+            of_best = "" if since is None else f" (the policy of step {since[place]:,})"
             say(f"{named}seed {seed}: return {of_seed} over {counted}{of_best}")
     for name, values in found.measures.items():
         for seed, of_seed in zip(opened.seeds, values, strict=True):

@@ -25,6 +25,7 @@ from lare.experiments.policy import choices
 from lare.files import write_atomically
 from lare.run.directory import Run, as_run, function_file
 from lare.source import source
+from lare.training.compiled import compiled
 from lare.training.seeds import of_seed
 from lare.training.session import load_actor, load_learner
 
@@ -63,8 +64,12 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
     place = run.place_of(seed)
     if out.exists():
         raise LareError(f"{out} exists, and is not overwritten; choose another --out")
-    config, learner, _, _ = load_learner(run)
-    _, actors, since = load_actor(run, best)
+    config, learner, host, _ = load_learner(run)
+    if best:
+        _, actors, since = load_actor(run, of_best=True)
+        step = int(since[place])
+    else:
+        actors, step = compiled(config).actor(learner, host["step"]), host["step"]
     actor = jax.tree.map(lambda leaf: leaf[place], actors)
     start = choices(run).start if config.env.discrete and config.env.agents == 1 else 0
     graphs = {"policy": policy(actor, config, start)}
@@ -93,7 +98,7 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
         "method": run.config.settings.method,
         "algorithm": run.config.settings.algorithm,
         "seed": run.seeds[place],
-        "step": int(since[place]),
+        "step": step,
     }
     for name, graph in graphs.items():
         text[name] = described(graph)
