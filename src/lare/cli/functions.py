@@ -124,9 +124,9 @@ def verify(
     plays = policy_that_plays(policy, spec)
     if changed:
         say("note    the source is not the one that was saved: its hash is another")
-    if written_for not in (None, the_role(spec).name):
-        say(f"note    it was written for the task {written_for!r}")
     role = the_role(spec)
+    if written_for not in (None, role.name):
+        say(f"note    it was written for the task {written_for!r}")
     verdict = verify_source(source, spec, kind, steps_of(data, spec))
     say(f"for {role.name}: observations of {role.observation_size} numbers, actions of {role.action_size}")
     for check in verdict.checks:
