@@ -155,7 +155,7 @@ class LatentFunction:
     @property
     def digest(self) -> str:
         """SHA-256 of the source."""
-        return hashlib.sha256(self.source.encode()).hexdigest()
+        return sha256(self.source)
 
     @property
     def changed(self) -> bool:
@@ -297,6 +297,11 @@ class LatentFunction:
             raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
 
+def sha256(source: str) -> str:
+    """Of a source, in hexadecimal digits."""
+    return hashlib.sha256(source.encode()).hexdigest()
+
+
 def normal(source: str) -> str:
     """The source as it is kept: line ends of one kind, no blank lines around it, and no header but that of `save`.
 
@@ -352,6 +357,11 @@ class SavedSource(NamedTuple):
     """Whether it was changed since it was saved."""
     task: str | None
     """That it was written for, where it says so."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the source."""
+        return sha256(self.source)
 
 
 def read_source(path: str | Path) -> SavedSource:
@@ -413,7 +423,7 @@ def said_of(what: str, header: Sequence[str]) -> str | None:
 def was_changed(header: Sequence[str], source: str) -> bool:
     """Whether the header that `save` has written speaks of another source."""
     said = said_of("sha256", header)
-    return said is not None and said != hashlib.sha256(normal(source).encode()).hexdigest()
+    return said is not None and said != sha256(normal(source))
 
 
 def check_task(function: LatentFunction, task: TaskSpec) -> None:

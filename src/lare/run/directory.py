@@ -27,7 +27,7 @@ from jaxtyping import Float
 from lare.errors import Checked, LareError, shortened
 from lare.files import write_atomically
 from lare.foreign import read_json, read_text
-from lare.latent.function import LatentFunction, LatentRewardError, load, per_role
+from lare.latent.function import LatentFunction, LatentRewardError, load, per_role, read_source
 from lare.run.checkpoint import STATE, saved_host
 from lare.run.formats import FORMAT, migrated
 from lare.run.settings import ResolvedSettings
@@ -319,10 +319,9 @@ def open_run(directory: str | Path) -> Run:
         raise LareError(f"{directory}: there are {len(digests)} latent functions for {len(config.task.roles)} roles")
     for role, digest in zip(config.task.roles, digests, strict=True) if digests else ():
         place = directory / function_file(config.task, role, since)
-        function = load(place, role)
-        if function.digest != digest:
+        if read_source(place).digest != digest:
             raise LareError(f"{place} is not the function that this run was trained with: its hash changed")
-        functions.append(function)
+        functions.append(load(place, role))
     return Run(directory, config, tuple(functions), since)
 
 
