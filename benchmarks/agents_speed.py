@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from measure import advance, interleave, new_session, show, summary, write
 
 import lare
 from lare.credit.methods import METHODS
 from lare.experiments import figures
 from lare.tasks.particles.table import find_particle_task
 from lare.training.session import Session
+from measure import advance, interleave, new_session, show, summary, write
 
 TASKS = ("TriangleArea", "CN-6", "CN-15", "CN-30")
 """3, 6, 15 and 30 agents."""

@@ -13,7 +13,6 @@ from pathlib import Path
 import jax
 import numpy as np
 from jaxtyping import Float
-from measure import apart, correlation, write
 
 from lare.experiments.watch import on_device, proxy_of
 from lare.run.directory import Run, open_run
@@ -23,6 +22,7 @@ from lare.training.annotate import annotate
 from lare.training.compiled import module_of
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
+from measure import apart, correlation, write
 
 EPISODES, KEY = 100, 7
 

@@ -16,13 +16,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from measure import write
 
 from lare.credit import evidence
 from lare.data import replay
 from lare.run.directory import open_run
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
+from measure import write
 
 EPISODES = (8, 15, 25, 40, 60)
 ASKED = 5

@@ -9,11 +9,11 @@ Absolute correlation (Pearson's) of each entry with the agent's true reward of t
 import sys
 
 import numpy as np
-from measure import write
 
 from lare.experiments.agents import sample
 from lare.experiments.credit import correlations
 from lare.run.directory import open_run
+from measure import write
 
 
 def main(directories: list[str]) -> None:

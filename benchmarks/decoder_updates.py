@@ -12,7 +12,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from measure import apart, correlation, write
 
 from lare.algorithms.table import ALGORITHMS
 from lare.credit import arel
@@ -27,6 +26,7 @@ from lare.training.compiled import module_of, new_learners
 from lare.training.config import TrainConfig
 from lare.training.learner import Learner
 from lare.training.seeds import of_seed
+from measure import apart, correlation, write
 
 ENV, STORED, JUDGED, AT_A_TIME = ParticleJaxEnv("CN-6"), 1600, 200, 100
 CONTENDERS = {"rd": (None, 3200), "arel": (None, 3200), "arel without its penalty": (0.0, 800)}

@@ -14,7 +14,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import tyro
-from measure import write
 
 from lare.credit import accuracy, decomposition
 from lare.credit.methods import METHODS
@@ -26,6 +25,7 @@ from lare.training.config import TrainConfig
 from lare.training.learner import Learner, Paid
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
+from measure import write
 
 AT_A_TIME = 50
 """Fits in a compiled call."""

@@ -15,16 +15,16 @@ from tempfile import TemporaryDirectory
 import jax
 import jax.numpy as jnp
 import numpy as np
-from basis import ASKED, CHOSEN, fitted, pairs, scores, standardised
 from jax import Array
-from measure import write
-from missing_factors import FACTORS, source
 
 import lare
+from basis import ASKED, CHOSEN, fitted, pairs, scores, standardised
 from lare.data import replay
 from lare.run.directory import open_run
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
+from measure import write
+from missing_factors import FACTORS, source
 
 TASK, SPEED = "HalfCheetah-v4", 8
 EPISODES = (15, 30, 55)

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import advance, interleave, new_session, show, summary, write
 
 import lare
 from lare.algorithms.settings import TD3Settings
@@ -33,6 +32,7 @@ from lare.llm.recording import SHIPPED, read_recording
 from lare.llm.reply import parse
 from lare.tasks.spec import read_task
 from lare.training import session as sessions
+from measure import advance, interleave, new_session, show, summary, write
 
 CASES = Path(__file__).parents[1] / "tests" / "latent" / "cases.json"
 OBSERVATION, ACTION, SEED = 17, 6, 0

@@ -14,9 +14,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from learning import read
-
 import lare
+from learning import read
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "HalfCheetah-v4": {"steps": 60_000, "seeds": 3},

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from measure import write
 
 import lare
 from lare.data import replay
 from lare.logs.source import open_logs
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
+from measure import write
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
 from offline_td3_bc import main as td3_bc

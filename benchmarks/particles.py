@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 import tyro
 from jaxtyping import Array, Float, PRNGKeyArray
-from measure import interleave, show, summary, write
 
 from lare.tasks.particles.table import find_particle_task
 from lare.tasks.particles.task import ACTIONS, STEPS, ParticleTask
 from lare.tasks.particles.world import State
+from measure import interleave, show, summary, write
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)

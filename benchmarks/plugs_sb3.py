@@ -22,16 +22,16 @@ import jax
 import numpy as np
 import torch
 import tyro
-from evaluations import Evaluations, evaluate
-from measure import PPO as PPO_COMMON
-from measure import TD3 as TD3_SETTINGS
-from measure import interleave, provenance, show, summary, write
 from stable_baselines3 import PPO, TD3
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import lare
+from evaluations import Evaluations, evaluate
 from lare.plugs.sb3 import CreditCallback, CreditReplayBuffer
+from measure import PPO as PPO_COMMON
+from measure import TD3 as TD3_SETTINGS
+from measure import interleave, provenance, show, summary, write
 
 TASK, RESULTS = "HalfCheetah-v4", Path(__file__).parent / "results" / "plugs"
 PPO_SETTINGS: dict[str, Any] = {**PPO_COMMON, "policy_kwargs": {"net_arch": [256, 256], "activation_fn": torch.nn.Tanh}}
@@ -77,6 +77,7 @@ def td3(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> TD3:
 def sbx_sac(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> Any:
     """SBX's SAC, likewise. SBX is imported here: it is not needed for the others."""
     from sbx import SAC
+
     from sbx_learning import OFF_POLICY
 
     settings = {"learning_starts": warmup, "seed": seed, **OFF_POLICY, **plug_of(task, rewards, seed)}

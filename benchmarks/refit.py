@@ -13,7 +13,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from measure import write
 
 from lare.credit import accuracy, decomposition, descent
 from lare.credit.decomposition import Decomposition, Episodes
@@ -28,6 +27,7 @@ from lare.training.config import TrainConfig
 from lare.training.learner import Learner
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
+from measure import write
 
 UPDATES, STRETCH = 20_000, 5_000
 

@@ -14,9 +14,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-from measure import write
 
 import lare
+from measure import write
 
 LENGTH, ENTRIES, ACTIONS = 1000, 11, 3
 

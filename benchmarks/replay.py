@@ -22,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 import psutil
 import tyro
-from measure import advance, interleave, new_session, show, summary, write
 
 import lare
 from lare.algorithms.settings import TD3Settings
@@ -37,6 +36,7 @@ from lare.training import off_policy
 from lare.training.config import TrainConfig
 from lare.training.learner import features
 from lare.training.session import Session
+from measure import advance, interleave, new_session, show, summary, write
 
 SEED, EPISODE, UPDATES = 0, 1000, 50
 STORED = (10_000, 100_000, 1_000_000)

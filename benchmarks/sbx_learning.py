@@ -18,11 +18,12 @@ import jax
 import numpy as np
 import sbx
 import tyro
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
 from evaluations import Evaluations, evaluate
 from measure import PPO as PPO_COMMON
 from measure import TD3, provenance
-from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 OFF_POLICY = {name: value for name, value in TD3.items() if name != "policy_delay"}
 PPO = {**PPO_COMMON, "policy_kwargs": {"net_arch": [256, 256], "activation_fn": nn.tanh}}

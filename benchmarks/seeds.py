@@ -10,10 +10,10 @@ from functools import partial
 from pathlib import Path
 
 import tyro
-from measure import advance, interleave, new_session, show, summary, write
 
 import lare
 from lare.algorithms.settings import TD3Settings
+from measure import advance, interleave, new_session, show, summary, write
 
 TASK, BEFORE = "HalfCheetah-v4", 2000
 

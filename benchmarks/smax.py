@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import tyro
 from jaxtyping import Array, Float, PRNGKeyArray
-from measure import interleave, show, summary, write
 
 from lare.tasks.smax import NAMES
 from lare.tasks.smax.env import SMAX
+from measure import interleave, show, summary, write
 
 STEPS = 60
 """Of each battle, in one call."""

@@ -23,11 +23,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from measure import write
 
 from lare.tasks.smax import NAMES, battle, enemy, observation
 from lare.tasks.smax.env import MOST, reward
 from lare.tasks.smax.scenarios import UNIT_TYPES, Scenario, find_scenario
+from measure import write
 
 streams = sys.stdout, sys.stderr
 from jaxmarl.environments.smax.heuristic_enemy import create_heuristic_policy  # noqa: E402

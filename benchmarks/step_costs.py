@@ -14,12 +14,12 @@ from pathlib import Path
 
 import jax
 import tyro
-from measure import advance, interleave, new_session, show, summary, write
 
 import lare
 from lare.algorithms.table import ALGORITHMS, Consumes
 from lare.credit.methods import METHODS
 from lare.training.session import Session
+from measure import advance, interleave, new_session, show, summary, write
 
 TASK, SEED, BEFORE, ROLLOUT = "HalfCheetah-v4", 0, 2000, 2000
 ONE_AGENT = [row.name for row in ALGORITHMS.values() if row.one_agent and row.continuous]

@@ -21,7 +21,6 @@ import numpy as np
 import optax
 import tyro
 from jaxtyping import Array, Float, Int, PRNGKeyArray
-from measure import write
 
 from lare.networks import MLP, descend, start_adam
 from lare.tasks.particles import prey
@@ -39,6 +38,7 @@ from lare.tasks.particles.predator_prey import (
 from lare.tasks.particles.prey import Layers, shipped_prey
 from lare.tasks.particles.task import ACTIONS, STEPS
 from lare.tasks.particles.world import State, move, push
+from measure import write
 
 TARGET = 29.5
 """What greedy predators earn from the published prey, summed over predators and steps of a PP-6 episode."""

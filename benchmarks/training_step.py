@@ -21,12 +21,12 @@ import sbx
 import stable_baselines3
 import tyro
 from jax import Array
-from measure import TD3, advance, interleave, new_session, ratio, show, summary, write
 from stable_baselines3.common.noise import NormalActionNoise
 
 import lare
 from lare.algorithms.settings import TD3Settings
 from lare.training.session import Session
+from measure import TD3, advance, interleave, new_session, ratio, show, summary, write
 
 TASK, SEED = "HalfCheetah-v4", 0
 BEFORE = 2000

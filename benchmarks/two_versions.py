@@ -18,6 +18,7 @@ from statistics import median
 from typing import Any
 
 import tyro
+
 from measure import write
 
 TURN = {"ppo": 2000, "td3": 500, "ddpg": 500, "sac": 500}

@@ -10,10 +10,10 @@ from functools import partial
 
 import numpy as np
 import tyro
-from burning import Burns
-from measure import interleave, show, summary, write
 
+from burning import Burns
 from lare.tasks.workers import Envs, LocalEnvs, WorkerEnvs
+from measure import interleave, show, summary, write
 
 REFERENCE = "one process"
 

@@ -1,8 +1,10 @@
 """Studies of many runs."""
 
+import importlib
 import sys
 from contextlib import suppress
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Literal
 
 import tyro
@@ -10,6 +12,9 @@ from tyro.conf import Positional
 
 from lare.cli.terminal import RunDirectories, progress, say, show
 from lare.errors import LareError
+
+BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
+"""In a checkout; there is no such directory where LaRe was installed from an index."""
 
 Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")]
 
@@ -73,36 +78,36 @@ def reproduce(
     cores: int = 1,
     ray: Ray = None,
 ) -> None:
-    """Make a figure or a table of the LaRe paper anew: train what is missing, and write a page that lays it beside the paper's.
+    """Train a figure or a table of the LaRe paper anew, in a checkout, and write a page that compares it with the paper's.
 
     Args:
-        exhibit: which one, or all; without it, they are listed.
+        exhibit: its name, or all; without it, they are listed.
         budget: smoke, to see that it runs; laptop, 3 seeds and a twentieth of a single agent's steps, some tasks; paper, all.
-        runs: where the runs are; those that are done are not trained again.
-        out: where the page goes, as OUT/BUDGET/NAME.md, with its pictures and all metrics.
+        runs: the directory of the runs; finished ones are not trained again.
+        out: the directory of the pages: OUT/BUDGET/NAME.md, with its pictures and all metrics.
         processes: runs at a time.
         cores: of each run.
         ray: a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
     """
     from lare.cli.watch import watching
-    from lare.experiments.paper import reproduce as paper
-    from lare.experiments.paper.budgets import BUDGETS
     from lare.experiments.sweep import Share
     from lare.training.train import Interrupted
 
+    paper = from_the_checkout("reproduce")
     if exhibit is None:
         show(("exhibit", "of the paper", "what it shows"), paper.listed())
         return
     share = Share(processes=processes, cores=cores)
 
     def make(name: str) -> None:
-        say(f"wrote {paper.reproduce(name, BUDGETS[budget], share, runs, out, ray, watching)}")
+        say(f"wrote {paper.reproduce(name, budget, share, runs, out, ray, watching)}")
 
     if exhibit != "all":
         make(exhibit)
         return
+    names = [name for name, _, _ in paper.listed()]
     failed = 0
-    for name in paper.NAMES:
+    for name in names:
         try:
             make(name)
         except Interrupted:
@@ -111,4 +116,16 @@ def reproduce(
             failed += 1
             progress(f"{name}: {error}")
     if failed:
-        raise LareError(f"{failed} of {len(paper.NAMES)} exhibits have no page")
+        raise LareError(f"{failed} of {len(names)} exhibits have no page")
+
+
+def from_the_checkout(module: str) -> ModuleType:
+    """A module of `benchmarks/paper`, which only a checkout has. Raises `LareError` where LaRe was installed without one."""
+    if not (BENCHMARKS / "paper" / f"{module}.py").is_file():
+        raise LareError(
+            "lare reproduce needs a checkout, whose directory benchmarks/paper describes the exhibits: clone the repository, and "
+            "install it there by pip install -e '.[statistics]'"
+        )
+    if str(BENCHMARKS) not in sys.path:
+        sys.path.append(str(BENCHMARKS))
+    return importlib.import_module(f"paper.{module}")

@@ -1,18 +1,11 @@
-"""Exhibits that are made of runs: which runs, and the page of what came out of them."""
+"""The page of an exhibit: what came out of its runs, beside what the paper says."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from lare.algorithms.table import ALGORITHMS, Consumes
-from lare.credit.methods import find_method
 from lare.experiments import figures
-from lare.experiments.jobs import Job, job_of
-from lare.experiments.paper.budgets import Budget
-from lare.experiments.paper.exhibits import OURS, TRAVELLED, WON, Claim, Contender, Exhibit
-from lare.experiments.paper.pages import Page, items, table
 from lare.experiments.scores import CORRELATION, ERROR, RETURN, SUMMED_RETURN, Group
 from lare.experiments.statistics import (
     REPETITIONS,
@@ -26,82 +19,60 @@ from lare.experiments.statistics import (
     too_few,
 )
 from lare.run.directory import Run, read_measured
-from lare.run.settings import Settings
-from lare.run.usual import usual_algorithm
-from lare.tasks.spec import load_task
 from lare.tasks.table import env_spec
+from paper.exhibits import OURS, Budget, Claim, Exhibit, Jobs
+from paper.pages import Page, items, table
+
+TRAVELLED, WON = "evaluation/x_position", "evaluation/won"
+MEANING = {
+    RETURN: "true return",
+    SUMMED_RETURN: "true return, sum over the agents",
+    ERROR: "error of the proxy reward",
+    TRAVELLED: "metres travelled",
+    WON: "share of battles won",
+}
+"""The keys of metrics.jsonl that an exhibit shows, in words."""
+
+SEEDS, STEPS, STEPS_OF_MANY, STEPS_OF_STARCRAFT = 5, 1_000_000, 2_050_000, 10_050_000
+"""Of the paper's runs."""
 
 LEVEL = 0.025
 """A claim counts as decided where luck alone would give as many pairs at most so often."""
 JUDGED = (
-    "So many pairs of runs, one of each, in which it is so (a run is a seed; where both have several draws, a draw, mean over its "
-    f"seeds). p: the chance of as many or more by luck, over all tasks, exact (Mann and Whitney). Decided at {LEVEL}, for it or "
-    "against it, each claim by itself: where there is no difference, one of twenty is decided all the same. It is so only if it "
-    "wins half of the pairs on every task. What is said to be at least as good is not refuted as long as nothing is decided "
-    "against it. Three seeds on one task decide nothing: p is 0.05 at least."
+    "A cell counts the pairs of runs, one run of each side, in which the claim holds. A run is a seed; where both sides "
+    "have several draws of the language model, it is a draw, with the mean over its seeds. p is the probability of as many "
+    "pairs or more by luck, over all tasks (Mann and Whitney's exact test). A claim, or its opposite, is decided at p up to "
+    f"{LEVEL}. Each claim is tested by itself: where there is no difference, one claim of twenty is decided all the same. A "
+    "claim must also win half of the pairs on every task. 'At least as good' is not refuted unless the opposite is decided. "
+    "Three seeds on one task decide nothing: their p is at least 0.05."
 )
 
 OF_ONE_AGENT = (
-    "Factors judge the observation that a step led to, but for Reacher-v4, whose own reward looks at the one before (the paper: "
-    "the one before).",
+    "Factors judge the observation after the step (the paper: before it). Reacher-v4 is the exception: its own reward looks at the "
+    "observation before the step.",
 )
 ALWAYS = (
-    "Inputs of decoders and returns are normalised by running statistics, for the baselines as for LaRe, but for what is fitted in "
-    "closed form (the paper: nothing is).",
-    "The recorded replies are of a newer language model than the paper's.",
-    "The seed of training and the draw of the language model are two things; the paper's change together.",
+    "Running statistics normalise the returns and the inputs of all decoders that descend a gradient, those of the baselines too "
+    "(the paper normalises nothing).",
+    "The recorded replies come from a newer language model than the paper's.",
+    "The seed of training and the draw of the language model are independent; in the paper they change together.",
 )
-"""What differs from the paper's protocol."""
-
-Jobs = Mapping[str, Mapping[str, Sequence[Job]]]
-"""By task and label, one for each draw."""
+"""Differences from the paper's protocol."""
 
 
-def tasks_of(exhibit: Exhibit, budget: Budget) -> tuple[str, ...]:
-    return {"smoke": exhibit.tasks[:1], "laptop": exhibit.laptop, "paper": exhibit.tasks}[budget.name]
-
-
-def jobs_of(exhibit: Exhibit, budget: Budget, root: Path) -> Jobs:
-    """Every run that an exhibit needs. Exhibits that need the same one share it."""
-    return {
-        name: {
-            one.label: list(jobs_of_contender(one, with_steps(budget, exhibit), name, root))
-            for one in exhibit.contenders
-        }
-        for name in tasks_of(exhibit, budget)
-    }
-
-
-def with_steps(budget: Budget, exhibit: Exhibit) -> Budget:
-    return budget if exhibit.steps is None or budget.name == "smoke" else replace(budget, steps=exhibit.steps)
-
-
-def jobs_of_contender(one: Contender, budget: Budget, name: str, root: Path) -> Iterator[Job]:
-    task = load_task(name)
-    steps = budget.steps_of_many if env_spec(task).agents > 1 else budget.steps
-    usual = {"method": one.method, "algorithm": one.algorithm, "steps": steps, "seeds": budget.seeds}
-    usual |= budget.by_algorithm.get(one.algorithm or usual_algorithm(env_spec(task)), {})
-    latent = find_method(one.method).latent
-    for draw in range(min(budget.draws, one.draws) if latent else 1):
-        job = job_of(root, task, Settings(**{**one.settings, **budget.settings, **usual, "draw": draw}))
-        yield replace(job, directory=job.directory.with_name(job.directory.name + one.ending))
-
-
-def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
+def page_of(name: str, exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
     """What came out of the runs, beside what the paper says.
 
     Raises:
         LareError: the runs do not make up a whole table.
     """
     runs = {
-        name: {label: [read_measured(job.directory) for job in some] for label, some in of_task.items()}
-        for name, of_task in jobs.items()
+        task: {label: [read_measured(job.directory) for job in some] for label, some in of_task.items()}
+        for task, of_task in jobs.items()
     }
     every = [run for of_task in runs.values() for some in of_task.values() for run in some]
-    found = {name: compare(of_task, exhibit.measure(name)) for name, of_task in runs.items()}
-    pictures = {
-        f"{exhibit.name}-{name}.svg": picture(one, exhibit, exhibit.measure(name)) for name, one in found.items()
-    }
+    found = {task: compare(of_task, exhibit.measure) for task, of_task in runs.items()}
+    pictures = {f"{name}-{task}.svg": picture(one, exhibit) for task, one in found.items()}
     ours = exhibit.source == OURS
     origin = "Not in the paper" if ours else f"The paper's {exhibit.source}"
     claims = "What was expected" if ours else "What the paper says"
@@ -109,29 +80,29 @@ def page_of(exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
         f"# {exhibit.title}",
         f"{origin}, by `{command}`.",
         protocol(every),
-        *(part for name in jobs for part in of_one_task(exhibit, name, runs[name], found[name])),
+        *(part for task in jobs for part in of_one_task(name, exhibit, task, runs[task], found[task])),
         f"## {claims}, and what came out",
         table(
             ["expected" if ours else "the paper", *found, "p", "here"],
-            (claimed(*one, exhibit, found) for one in pairs(exhibit.claims)),
+            (claimed(claim, other, exhibit, found) for claim in exhibit.claims for other in claim.than),
         ),
         JUDGED,
         "## What differs from the paper",
         items(differences(exhibit, budget, len(runs), every)),
     ]
-    return Page(exhibit.name, "\n\n".join(parts), pictures)
+    return Page(name, "\n\n".join(parts), pictures)
 
 
 def differences(exhibit: Exhibit, budget: Budget, tasks: int, runs: Sequence[Run]) -> Iterator[str]:
     """From the paper, a sentence each."""
-    if budget.name != "paper":
-        yield f"Seeds: {budget.seeds} (the paper: 5)."
-        if tasks < len(exhibit.tasks):
-            yield f"Tasks: {tasks} of {len(exhibit.tasks)}."
+    if budget.seeds != SEEDS:
+        yield f"Seeds: {budget.seeds} (the paper: {SEEDS})."
+    if tasks < len(exhibit.tasks):
+        yield f"Tasks: {tasks} of {len(exhibit.tasks)}."
     steps = max(run.config.settings.steps for run in runs)
     one_agent = not any(env_spec(run.config.task).agents > 1 for run in runs)
     consumes = {ALGORITHMS[run.config.settings.algorithm].consumes for run in runs}
-    theirs = 1_000_000 if one_agent else 10_050_000 if Consumes.SEQUENCES in consumes else 2_050_000
+    theirs = STEPS if one_agent else STEPS_OF_STARCRAFT if Consumes.SEQUENCES in consumes else STEPS_OF_MANY
     if steps != theirs:
         yield f"Environment steps: {steps:,} (the paper: {theirs:,})."
     if budget.settings:
@@ -160,16 +131,18 @@ def span(name: str, numbers: Sequence[int]) -> str:
     return f"{name} {numbers[0]}" if len(numbers) == 1 else f"{name}s {numbers[0]} to {numbers[-1]}"
 
 
-def of_one_task(exhibit: Exhibit, name: str, runs: Mapping[str, Sequence[Run]], found: Comparison) -> Iterator[str]:
+def of_one_task(
+    name: str, exhibit: Exhibit, task: str, runs: Mapping[str, Sequence[Run]], found: Comparison
+) -> Iterator[str]:
     """A picture and a table."""
-    key, printed = exhibit.measure(name), exhibit.printed.get(name, {})
-    yield f"## {name}"
-    yield f"![{name}]({exhibit.name}-{name}.svg)"
+    key, printed = exhibit.measure, exhibit.printed.get(task, {})
+    yield f"## {task}"
+    yield f"![{task}]({name}-{task}.svg)"
     columns = {RETURN: "return"} if key == WON else {}
     columns |= {} if key == ERROR else {ERROR: "error of the proxy reward", CORRELATION: "its correlation"}
     beside = ["the paper"] if printed else list(columns.values())
     several = max(len(some) for some in runs.values()) > 1
-    head = ["", f"{meaning(key)}: IQM [95%]", "mean ± sd", *(["mean [95%] over draws"] if several else []), *beside]
+    head = ["", f"{MEANING[key]}: IQM [95%]", "mean ± sd", *(["mean [95%] over draws"] if several else []), *beside]
     step, rows = int(found.curves[found.rows[0].label].x[-1]), []
     for row in found.rows:
         cells = [
@@ -204,43 +177,29 @@ def mean_and_spread(runs: Sequence[Run], key: str, step: int) -> str:
     return plus_minus(*mean_and_deviation(np.array([np.mean(values) for values in by_seed.values()])))
 
 
-def meaning(key: str) -> str:
-    return {
-        RETURN: "true return",
-        SUMMED_RETURN: "true return, sum over the agents",
-        ERROR: "error of the proxy reward",
-        TRAVELLED: "metres travelled",
-        WON: "share of battles won",
-    }[key]
-
-
-def picture(found: Comparison, exhibit: Exhibit, key: str) -> str:
+def picture(found: Comparison, exhibit: Exhibit) -> str:
     """Learning curves; a panel for each algorithm, where there are several."""
-    across, up = "environment steps", f"{meaning(key)}, IQM"
+    across, up = "environment steps", f"{MEANING[exhibit.measure]}, IQM"
     panels: dict[str, dict[str, Band]] = {}
-    for one in exhibit.contenders:
+    for label, one in exhibit.contenders.items():
         panel = panels.setdefault(one.algorithm or "", {})
-        panel[one.label.removesuffix(f", {one.algorithm}")] = found.curves[one.label]
+        panel[label.removesuffix(f", {one.algorithm}")] = found.curves[label]
     if len(panels) > 1:
         return figures.bands_side_by_side(panels, across, up)
-    return figures.bands(found.curves, across, up, steps=True, decades=key == ERROR)
-
-
-def pairs(claims: Iterable[Claim]) -> Iterator[tuple[Claim, str]]:
-    return ((claim, other) for claim in claims for other in claim.others)
+    return figures.bands(found.curves, across, up, steps=True, decades=exhibit.measure == ERROR)
 
 
 def claimed(claim: Claim, other: str, exhibit: Exhibit, found: Mapping[str, Comparison]) -> list[str]:
     """A row: what is claimed, in how many pairs of runs it is so on each task, and what that says of all of them."""
     pairs = [units(one.groups[claim.better], one.groups[other]) for one in found.values()]
-    if exhibit.key == ERROR:
+    if exhibit.measure == ERROR:
         pairs = [(-ours, -theirs) for ours, theirs in pairs]
     won = [mann_whitney_u(ours, theirs) for ours, theirs in pairs]
     of = [len(ours) * len(theirs) for ours, theirs in pairs]
     chance = mann_whitney_p(pairs)
     contrary = mann_whitney_p([(theirs, ours) for ours, theirs in pairs])
     everywhere = all(2 * count >= all_of_them for count, all_of_them in zip(won, of, strict=True))
-    says = "errs less than" if exhibit.key == ERROR else "is at least as good as" if claim.at_least else "is above"
+    says = "errs less than" if exhibit.measure == ERROR else "is at least as good as" if claim.at_least else "is above"
     return [
         f"{claim.better} {says} {other}",
         *(f"{count:g} of {all_of_them}" for count, all_of_them in zip(won, of, strict=True)),

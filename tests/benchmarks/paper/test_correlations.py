@@ -1,14 +1,12 @@
 """Table 1: steps whose correlations are known, and the page."""
 
-import dataclasses
-
 import numpy as np
 
-from lare.experiments.paper import correlations
-from lare.experiments.paper.budgets import BUDGETS
 from lare.latent.design import DesignFailed
 from lare.llm.recording import Recorder
 from lare.tasks.spec import load_task
+from paper import correlations
+from paper.exhibits import budgets
 from toys import toy_spec
 
 
@@ -33,7 +31,7 @@ def test_steps_of_many_agents_have_the_rewards_of_each():
 
 def test_the_page(monkeypatch):
     monkeypatch.setattr(correlations, "PRINTED", {"Reacher-v4": ("1", "2", "3", "4")})
-    budget = dataclasses.replace(BUDGETS["smoke"], functions=2)
+    budget = budgets()["smoke"].model_copy(update={"functions": 2})
     page = correlations.page_of(budget, "lare reproduce table-1")
     row = next(line for line in page.text.splitlines() if line.startswith("| Reacher-v4 |"))
     cells = [cell.strip() for cell in row.strip("|").split("|")]

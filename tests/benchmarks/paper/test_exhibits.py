@@ -7,22 +7,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lare.cli import studies
 from lare.credit.methods import METHODS
 from lare.errors import LareError
 from lare.experiments import processes, statistics
 from lare.experiments.jobs import as_json, check, train_one
-from lare.experiments.paper.budgets import BUDGETS
-from lare.experiments.paper.exhibits import EXHIBITS, OURS, TABLE, TRAVELLED, WON
-from lare.experiments.paper.reproduce import NAMES, UNTRAINED, listed, reproduce
-from lare.experiments.paper.trained import jobs_of, verdict
 from lare.experiments.scores import ERROR, RETURN, SUMMED_RETURN
 from lare.experiments.sweep import Share
 from lare.llm.recording import shipped_recordings
 from lare.run.directory import describe
 from lare.training import train as training
+from paper.exhibits import OURS, Exhibit, budgets, exhibits, jobs_of
+from paper.reproduce import UNTRAINED, listed, reproduce
+from paper.trained import MEANING, TRAVELLED, WON, verdict
 from toys import At
 
-SMOKE = BUDGETS["smoke"]
+EXHIBITS = exhibits()
+BUDGETS = tuple(budgets())
+NAMES = [name for name, _, _ in listed()]
+of_each_exhibit = pytest.mark.parametrize("exhibit", EXHIBITS.values(), ids=EXHIBITS)
+of_each_budget = pytest.mark.parametrize("budget", BUDGETS)
 
 
 @pytest.fixture(autouse=True)
@@ -53,18 +57,18 @@ def made_up(monkeypatch):
     monkeypatch.setattr(processes, "in_a_process", write_run(lambda settings, _: list(METHODS).index(settings.method)))
 
 
-@pytest.mark.parametrize("exhibit", TABLE, ids=lambda exhibit: exhibit.name)
+@of_each_exhibit
 def test_what_is_claimed_and_printed_is_of_contenders_that_are_there(exhibit):
-    labels = [contender.label for contender in exhibit.contenders]
-    assert len(set(labels)) == len(labels)
-    assert {name for claim in exhibit.claims for name in (claim.better, *claim.others)} <= set(labels)
+    labels = exhibit.contenders
+    assert {name for claim in exhibit.claims for name in (claim.better, *claim.than)} <= set(labels)
+    assert exhibit.measure in MEANING
     assert set(exhibit.printed) <= set(exhibit.tasks)
     assert all(set(figures) <= set(labels) for figures in exhibit.printed.values())
     assert set(exhibit.laptop) <= set(exhibit.tasks)
 
 
-@pytest.mark.parametrize("budget", BUDGETS.values(), ids=BUDGETS)
-@pytest.mark.parametrize("exhibit", TABLE, ids=lambda exhibit: exhibit.name)
+@of_each_budget
+@of_each_exhibit
 def test_every_run_of_an_exhibit_could_be_trained(exhibit, budget):
     """Settings that go together, and recordings that are there."""
     for of_task in jobs_of(exhibit, budget, Path("runs")).values():
@@ -78,10 +82,10 @@ def test_every_run_of_an_exhibit_could_be_trained(exhibit, budget):
                 } <= recorded
 
 
-@pytest.mark.parametrize("exhibit", TABLE, ids=lambda exhibit: exhibit.name)
+@of_each_exhibit
 def test_runs_that_are_kept_are_taken_for_trained(exhibit):
     kept = Path(__file__).parents[3] / "benchmarks" / "results" / "reproduce" / "laptop"
-    for of_task in jobs_of(exhibit, BUDGETS["laptop"], kept).values():
+    for of_task in jobs_of(exhibit, "laptop", kept).values():
         for job in (job for some in of_task.values() for job in some):
             check(job)
             assert job.done == job.begun
@@ -90,11 +94,11 @@ def test_runs_that_are_kept_are_taken_for_trained(exhibit):
 @pytest.mark.parametrize("name", EXHIBITS)
 def test_every_exhibit_becomes_a_page(name, made_up, tmp_path):
     exhibit = EXHIBITS[name]
-    page = reproduce(name, SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
+    page = reproduce(name, "smoke", Share(), tmp_path / "runs", tmp_path / "out")
     text = page.read_text()
     origin = "Not in the paper" if exhibit.source == OURS else f"The paper's {exhibit.source}"
     assert text.startswith(f"# {exhibit.title}\n\n{origin}, by `lare reproduce {name} --budget smoke`.")
-    assert all(f"| {contender.label} |" in text for contender in exhibit.contenders)
+    assert all(f"| {label} |" in text for label in exhibit.contenders)
     assert all(f"* {difference}" in text for difference in exhibit.differences)
     for task in exhibit.tasks[:1]:
         assert f"]({name}-{task}.svg)" in text
@@ -104,7 +108,7 @@ def test_every_exhibit_becomes_a_page(name, made_up, tmp_path):
 
 def test_figures_claims_and_verdicts(made_up, tmp_path):
     """With three seeds on two tasks: errors are the place in the table of methods, a tenth of it; more is worse."""
-    text = reproduce("errors", BUDGETS["laptop"], Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    text = reproduce("errors", "laptop", Share(), tmp_path / "runs", tmp_path / "out").read_text()
     places = {label: list(METHODS).index(name) / 10 for label, name in (("RD", "rd"), ("LaRe-RRDu", "lare-rrdu"))}
     assert "50,000 environment steps, seeds 0 to 2, draw 0 of the language model." in text
     assert f"| RD | {places['RD']:.4f} |" in text
@@ -118,7 +122,7 @@ def test_draws_are_what_is_compared_where_there_are_several(tmp_path, monkeypatc
     monkeypatch.setattr(
         processes, "in_a_process", write_run(lambda settings, seed: settings.draw * 1000 + settings.candidates + seed)
     )
-    text = reproduce("candidates", BUDGETS["laptop"], Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    text = reproduce("candidates", "laptop", Share(), tmp_path / "runs", tmp_path / "out").read_text()
     assert "| n = 5 is at least as good as n = 1 | 6 of 9 |" in text
     assert "| not refuted |" in text
     rows = (tmp_path / "out" / "laptop" / "candidates.csv").read_text().splitlines()
@@ -141,32 +145,32 @@ def test_verdicts(for_it, against, everywhere, at_least, said):
     assert verdict(for_it, against, everywhere, at_least) == said
 
 
-@pytest.mark.parametrize("budget", BUDGETS.values(), ids=BUDGETS)
+@of_each_budget
 def test_no_two_contenders_share_a_run_by_chance(budget):
     """A directory is one run, whoever asks for it."""
     found = {}
-    for exhibit in TABLE:
+    for exhibit in EXHIBITS.values():
         for of_task in jobs_of(exhibit, budget, Path("runs")).values():
             for job in (job for some in of_task.values() for job in some):
                 assert found.setdefault(job.directory, job.resolved) == job.resolved
 
 
 def test_what_is_shared_or_done_is_not_trained_again(made_up, monkeypatch, tmp_path):
-    reproduce("bottleneck", SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
+    reproduce("bottleneck", "smoke", Share(), tmp_path / "runs", tmp_path / "out")
     trained = []
     monkeypatch.setattr(processes, "in_a_process", lambda job, *_: trained.append(job.name) or "no")
-    reproduce("bottleneck", SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
+    reproduce("bottleneck", "smoke", Share(), tmp_path / "runs", tmp_path / "out")
     assert trained == []
     with pytest.raises(LareError, match=r"^1 of 3 runs failed, so there is no page: Reacher-v4/rd-td3$"):
-        reproduce("errors", SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
+        reproduce("errors", "smoke", Share(), tmp_path / "runs", tmp_path / "out")
     assert trained == ["Reacher-v4/rd-td3"]
 
 
 def test_remarks_outlive_a_page(made_up, tmp_path):
-    page = reproduce("sparse", SMOKE, Share(), tmp_path / "runs", tmp_path / "out")
+    page = reproduce("sparse", "smoke", Share(), tmp_path / "runs", tmp_path / "out")
     remarked = page.read_text() + "\n## Remarks\n\nNobody got anywhere.\n"
     page.write_text(remarked)
-    assert reproduce("sparse", SMOKE, Share(), tmp_path / "runs", tmp_path / "out").read_text() == remarked
+    assert reproduce("sparse", "smoke", Share(), tmp_path / "runs", tmp_path / "out").read_text() == remarked
 
 
 def test_an_exhibit_that_is_trained(command, monkeypatch, tmp_path):
@@ -184,9 +188,9 @@ def test_an_exhibit_that_is_trained(command, monkeypatch, tmp_path):
 
 
 def test_a_budget_that_teaches_nothing_says_so(made_up, tmp_path):
-    text = reproduce("sparse", SMOKE, Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    text = reproduce("sparse", "smoke", Share(), tmp_path / "runs", tmp_path / "out").read_text()
     assert "it runs, and learns nothing.**" in text
-    text = reproduce("triangle-area", SMOKE, Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    text = reproduce("triangle-area", "smoke", Share(), tmp_path / "runs", tmp_path / "out").read_text()
     assert "* Environment steps: 600 (the paper: 2,050,000)." in text
 
 
@@ -205,7 +209,7 @@ def test_where_nothing_can_be_written_nothing_is_trained(prepare, message, monke
     out = tmp_path / "out"
     prepare(out)
     with pytest.raises(LareError) as error:
-        reproduce("sparse", SMOKE, Share(), tmp_path / "runs", out)
+        reproduce("sparse", "smoke", Share(), tmp_path / "runs", out)
     assert str(error.value) == message.format(out=out)
 
 
@@ -215,7 +219,7 @@ def test_all_of_them_goes_on_after_one_that_fails(command, made_up, monkeypatch)
             raise LareError("no luck")
         return Path(name)
 
-    monkeypatch.setattr("lare.experiments.paper.reproduce.reproduce", made)
+    monkeypatch.setattr("paper.reproduce.reproduce", made)
     status, out, err = command("reproduce", "all", "--budget", "smoke")
     assert status == 2
     assert out.split() == [word for name in NAMES if name != "errors" for word in ("wrote", name)]
@@ -225,7 +229,6 @@ def test_all_of_them_goes_on_after_one_that_fails(command, made_up, monkeypatch)
 def test_the_list(command):
     status, out, _ = command("reproduce")
     assert status == 0
-    assert [name for name, _, _ in listed()] == list(NAMES)
     assert all(name in out for name in (*EXHIBITS, *UNTRAINED))
 
 
@@ -233,3 +236,30 @@ def test_an_exhibit_that_is_not_there(command):
     status, _, err = command("reproduce", "figure-9")
     assert status == 2
     assert err == f"lare: no exhibit 'figure-9'; the exhibits are {', '.join(NAMES)}\n"
+
+
+def test_without_a_checkout(command, monkeypatch, tmp_path):
+    monkeypatch.setattr(studies, "BENCHMARKS", tmp_path)
+    status, _, err = command("reproduce")
+    assert status == 2
+    assert err == (
+        "lare: lare reproduce needs a checkout, whose directory benchmarks/paper describes the exhibits: clone the repository, and "
+        "install it there by pip install -e '.[statistics]'\n"
+    )
+
+
+def test_a_contender_for_each_algorithm():
+    assert [*EXHIBITS["algorithms"].contenders][:5] == [
+        "dense, td3",
+        "episodic, td3",
+        "RRD-unbiased, td3",
+        "LaRe-RRDu, td3",
+        "dense, sac",
+    ]
+    claim = EXHIBITS["algorithms"].claims[-1]
+    assert (claim.better, claim.than, claim.at_least) == ("LaRe-RRDu, ppo", ("dense, ppo",), True)
+
+
+def test_an_exhibit_of_which_something_is_missing():
+    with pytest.raises(LareError, match=r"^the key 'tasks' is missing$"):
+        Exhibit(title="none", source=OURS, contenders={"dense": "dense"}, claims=[])

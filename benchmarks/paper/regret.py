@@ -9,10 +9,10 @@ from jaxtyping import Float, PRNGKeyArray
 
 from lare import theory
 from lare.experiments import figures
-from lare.experiments.paper.budgets import Budget
-from lare.experiments.paper.pages import Page, items, table
 from lare.experiments.statistics import Band, plus_minus
 from lare.theory import History, Table
+from paper.exhibits import Budget
+from paper.pages import Page, items, table
 
 TITLE = "Regret with a latent table, and with a raw one"
 CORES, ACTIONS, HORIZON, DELTA = 3, 2, 5, 0.1
@@ -23,7 +23,7 @@ PICTURE = "theory-regret.svg"
 
 def page_of(budget: Budget, command: str) -> Page:
     """Play OFUL on random problems, with tables of more and more redundant entries."""
-    episodes, runs = budget.tabular
+    episodes, runs = budget.tabular.episodes, budget.tabular.runs
     found = {redundant: played(redundant, episodes, runs) for redundant in REDUNDANT}
     latent = float(np.mean(last(found[1])))
     rows = [row(redundant, history, latent) for redundant, history in found.items()]

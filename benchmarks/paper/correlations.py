@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.experiments.credit import correlations
-from lare.experiments.paper.budgets import Budget
-from lare.experiments.paper.pages import Page, items, table
 from lare.latent.design import DesignFailed, design, examine
 from lare.latent.function import LatentFunction
 from lare.llm.recording import shipped_recordings
 from lare.tasks.play import Episode, episodes_of
 from lare.tasks.spec import Judges, TaskSpec, load_task
+from paper.exhibits import Budget
+from paper.pages import Page, items, table
 
 TITLE = "What states and factors know of the true reward"
 PRINTED = {

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from lare.experiments.paper import regret
-from lare.experiments.paper.budgets import BUDGETS
+from paper import regret
+from paper.exhibits import budgets
 
 
 def test_the_page(monkeypatch):
     monkeypatch.setattr(regret, "REDUNDANT", (1, 6))
-    found = regret.page_of(BUDGETS["smoke"], "lare reproduce theory")
+    found = regret.page_of(budgets()["smoke"], "lare reproduce theory")
     rows = [line.split("|") for line in found.text.splitlines() if line.startswith(("| 1 (latent)", "| 6 "))]
     assert [row[2].strip() for row in rows] == ["6", "36"]
     assert [row[7].strip() for row in rows] == ["3 of 3", "3 of 3"]

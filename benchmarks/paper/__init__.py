@@ -1,0 +1,1 @@
+"""`lare reproduce`: the figures and tables of the LaRe paper, trained anew."""

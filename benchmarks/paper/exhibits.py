@@ -1,0 +1,189 @@
+"""The exhibits of the LaRe paper that need training: `exhibits/NAME.toml`, read and checked; `budgets.toml`; and the runs of both.
+
+An exhibit compares *contenders*, methods as the paper's figure names them, on tasks, and holds the paper's *claims* against the
+runs. Two exhibits need no training: `correlations.py` (table 1) and `regret.py` (propositions 1 and 2).
+"""
+
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, field_validator
+
+from lare.algorithms.table import Name
+from lare.credit.methods import find_method
+from lare.errors import Checked, LareError
+from lare.experiments.jobs import Job, job_of
+from lare.experiments.scores import RETURN
+from lare.foreign import LARGEST_SETTINGS, read_text, read_toml
+from lare.run.settings import Settings
+from lare.run.usual import usual_algorithm
+from lare.tasks.spec import load_task
+from lare.tasks.table import env_spec
+
+PLACE = Path(__file__).parent
+OURS = "ours"
+
+Names = Annotated[tuple[str, ...], Field(min_length=1)]
+
+
+class Contender(Checked):
+    """A method, as the paper's figure shows it. In the TOML file it stands under its label; a text is the method alone."""
+
+    method: str
+    algorithm: Name | None = None
+    """The task's own, unless given."""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    """That differ from the usual ones."""
+    draws: int = 1
+    """Of the language model, at most."""
+    ending: str = ""
+    """Of the names of its runs, where another contender differs by settings alone."""
+
+
+class Claim(Checked):
+    """The paper says: on every task that is shown, one contender is better than the others."""
+
+    better: str
+    than: Names
+    at_least: bool = False
+    """Whether the paper only says that it is as good."""
+
+
+class Exhibit(Checked):
+    """A figure or a table."""
+
+    title: str
+    source: str
+    """Its place in the paper; `OURS`, where the paper does not have it."""
+    tasks: Names
+    """The smoke budget takes the first."""
+    laptop: tuple[str, ...] = ()
+    """The tasks of the laptop budget: all, unless given."""
+    contenders: dict[str, Contender]
+    """By label."""
+    algorithms: tuple[Name, ...] = ()
+    """Every contender is trained, and every claim is tested, with each of them; their labels end with the algorithm."""
+    claims: tuple[Claim, ...]
+    steps: int | None = None
+    """Environment steps of every run; those of the budget, unless given."""
+    measure: str = RETURN
+    """The key of metrics.jsonl that is shown."""
+    printed: dict[str, dict[str, str]] = Field(default_factory=dict)
+    """The numbers that the paper prints, by task and label."""
+    differences: tuple[str, ...] = ()
+    """From the paper, besides those that all exhibits share."""
+
+    @field_validator("contenders", mode="before")
+    @classmethod
+    def method_alone(cls, contenders: dict[str, Any]) -> dict[str, Any]:
+        return {label: {"method": given} if isinstance(given, str) else given for label, given in contenders.items()}
+
+
+class Tabular(Checked):
+    """Of the tabular problems."""
+
+    episodes: int
+    runs: int
+
+
+class Budget(Checked):
+    """What all runs of an exhibit have in common."""
+
+    seeds: int
+    draws: int
+    """Of the language model, at most."""
+    functions: int
+    """Draws of the language model where nothing is trained."""
+    episodes: int
+    """Over which correlations are taken."""
+    tabular: Tabular
+    steps: int | None = None
+    """Environment steps of one agent; the task's own, unless given."""
+    steps_of_many: int | None = None
+    """Environment steps of tasks of many agents."""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    """That differ from the usual ones."""
+    algorithms: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """Settings for some of the algorithms."""
+
+
+def read(path: Path) -> dict[str, Any]:
+    """A TOML file. Raises `LareError` with its name where it is none."""
+    try:
+        return read_toml(read_text(path, LARGEST_SETTINGS))
+    except ValueError as error:
+        raise LareError(f"{path}: {error}") from error
+
+
+@functools.cache
+def budgets() -> dict[str, Budget]:
+    """By name: `smoke`, `laptop`, `paper`."""
+    return {name: Budget(**values) for name, values in read(PLACE / "budgets.toml").items()}
+
+
+@functools.cache
+def exhibits() -> dict[str, Exhibit]:
+    """By name, in the order of the alphabet."""
+    paths = sorted((PLACE / "exhibits").glob("*.toml"))
+    return {path.stem: with_algorithms(Exhibit(**read(path))) for path in paths}
+
+
+def with_algorithms(exhibit: Exhibit) -> Exhibit:
+    """The exhibit with a contender and a claim for each of its algorithms."""
+    if not exhibit.algorithms:
+        return exhibit
+
+    def named(label: str, algorithm: str) -> str:
+        return f"{label}, {algorithm}"
+
+    contenders = {
+        named(label, algorithm): one.model_copy(update={"algorithm": algorithm})
+        for algorithm in exhibit.algorithms
+        for label, one in exhibit.contenders.items()
+    }
+    claims = tuple(
+        claim.model_copy(
+            update={
+                "better": named(claim.better, algorithm),
+                "than": tuple(named(other, algorithm) for other in claim.than),
+            }
+        )
+        for algorithm in exhibit.algorithms
+        for claim in exhibit.claims
+    )
+    return exhibit.model_copy(update={"contenders": contenders, "claims": claims})
+
+
+Jobs = Mapping[str, Mapping[str, Sequence[Job]]]
+"""By task and label, one for each draw."""
+
+
+def tasks_of(exhibit: Exhibit, budget: str) -> tuple[str, ...]:
+    """Those of a budget."""
+    return {"smoke": exhibit.tasks[:1], "laptop": exhibit.laptop or exhibit.tasks, "paper": exhibit.tasks}[budget]
+
+
+def jobs_of(exhibit: Exhibit, budget: str, root: Path) -> Jobs:
+    """Every run that an exhibit needs. Exhibits that need the same one share it."""
+    common = budgets()[budget]
+    if exhibit.steps is not None and budget != "smoke":
+        common = common.model_copy(update={"steps": exhibit.steps})
+    return {
+        name: {label: list(jobs_of_contender(one, common, name, root)) for label, one in exhibit.contenders.items()}
+        for name in tasks_of(exhibit, budget)
+    }
+
+
+def jobs_of_contender(one: Contender, budget: Budget, name: str, root: Path) -> Iterator[Job]:
+    """A run for each draw of the language model."""
+    task = load_task(name)
+    steps = budget.steps_of_many if env_spec(task).agents > 1 else budget.steps
+    common = {"method": one.method, "algorithm": one.algorithm, "steps": steps, "seeds": budget.seeds}
+    common |= budget.algorithms.get(one.algorithm or usual_algorithm(env_spec(task)), {})
+    latent = find_method(one.method).latent
+    for draw in range(min(budget.draws, one.draws) if latent else 1):
+        job = job_of(root, task, Settings(**{**one.settings, **budget.settings, **common, "draw": draw}))
+        yield replace(job, directory=job.directory.with_name(job.directory.name + one.ending))
