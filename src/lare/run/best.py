@@ -1,6 +1,6 @@
 """The policy of each seed's best evaluation, kept beside the last checkpoint.
 
-    checkpoint/best.npz     what is needed to act, by its place; `score` and `step` of each seed
+    checkpoint/best.npz     the arrays that are needed to act; score and step of each seed
 
 The best of many evaluations looks better than it is: `lare evaluate --best` plays it from starts that none of them has used.
 """
@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from lare.errors import LareError
 from lare.files import write_atomically
-from lare.run.checkpoint import DAMAGED, opened
+from lare.run.checkpoint import DAMAGED, fill, named_leaves, opened
 
 FILE = "best.npz"
 
@@ -26,9 +26,9 @@ class Best(NamedTuple):
     score: Float[np.ndarray, " seeds"]
     """The mean return of its best evaluation; -inf before the first."""
     step: Int[np.ndarray, " seeds"]
-    """When that was."""
+    """The environment step of that evaluation."""
     actor: Any
-    """What was needed to act then. None before the first evaluation."""
+    """The arrays that are needed to act as it did. None before the first evaluation."""
 
 
 def none_yet(seeds: int) -> Best:
@@ -37,14 +37,14 @@ def none_yet(seeds: int) -> Best:
 
 
 def better_of(best: Best, score: Float[np.ndarray, " seeds"], step: int, actor: Any) -> Best:
-    """With the newest policy of those seeds whose evaluation was better than every one before. NaN is never better."""
+    """Each seed's newest policy where its evaluation beats all earlier ones, else the policy as it was. NaN beats nothing."""
     better = np.asarray(score) > best.score
     if best.actor is None:
         kept = jax.tree.map(np.asarray, actor)
     else:
 
-        def chosen(old: np.ndarray, new: Any) -> np.ndarray:
-            return np.where(better.reshape(-1, *[1] * (old.ndim - 1)), np.asarray(new), old)
+        def chosen(old: Any, new: Any) -> np.ndarray:
+            return np.where(better.reshape(-1, *[1] * (old.ndim - 1)), np.asarray(new), np.asarray(old))
 
         kept = jax.tree.map(chosen, best.actor, actor)
     return Best(np.where(better, score, best.score), np.where(better, step, best.step), kept)
@@ -52,8 +52,7 @@ def better_of(best: Best, score: Float[np.ndarray, " seeds"], step: int, actor: 
 
 def save(directory: Path, best: Best) -> None:
     """Write it into a checkpoint's directory. Raises `LareError` where it cannot be written."""
-    arrays = {place: np.asarray(leaf) for place, leaf in by_place(best.actor)}
-    arrays |= {"score": best.score, "step": best.step}
+    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(best).items()}
     directory.mkdir(exist_ok=True)
     write_atomically(directory / FILE, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
@@ -76,25 +75,6 @@ def load(directory: Path, shapes: Any, seeds: Sequence[int]) -> Best:
         )
     try:
         with opened(path) as saved:
-            leaves = [as_shaped(saved[place], leaf, place) for place, leaf in by_place(shapes)]
-            score, step = (
-                as_shaped(saved[name], np.zeros(len(seeds), kind), name)
-                for name, kind in (("score", float), ("step", int))
-            )
+            return fill(none_yet(len(seeds))._replace(actor=shapes), saved)
     except DAMAGED as error:
         raise LareError(f"{path} cannot be read: {error or type(error).__name__}") from error
-    return Best(score, step, jax.tree.unflatten(jax.tree.structure(shapes), leaves))
-
-
-def by_place(actor: Any) -> list[tuple[str, Any]]:
-    """Every array of it, with its place as a name."""
-    return [
-        (f"actor{jax.tree_util.keystr(path)}", leaf) for path, leaf in jax.tree_util.tree_flatten_with_path(actor)[0]
-    ]
-
-
-def as_shaped(array: np.ndarray, like: Any, name: str) -> np.ndarray:
-    """The array. Raises `ValueError` where it has not the shape and type that it should have."""
-    if array.shape != like.shape or array.dtype != like.dtype:
-        raise ValueError(f"{name} is {array.dtype}{list(array.shape)}, not {like.dtype}{list(like.shape)}")
-    return array

@@ -66,6 +66,7 @@ class WithReplay(Protocol):
 
 
 Some = TypeVar("Some", bound=WithReplay)
+Filled = TypeVar("Filled")
 
 
 @contextlib.contextmanager
@@ -204,19 +205,25 @@ def saved_host(directory: Path) -> dict[str, Any] | None:
         return None
 
 
-def fill(template: Some, state: Mapping[str, np.ndarray]) -> Some:
+def fill(template: Filled, state: Mapping[str, np.ndarray]) -> Filled:
+    """The template with the saved arrays for its leaves. Those that are NumPy's stay NumPy's, with 64 bits.
+
+    Raises `ValueError` where a shape or a type differs, `KeyError` where an array is missing.
+    """
     known = named_leaves(template)
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     filled = []
     for path, leaf in leaves:
         name = jax.tree_util.keystr(path)
-        if name in known and name.startswith(REPLAY):
-            state = {**state, name: grown(state[name], leaf.shape)}
-        if name in known and state[name].shape != leaf.shape:
-            raise ValueError(f"{name} has shape {state[name].shape}, not {leaf.shape}")
-        if name in known and state[name].dtype != leaf.dtype:
-            raise ValueError(f"{name} holds {state[name].dtype}, not {leaf.dtype}")
-        filled.append(jnp.asarray(state[name]) if name in known else leaf)
+        if name not in known:
+            filled.append(leaf)
+            continue
+        array = grown(state[name], leaf.shape) if name.startswith(REPLAY) else state[name]
+        if array.shape != leaf.shape:
+            raise ValueError(f"{name} has shape {array.shape}, not {leaf.shape}")
+        if array.dtype != leaf.dtype:
+            raise ValueError(f"{name} holds {array.dtype}, not {leaf.dtype}")
+        filled.append(array if isinstance(leaf, np.ndarray) else jnp.asarray(array))
     return jax.tree.unflatten(structure, filled)
 
 
