@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check docs setup clean
+.PHONY: demo test check docs site setup clean
 
 demo: setup ## Train HalfCheetah on episodic rewards with recorded replies, and draw the report
 	@if [ -e runs/demo ]; then $(BIN)/lare train --resume runs/demo; \
@@ -19,7 +19,11 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-docs: setup ## The documentation as a site, in site/
+docs: setup ## The documentation as a site, in site/, once every command and snippet in it has run
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m docs
+	$(MAKE) site
+
+site: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "to read it: $(BIN)/mkdocs serve, or open site/index.html"
 

@@ -5,6 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.docs
 NOTEBOOK = Path(__file__).parents[1] / "examples" / "first_run.ipynb"
 EXECUTE = """
 import sys

@@ -41,7 +41,7 @@ def test_decoders_are_fitted_before_the_first_update_and_then_every_so_often(sma
     assert (fits, done) == ([0, 100], [0, 50, 100, 150])
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", ["CN-15", "PP-30", "TriangleArea", "CompetitivePP-6"])  # of each kind, and of many
 def test_every_particle_task_trains_with_its_recorded_functions(task, small_many, tmp_path):
     run = lare.train(task, small_many(steps=100), out=tmp_path / "run", listeners=[])
     teams, lines = [team.name for team in TASKS[task].teams], run.metrics()
@@ -68,10 +68,9 @@ def test_the_return_is_the_mean_over_the_agents_and_the_sum_is_reported_beside_i
 @pytest.mark.parametrize(
     ("task", "algorithm", "method"),
     [
-        ("CN-6", "ippo", "lare-rd"),
         ("CompetitivePP-6", "ippo", "lare-linear"),
         ("echo", "qmix", "lare-rrdu"),
-        ("echo", "ippo", "rrdu"),
+        ("echo", "ippo", "lare-rd"),
     ],
 )
 def test_a_stopped_run_resumes_bit_for_bit(task, algorithm, method, small_many, echo, tmp_path):
@@ -105,7 +104,7 @@ def test_what_dies_between_two_checkpoints_is_done_again(small_many, tmp_path):
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
-@pytest.mark.parametrize("judges", ["before", "after", "both"])
+@pytest.mark.parametrize("judges", ["before", "both"])
 def test_judges(judges, small_many, tmp_path):
     run = lare.train(OF_CHOICE, small_many(judges=judges, steps=100), out=tmp_path / "run", listeners=[])
     config, learner, _, _ = sessions.load_learner(run)

@@ -33,7 +33,7 @@ def episodes_of(steps):
     return [[np.arange(a, b) for a, b in zip([0, *of_env], of_env, strict=False)] for of_env in ends]
 
 
-@pytest.mark.parametrize("method", ["dense", "episodic", "lare-rd"])
+@pytest.mark.parametrize("method", ["episodic", "lare-rd"])
 def test_episodes_against_the_steps_that_were_stored(method):
     config, steps = qmix(method), steps_of(TOGETHER, 2)
     learner = stored(config)

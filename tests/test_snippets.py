@@ -1,0 +1,342 @@
+"""Every command and every snippet of the documentation runs, page by page, from top to bottom: `make docs`.
+
+A page is run as it stands, but for its budgets: `CUTS` makes numbers of steps and episodes small, `miniature` networks and
+batches. A function of the table `BEFORE` makes whatever the reader of a page already has (a log, a server).
+"""
+
+import json
+import os
+import re
+import shlex
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+
+import lare
+from lare.experiments import processes, statistics
+from lare.experiments.sweep import read_sweep
+from lare.foreign import read_toml
+from lare.run.directory import describe
+from lare.tasks import env, spec
+from lare.training import train as training
+from paper.exhibits import Exhibit
+from servers import Server, completion
+
+pytestmark = pytest.mark.docs
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md")])
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+RUNNABLE = ("sh", "python", "toml")
+
+
+def blocks(page):
+    """Language and text of every block that is to be run."""
+    return [(name, text) for name, text in BLOCK.findall(page.read_text(encoding="utf-8")) if name in RUNNABLE]
+
+
+WITH_BLOCKS = [str(page.relative_to(ROOT)) for page in PAGES if blocks(page)]
+
+SELF_HOSTED = "http://localhost:11434/v1"
+
+CUTS = {
+    r"HalfCheetah-v4": "Reacher-v4",
+    r"--steps 100000": "--steps 200 --td3.warmup 100 --evaluation-episodes 1",
+    r"--resume runs/lare --steps 200000": "--resume runs/lare --steps 400",
+    r"--steps 20000 --td3.warmup 1000": "--steps 400 --td3.warmup 100 --evaluation-episodes 1",
+    r"--steps 40000": "--steps 600",
+    r"steps=(100|20)_000": "steps=400, evaluation_episodes=1",
+    r"--seeds 3|seeds=3": lambda found: found[0].replace("3", "2"),
+    r"(lare train (CN|PP|CompetitivePP|TriangleArea)-?6?.*)": r"\1 --steps 200 --environments 4 --evaluation-episodes 1",
+    r"(lare train spread.toml.*)": r"\1 --steps 400 --evaluation-episodes 1",
+    r"lare train SMAX-\w+": "lare train SMAX-2s3z",
+    r"--qmix.*": "",
+    r"(lare train SMAX-.*)": r"\1 --steps 1200 --environments 2 --evaluation-episodes 1",
+    r"(lare train \S+ --method \w+-?\w*)$": r"\1 --steps 200 --td3.warmup 100 --evaluation-episodes 1",
+    r"--budget laptop|reproduce errors": lambda found: f"{found[0].split(' --')[0]} --budget smoke",
+    r"--episodes 20|episodes=20": lambda found: found[0].replace("20", "1"),
+    r"learn\(1_000_000": "learn(1100",
+    r"runs/\.\.\.": "runs/Reacher-v4-lare-bayes-td3-s0",
+}
+"""What is run instead of what stands there, by regular expression: short runs, on a task of short episodes."""
+
+
+def cut(text):
+    for pattern, less in CUTS.items():
+        text = re.sub(pattern, less, text, flags=re.MULTILINE)
+    return text
+
+
+class Page:
+    """What a page is run with: a directory, variables of the environment, names of Python."""
+
+    def __init__(self, command, monkeypatch, directory):
+        self.command, self.patch, self.directory = command, monkeypatch, directory
+        self.names = {}
+        self.ran = []
+
+    def given(self, code):
+        """Names that the page assumes."""
+        exec(code, self.names)
+
+    def write(self, name, text):
+        path = self.directory / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+    def serve(self, source):
+        """A language model that always writes the same function, wherever the page says that one is."""
+        reply = json.dumps({"Understand": "", "Analyze": "", "Functions": source})
+        server = Server(lambda handler: handler.send(200, json.dumps(completion(reply)).encode()))
+        self.patch.setenv("OPENAI_BASE_URL", server.url)
+        self.patch.setenv("OPENAI_API_KEY", "key")
+        self.url = server.url
+        return server
+
+    def shell(self, line):
+        """A command, or an assignment."""
+        words = shlex.split(line, comments=True)
+        if not words:
+            return
+        self.ran.append(line)
+        match words:
+            case ["export", *given]:
+                for one in given:
+                    name, value = one.split("=", 1)
+                    if value != "...":
+                        self.patch.setenv(name, value.replace("$PWD", os.getcwd()))
+            case ["lare", *arguments]:
+                status, out, err = self.command(*arguments)
+                assert status == 0, f"{line}\n{out}\n{err}"
+            case ["make", target]:
+                assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+            case ["pip", "install", *packages]:
+                project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+                extras = {f"lare-rl[{name}]" for name in project["optional-dependencies"]}
+                developed = " ".join(project["optional-dependencies"]["dev"])
+                assert all(package in extras or package in developed for package in packages)
+            case ["python", path, *_] | [".venv/bin/python", "-m", "pytest", path]:
+                assert (ROOT / path).exists()
+            case [".venv/bin/ruff", *_]:
+                assert "ruff check" in (ROOT / "Makefile").read_text()
+            case _:
+                pytest.fail(f"nothing is known of {line!r}")
+
+    def run(self, language, text):
+        if language == "sh":
+            for line in text.splitlines():
+                self.shell(cut(line.split("  #")[0].strip()).replace(SELF_HOSTED, self.url))
+        elif language == "python":
+            exec(compile(cut(text).replace(SELF_HOSTED, self.url), "snippet", "exec"), self.names)
+
+    url = "none"
+
+
+def made_up(job, cores, running):
+    """Instead of training a run of a sweep: metrics as it would have them."""
+    job.directory.mkdir(parents=True)
+    (job.directory / "config.json").write_text(describe(job.task, job.resolved, ()).model_dump_json())
+    lines = [
+        {"step": job.resolved.steps, "seed": seed, "evaluation/return": float(seed), "credit/error": 1.0}
+        for seed in job.resolved.all_seeds
+    ]
+    (job.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def python_of(page, number):
+    """One of its blocks."""
+    return [text for language, text in blocks(ROOT / page) if language == "python"][number]
+
+
+def toml_of(page, number):
+    return [text for language, text in blocks(ROOT / page) if language == "toml"][number]
+
+
+PENDULUM = python_of("docs/bring-your-own-task.md", 0)
+STUDY = toml_of("docs/sweeps.md", 0)
+
+
+def a_study(page):
+    """The files that the study names; its runs are not trained."""
+    page.write("study.toml", STUDY)
+    page.write("my-task.toml", toml_of("docs/bring-your-own-task.md", 0).replace('"Pendulum"', '"MyTask"'))
+    page.write("phi.py", PENDULUM)
+    page.patch.setattr(processes, "in_a_process", made_up)
+    page.patch.setattr(statistics, "REPETITIONS", 50)
+
+
+def logs(page):
+    """Episodes of HalfCheetah as files, and as a data set of Minari's."""
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    page.patch.setenv("MINARI_DATASETS_PATH", str(page.directory / "minari"))
+    random = np.random.default_rng(0)
+
+    def episode(steps=60):
+        observations = random.normal(size=(steps + 1, 17)) + random.normal(size=17)
+        rewards = observations[1:, 8] + 1.0
+        return (
+            observations,
+            random.normal(size=(steps, 6)),
+            rewards,
+            np.zeros(steps, bool),
+            np.arange(steps) == steps - 1,
+        )
+
+    (page.directory / "runs" / "2024").mkdir(parents=True)
+    names = ("observations", "actions", "rewards", "terminations", "truncations")
+    for number in range(90):
+        np.savez(page.directory / "runs" / "2024" / f"{number}.npz", **dict(zip(names, episode(), strict=True)))
+    buffers = [
+        EpisodeBuffer(
+            observations=seen, actions=action, rewards=list(paid), terminations=list(over), truncations=list(cut)
+        )
+        for seen, action, paid, over, cut in (episode() for _ in range(90))
+    ]
+    box = gymnasium.spaces.Box
+    minari.create_dataset_from_buffers(
+        "mujoco/hopper/medium-v0",
+        buffers,
+        observation_space=box(-np.inf, np.inf, (17,), np.float64),
+        action_space=box(-1, 1, (6,), np.float64),
+    )
+    page.serve(lare.design("HalfCheetah-v4").source)
+
+
+def a_run(page):
+    settings = lare.Settings(method="lare-bayes", steps=400, evaluation_episodes=1, seeds=2)
+    return lare.train("Reacher-v4", settings, out="runs/lare", listeners=[])
+
+
+def for_the_api(page):
+    run = a_run(page)
+    page.patch.setenv("WANDB_MODE", "offline")
+    page.names["model"] = SimpleNamespace(name="says", reply=lambda messages, sample: reply_of(run.functions[0].source))
+    page.given(
+        "import gymnasium, numpy as np\n"
+        "envs = gymnasium.make_vec('Reacher-v4', num_envs=4)\n"
+        "observation, _ = envs.reset(seed=0)\n"
+        "action = envs.action_space.sample()\n"
+        "next_observation, reward, terminated, truncated, _ = envs.step(action)\n"
+        "before, after = observation, next_observation\n"
+    )
+
+
+def reply_of(source):
+    return json.dumps({"Understand": "", "Analyze": "", "Functions": source})
+
+
+def an_export(page):
+    run = a_run(page)
+    lare.export(run, page.directory / "exported")
+    page.patch.chdir(page.directory / "exported")
+    page.patch.syspath_prepend(page.directory / "exported")
+    page.given(
+        "import numpy as np\n"
+        "observations = before = after = np.ones((5, 11), np.float32)\naction = np.ones((5, 2), np.float32)"
+    )
+
+
+def for_the_architecture(page):
+    page.names |= {name: getattr(env, name) for name in ("EnvSpec", "Team", "Timestep")}
+    page.names |= {"TaskSpec": spec.TaskSpec, "my_game": SimpleNamespace(load=lambda name, **arguments: name)}
+
+
+def a_function(page):
+    lare.design("Reacher-v4").save(page.directory / "phi.py")
+
+
+def a_user(page):
+    page.serve(PENDULUM)
+    page.write("phi.py", PENDULUM)
+
+
+def for_the_readme(page):
+    a_study(page)
+    (page.directory / "phi.py").unlink()
+    page.write("study.toml", STUDY.replace('["phi.py"]', '["mine.py"]'))
+    page.write("mine.py", PENDULUM)
+    page.serve(PENDULUM)
+
+
+BEFORE = {
+    "README.md": for_the_readme,
+    "docs/api.md": for_the_api,
+    "docs/architecture.md": for_the_architecture,
+    "docs/bring-your-own-task.md": a_user,
+    "docs/export.md": an_export,
+    "docs/logs.md": logs,
+    "docs/plugs/sb3.md": a_function,
+    "docs/reproduce.md": a_study,
+    "docs/runs.md": a_run,
+    "docs/starcraft.md": a_study,
+    "docs/sweeps.md": a_study,
+}
+"""What the reader of a page has."""
+
+EXCERPTS = {"docs/plugs/others.md": ("tianshou_td3.py", "skrl_td3.py", "rllib_ppo.py")}
+"""Pages whose snippets are lines of examples, which `test_examples.py` runs where the library is installed."""
+
+
+@pytest.fixture
+def miniature(monkeypatch):
+    """Every run that begins in this process is as it is asked for, but for small networks and little work for them."""
+    decide = training.decide
+
+    def smaller(settings, task):
+        plan = decide(settings, task)
+        credit = plan.credit.model_copy(update={"hidden": (8,), "drawn_steps": 4, "steps": 16})
+        algorithm = plan.hyperparameters
+        less = {"hidden": 8 if plan.algorithm in ("qmix", "vdn") else (8,), "batch_size": 8, "epochs": 1}
+        less = {name: value for name, value in less.items() if name in type(algorithm).model_fields}
+        changes = {"credit": credit, "hyperparameters": algorithm.model_copy(update=less), "fit_updates": 1}
+        return plan.model_copy(update=changes)
+
+    monkeypatch.setattr(training, "decide", smaller)
+
+
+@pytest.mark.usefixtures("miniature")
+@pytest.mark.filterwarnings("ignore:.*(HalfCheetah-v4 is out of date|v4 is out of date)")
+@pytest.mark.parametrize("name", [name for name in WITH_BLOCKS if name not in EXCERPTS])
+def test_a_page_runs(name, command, monkeypatch, tmp_path):
+    page = Page(command, monkeypatch, tmp_path)
+    BEFORE.get(name, lambda page: None)(page)
+    for language, text in blocks(ROOT / name):
+        page.run(language, text)
+
+
+@pytest.mark.parametrize(("name", "examples"), EXCERPTS.items())
+def test_an_excerpt_is_in_its_example(name, examples):
+    for example, (_, text) in zip(examples, blocks(ROOT / name), strict=True):
+        whole = re.sub(r"\s+", "", (ROOT / "examples" / example).read_text(encoding="utf-8"))
+        for line in text.splitlines():
+            assert re.sub(r"\s+", "", line.split("  #")[0]) in whole
+
+
+def test_task_files_are_task_files(tmp_path):
+    """Those of one agent and of many; and of two teams, where the page leaves out the texts."""
+    for number in range(4):
+        text = toml_of("docs/bring-your-own-task.md", number)
+        if "description = " not in text:
+            text += "".join(f'{key} = "what it is"\n' for key in ("description", "observation", "action"))
+        name = tomllib.loads(text)["name"]
+        (tmp_path / ("simple_adversary_v3-adversary.toml" if name == "adversary" else f"{name}.toml")).write_text(text)
+    other = (tmp_path / "simple_adversary_v3-adversary.toml").read_text().replace("adversary_*", "agent_*")
+    (tmp_path / "simple_adversary_v3-agent.toml").write_text(other.replace('name = "adversary"', 'name = "agent"'))
+    loaded = [lare.load_task(tmp_path / f"{name}.toml") for name in ("Pendulum", "spread", "simple_adversary_v3")]
+    assert [len(task.roles) for task in loaded] == [1, 1, 2]
+
+
+def test_a_study_can_be_trained(monkeypatch, tmp_path):
+    a_study(Page(None, monkeypatch, tmp_path))
+    _, jobs = read_sweep(tmp_path / "study.toml")
+    assert len(jobs) == 2 * (2 + 2 + 3 + 1)
+
+
+def test_an_exhibit_of_ones_own():
+    assert list(Exhibit(**read_toml(toml_of("docs/reproduce.md", 0))).contenders) == ["64 units", "256 units"]
