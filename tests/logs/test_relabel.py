@@ -2,6 +2,9 @@
 
 import json
 import math
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -23,7 +26,7 @@ def test_a_linear_score_is_found_and_told_from_unseen_returns(folder, tmp_path):
     assert (found.method, found.episodes, found.cut, found.held_out) == ("bayes", 120, 0, 12)
     assert found.return_r2 > 0.98
     assert any("Raw features explain" in line for line in found.explanation)
-    assert "12 episodes that were held out, which nothing was fitted to, are predicted with an R^2 of" in found.words[1]
+    assert "12 episodes held out, which nothing was fitted to, are predicted with an R^2 of" in found.words[1]
     for old, new in zip(logged(120), read(tmp_path / "new"), strict=True):
         np.testing.assert_array_equal(new["paid"], old["rewards"])
         np.testing.assert_allclose(new["rewards"], old["rewards"], atol=0.5)
@@ -54,7 +57,7 @@ def test_cut_episodes_are_paid_and_not_learned_from(folder, tmp_path):
     found = lare.relabel(folder(episodes), tmp_path / "new", hold_out=0.2)
     assert found.cut == 5
     assert found.return_r2 > 0.95
-    assert "5 of the episodes were cut before their end: they were not learned from." in found.words
+    assert "Cut before their end, and not learned from: 5 episodes." in found.words
     assert np.abs(read(tmp_path / "new")[3]["rewards"]).max() < 20
 
 
@@ -199,7 +202,7 @@ def test_the_command(command, folder, tmp_path, task):
     (tmp_path / "phi.py").write_text(PHI)
     options = ("--task", "task.toml", "--function", "phi.py", "--hold-out", "0.2")
     status, said, wrong = command("relabel", path, "--out", "new", *options)
-    assert (status, wrong) == (0, "")
+    assert (status, wrong) == (0, "learning, 40 episodes\nwriting, 40 episodes\n")
     assert "lare-bayes" in said.splitlines()[0]
     assert said.splitlines()[-1] == "wrote new"
     assert command("relabel", path, "--out", "new") == (
@@ -225,3 +228,14 @@ def test_a_directory_of_other_files_is_never_replaced(folder, tmp_path):
         f"{tmp_path / 'precious'} holds thesis.txt, which is no log, and is not replaced: choose another --out"
     )
     assert (tmp_path / "precious" / "thesis.txt").read_text() == "years"
+
+
+def test_one_that_is_asked_to_end_leaves_nothing_behind(folder, tmp_path):
+    path = folder(logged(3000))
+    command = [sys.executable, "-c", "from lare.cli import main; main()", "relabel", str(path), "--out", "new"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as running:
+        while not running.stderr.readline().startswith("writing"):
+            assert running.poll() is None
+        running.terminate()
+    assert running.returncode == 128 + signal.SIGTERM
+    assert [one.name for one in tmp_path.iterdir() if "new" in one.name] == []

@@ -1,5 +1,6 @@
 """Logs of the past: rewards for steps that somebody recorded."""
 
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,7 +10,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare.cli.terminal import say
+from lare.cli.terminal import progress, say
 
 
 def relabel(
@@ -52,6 +53,8 @@ def relabel(
         if spec is None:
             raise LareError("--function needs the --task that it was designed for")
         phi = lare.load_function(function, spec, steps=lare.logged_steps(dataset, spec))
+    # So that what is half written is removed where the process is asked to end.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     with shown() as told:
         found = lare.relabel(
             dataset,
@@ -73,7 +76,7 @@ def relabel(
 
 @contextmanager
 def shown() -> Iterator:
-    """A progress bar on stderr for each pass, where that is a terminal."""
+    """A progress bar on stderr for each pass; a line, where that is no terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -83,7 +86,10 @@ def shown() -> Iterator:
 
         def told(stage: str, done: int, count: int | None) -> None:
             if stage not in passes:
-                passes[stage] = bars.add_task({"fit": "learning", "write": "writing"}[stage], total=count)
+                name = {"fit": "learning", "write": "writing"}[stage]
+                passes[stage] = bars.add_task(name, total=count)
+                if bars.disable:
+                    progress(f"{name}, {'an unknown number of' if count is None else f'{count:,}'} episodes")
             bars.update(passes[stage], completed=done)
 
         yield told

@@ -54,21 +54,27 @@ class Relabelled:
     @property
     def words(self) -> list[str]:
         """All of it, a sentence each."""
-        said = [f"{self.steps:,} steps of {self.episodes:,} episodes were given rewards by {self.method}."]
+        steps, episodes = (number_of(*one) for one in ((self.steps, "step"), (self.episodes, "episode")))
+        said = [f"{self.method} gave rewards to {steps} of {episodes}."]
         if self.cut:
-            said.append(f"{self.cut:,} of the episodes were cut before their end: they were not learned from.")
+            said.append(f"Cut before their end, and not learned from: {number_of(self.cut, 'episode')}.")
         said += predicted(self)
         return [*said, *self.explanation]
+
+
+def number_of(count: int, name: str) -> str:
+    """Things, counted."""
+    return f"{count:,} {name}{'' if count == 1 else 's'}"
 
 
 def predicted(found: Relabelled) -> list[str]:
     """How well unseen returns are predicted, in words."""
     if found.held_out < FEWEST:
         return [
-            f"How well unseen returns are predicted is not known: {found.held_out} episodes were held out, and {FEWEST} "
-            "are needed: hold out a larger share (--hold-out 0.2)."
+            f"How well unseen returns are predicted is not known: {number_of(found.held_out, 'episode')} held out, and {FEWEST} "
+            "are needed. Hold out a larger share (--hold-out 0.2)."
         ]
-    of = f"returns of {found.held_out:,} episodes that were held out"
+    of = f"returns of {number_of(found.held_out, 'episode')} held out"
     if math.isnan(found.return_correlation):
         return [f"The {of}, or what is predicted of them, are all the same: nothing can be said of these rewards."]
     if math.isnan(found.return_r2):
