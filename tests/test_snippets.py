@@ -116,6 +116,9 @@ class Page:
             case ["lare", *arguments]:
                 status, out, err = self.command(*arguments)
                 assert status == 0, f"{line}\n{out}\n{err}"
+                if arguments[0] == "new-task":  # the reader fills it in
+                    draft = Path(arguments[-1])
+                    draft.write_text(draft.read_text().replace(spec.FILL_IN, "what it is"))
             case ["make", target]:
                 assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
             case ["pip", "install", *packages]:
