@@ -1,0 +1,148 @@
+"""What each adapter adds to a step: processor milliseconds with `lare-bayes` (of PettingZoo `bayes`) beside the library alone.
+
+    python benchmarks/plugs_cost.py                  results/plugs/cost.json
+    python benchmarks/plugs_cost.py --sbx            the same of SBX's SAC, where SBX is installed: results/plugs/cost_sbx.json
+
+A turn is a thousand environment steps of HalfCheetah-v4: one episode ends in it, and one decoder is fitted in closed form. With
+PettingZoo it is forty episodes of CN-6. By turns within one process, on one core. What is stepped:
+
+    Gymnasium            a single environment with random actions, paid r_hat at every step
+    PettingZoo           six agents with random actions, paid r_hat at every step
+    TorchRL              a replay buffer: 1,000 rows in, then one draw of 256 for each of them
+    Stable-Baselines3    PPO as in `plugs_sb3.py`, two rollouts. What its TD3 costs is measured there
+    SBX                  SAC as in `plugs_sb3.py`, an update at each step
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+import torch
+import tyro
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+import lare
+from lare.plugs.gymnasium import Credit
+from lare.plugs.pettingzoo import CreditParallel
+from lare.plugs.torchrl import CreditTransform
+from lare.tasks.particles.pettingzoo import ParticleEnv
+from measure import interleave, provenance, show, summary, write
+from plugs_sb3 import TASK, assigner, environment_of, ppo, sbx_sac
+
+STEPS = 1000
+PLAIN, PLUG = "plain", "with the plug"
+
+Turns = Mapping[str, Callable[[], object]]
+
+
+def of_gymnasium(task: lare.TaskSpec) -> Turns:
+    """An episode of random actions."""
+    plain = environment_of(task, dense=False)
+
+    def play(environment: gymnasium.Env) -> None:
+        environment.reset(seed=0)
+        for _ in range(STEPS):
+            environment.step(environment.action_space.sample())
+
+    plugged = Credit(environment_of(task, dense=False), assigner("lare-bayes", task, 0))
+    return {PLAIN: partial(play, plain), PLUG: partial(play, plugged)}
+
+
+def of_pettingzoo() -> Turns:
+    """Forty episodes of random actions of six agents."""
+    one = ParticleEnv("CN-6")
+    spaces = {"observation_space": one.observation_space("agent_0"), "action_space": one.action_space("agent_0")}
+    credit = lare.CreditAssigner("bayes", **spaces, agents=6, max_steps=25)
+
+    def play(environment: Any) -> None:
+        for episode in range(STEPS // 25):
+            environment.reset(seed=episode)
+            while environment.agents:
+                environment.step({agent: environment.action_space(agent).sample() for agent in environment.agents})
+
+    return {PLAIN: partial(play, one), PLUG: partial(play, CreditParallel(ParticleEnv("CN-6"), credit))}
+
+
+def of_torchrl(task: lare.TaskSpec) -> Turns:
+    """An episode goes into the buffer, and a batch is drawn for each of its steps."""
+    environment, rows = environment_of(task, dense=False), []
+    observation, _ = environment.reset(seed=0)
+    for _ in range(STEPS):
+        action = environment.action_space.sample()
+        after, reward, terminated, truncated, _ = environment.step(action)
+        done = torch.tensor([terminated or truncated])
+        ends = {"done": done, "terminated": torch.tensor([terminated]), "truncated": torch.tensor([truncated])}
+        led_to = {"observation": torch.tensor(after), "reward": torch.tensor([reward], dtype=torch.float32), **ends}
+        rows.append(
+            TensorDict({"observation": torch.tensor(observation), "action": torch.tensor(action), "next": led_to})
+        )
+        observation = after
+    episode = torch.stack(rows)
+
+    def train(buffer: TensorDictReplayBuffer) -> None:
+        buffer.extend(episode.clone())
+        for _ in range(STEPS):
+            buffer.sample()
+
+    def buffer(**more: Any) -> TensorDictReplayBuffer:
+        return TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=256, **more)
+
+    plugged = buffer(transform=CreditTransform(assigner("lare-bayes", task, 0)))
+    return {PLAIN: partial(train, buffer()), PLUG: partial(train, plugged)}
+
+
+def of_ppo(task: lare.TaskSpec) -> Turns:
+    """Two rollouts, and what is learned from them."""
+
+    def learning(rewards: str) -> Callable[[], object]:
+        model, callbacks = ppo(task, rewards, 0)
+        return lambda: model.learn(STEPS, callback=callbacks, reset_num_timesteps=False, log_interval=1_000_000)
+
+    return {PLAIN: learning("episodic"), PLUG: learning("lare-bayes")}
+
+
+def of_sbx(task: lare.TaskSpec) -> Turns:
+    """A step and an update."""
+
+    def learning(rewards: str) -> Callable[[], object]:
+        model = sbx_sac(task, rewards, 0, STEPS)
+        model.learn(STEPS)  # random steps, without an update
+        return lambda: model.learn(STEPS, reset_num_timesteps=False, log_interval=1_000_000)
+
+    return {PLAIN: learning("episodic"), PLUG: learning("lare-bayes")}
+
+
+def main(rounds: int = 5, sbx: bool = False) -> None:
+    """Measure.
+
+    Args:
+        rounds: how often each has its turn, after one that is not counted.
+        sbx: SBX's SAC alone.
+    """
+    task = lare.load_task(TASK)
+    contenders = {
+        "Gymnasium": (partial(of_gymnasium, task), STEPS),
+        "PettingZoo": (of_pettingzoo, STEPS),
+        "TorchRL": (partial(of_torchrl, task), STEPS),
+        "Stable-Baselines3, PPO": (partial(of_ppo, task), 2000),  # a rollout is 2,000 steps, whatever is asked for
+    }
+    if sbx:
+        contenders = {"SBX, SAC": (partial(of_sbx, task), STEPS)}
+    tables = {}
+    for name, (turns, steps) in contenders.items():
+        tables[name] = summary(interleave(turns(), rounds, time.process_time), steps, PLAIN)
+        show(f"{name}, processor time", tables[name], PLAIN)
+    figures = {"task": TASK, "seeds": [0], "rounds": rounds, "processor milliseconds for a step": tables}
+    write("plugs/cost_sbx" if sbx else "plugs/cost", {**provenance(), **figures})
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_platforms", "cpu")
+    torch.set_num_threads(1)
+    np.random.seed(0)
+    tyro.cli(main, description=__doc__)
