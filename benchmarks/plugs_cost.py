@@ -9,7 +9,7 @@ PettingZoo it is forty episodes of CN-6. By turns within one process, on one cor
     Gymnasium            a single environment with random actions, paid r_hat at every step
     PettingZoo           six agents with random actions, paid r_hat at every step
     TorchRL              a replay buffer: 1,000 rows in, then one draw of 256 for each of them
-    Stable-Baselines3    PPO as in `plugs_sb3.py`, two rollouts. What its TD3 costs is measured there
+    Stable-Baselines3    PPO as in `plugs_sb3.py`, a rollout of two episodes. What its TD3 costs is measured there
     SBX                  SAC as in `plugs_sb3.py`, an update at each step
 """
 
@@ -97,7 +97,7 @@ def of_torchrl(task: lare.TaskSpec) -> Turns:
 
 
 def of_ppo(task: lare.TaskSpec) -> Turns:
-    """Two rollouts, and what is learned from them."""
+    """A rollout, and what is learned from it."""
 
     def learning(rewards: str) -> Callable[[], object]:
         model, callbacks = ppo(task, rewards, 0)
