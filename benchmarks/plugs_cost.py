@@ -56,7 +56,10 @@ def of_gymnasium(task: lare.TaskSpec) -> Turns:
 def of_pettingzoo() -> Turns:
     """Forty episodes of random actions of six agents."""
     one = ParticleEnv("CN-6")
-    spaces = {"observation_space": one.observation_space("agent_0"), "action_space": one.action_space("agent_0")}
+    spaces: dict[str, Any] = {
+        "observation_space": one.observation_space("agent_0"),
+        "action_space": one.action_space("agent_0"),
+    }
     credit = lare.CreditAssigner("bayes", **spaces, agents=6, max_steps=25)
 
     def play(environment: Any) -> None:
@@ -82,7 +85,7 @@ def of_torchrl(task: lare.TaskSpec) -> Turns:
             TensorDict({"observation": torch.tensor(observation), "action": torch.tensor(action), "next": led_to})
         )
         observation = after
-    episode = torch.stack(rows)
+    episode: Any = torch.stack(rows)
 
     def train(buffer: TensorDictReplayBuffer) -> None:
         buffer.extend(episode.clone())
@@ -101,7 +104,7 @@ def of_ppo(task: lare.TaskSpec) -> Turns:
 
     def learning(rewards: str) -> Callable[[], object]:
         model, callbacks = ppo(task, rewards, 0)
-        return lambda: model.learn(STEPS, callback=callbacks, reset_num_timesteps=False, log_interval=1_000_000)
+        return lambda: model.learn(STEPS, callback=[*callbacks], reset_num_timesteps=False, log_interval=1_000_000)
 
     return {PLAIN: learning("episodic"), PLUG: learning("lare-bayes")}
 
