@@ -115,7 +115,8 @@ class Page:
                         self.patch.setenv(name, value.replace("$PWD", os.getcwd()))
             case ["lare", *arguments]:
                 status, out, err = self.command(*arguments)
-                assert status == 0, f"{line}\n{out}\n{err}"
+                undrawn = "--video" in arguments and "cannot be drawn here" in err  # a machine without graphics
+                assert status == 0 or undrawn, f"{line}\n{out}\n{err}"
                 if arguments[0] == "new-task":  # the reader fills it in
                     draft = Path(arguments[-1])
                     draft.write_text(draft.read_text().replace(spec.FILL_IN, "what it is"))
