@@ -53,7 +53,7 @@ CUTS = {
     r"steps=(100|20)_000": "steps=400, evaluation_episodes=1",
     r"--seeds 3|seeds=3": lambda found: found[0].replace("3", "2"),
     r"(lare train (CN|PP|CompetitivePP|TriangleArea)-?6?.*)": r"\1 --steps 200 --environments 4 --evaluation-episodes 1",
-    r"(lare train spread.toml.*)": r"\1 --steps 400 --evaluation-episodes 1",
+    r"(lare train spread.toml.*)": r"\1 --steps 2000 --evaluation-episodes 1",
     r"lare train SMAX-\w+": "lare train SMAX-2s3z",
     r"--qmix.* --steps": "--steps",
     r" --processes 2": "",
@@ -310,7 +310,7 @@ def miniature(monkeypatch):
 
 
 @pytest.mark.usefixtures("miniature")
-@pytest.mark.filterwarnings("ignore::UserWarning:minari")
+@pytest.mark.filterwarnings("ignore:.*v4 is out of date", "ignore::UserWarning:minari")
 @pytest.mark.parametrize("name", [name for name in WITH_BLOCKS if name not in EXCERPTS])
 def test_a_page_runs(name, command, monkeypatch, tmp_path):
     page = Page(command, monkeypatch, tmp_path)
