@@ -31,7 +31,7 @@ from lare.plugs.gymnasium import Credit
 from lare.plugs.pettingzoo import CreditParallel
 from lare.plugs.torchrl import CreditTransform
 from lare.tasks.particles.pettingzoo import ParticleEnv
-from measure import interleave, provenance, show, summary, write
+from measure import interleave, show, summary, write
 from plugs_sb3 import TASK, assigner, environment_of, ppo, sbx_sac
 
 STEPS = 1000
@@ -132,7 +132,7 @@ def main(rounds: int = 5, sbx: bool = False) -> None:
         "Gymnasium": (partial(of_gymnasium, task), STEPS),
         "PettingZoo": (of_pettingzoo, STEPS),
         "TorchRL": (partial(of_torchrl, task), STEPS),
-        "Stable-Baselines3, PPO": (partial(of_ppo, task), 2000),  # a rollout is 2,000 steps, whatever is asked for
+        "Stable-Baselines3, PPO": (partial(of_ppo, task), 2000),  # PPO always finishes its rollout of 2,000 steps
     }
     if sbx:
         contenders = {"SBX, SAC": (partial(of_sbx, task), STEPS)}
@@ -141,7 +141,7 @@ def main(rounds: int = 5, sbx: bool = False) -> None:
         tables[name] = summary(interleave(turns(), rounds, time.process_time), steps, PLAIN)
         show(f"{name}, processor time", tables[name], PLAIN)
     figures = {"task": TASK, "seeds": [0], "rounds": rounds, "processor milliseconds for a step": tables}
-    write("plugs/cost_sbx" if sbx else "plugs/cost", {**provenance(), **figures})
+    write("plugs/cost_sbx" if sbx else "plugs/cost", figures)
 
 
 if __name__ == "__main__":

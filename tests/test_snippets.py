@@ -81,7 +81,6 @@ class Page:
     def __init__(self, command, monkeypatch, directory):
         self.command, self.patch, self.directory = command, monkeypatch, directory
         self.names = {}
-        self.ran = []
 
     def given(self, code):
         """Names that the page assumes."""
@@ -94,19 +93,16 @@ class Page:
 
     def serve(self, source):
         """A language model that always writes the same function, wherever the page says that one is."""
-        reply = json.dumps({"Understand": "", "Analyze": "", "Functions": source})
-        server = Server(lambda handler: handler.send(200, json.dumps(completion(reply)).encode()))
+        server = Server(lambda handler: handler.send(200, json.dumps(completion(reply_of(source))).encode()))
         self.patch.setenv("OPENAI_BASE_URL", server.url)
         self.patch.setenv("OPENAI_API_KEY", "key")
         self.url = server.url
-        return server
 
     def shell(self, line):
         """A command, or an assignment."""
         words = shlex.split(line, comments=True)
         if not words:
             return
-        self.ran.append(line)
         match words:
             case ["export", *given]:
                 for one in given:

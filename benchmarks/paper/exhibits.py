@@ -74,7 +74,7 @@ class Exhibit(Checked):
     printed: dict[str, dict[str, str]] = Field(default_factory=dict)
     """The numbers that the paper prints, by task and label."""
     differences: tuple[str, ...] = ()
-    """From the paper, besides those that all exhibits share."""
+    """Differences from the paper, in addition to the ones that every exhibit has."""
 
     @field_validator("contenders", mode="before")
     @classmethod
@@ -103,7 +103,7 @@ class Budget(Checked):
     steps: int | None = None
     """Environment steps of one agent; the task's own, unless given."""
     steps_of_many: int | None = None
-    """Environment steps of tasks of many agents."""
+    """Environment steps of a run with many agents."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """That differ from the usual ones."""
     algorithms: dict[str, dict[str, Any]] = Field(default_factory=dict)

@@ -21,10 +21,10 @@ GRID += [
     ("qmix", method) for method in ("dense", "ircr", "rrdu", "diaster", "lare-rd", "lare-bayes", "llm-reward", "stas")
 ]
 GRID += [("ppo", method) for method in ("dense", "rrdu", "diaster", "arel", "lare-linear")]
-"""Every method with the algorithm that costs least of those that it is for; and pairs: each kind of reward (paid as it is, by a
-decoder, by the function itself), each way to fit, raw features and factors, with each way to consume steps. What a method adds to
-others of its kind is in its decoder and its features, which know of no algorithm; what they are of many agents is in
-`test_learner.py`. ppo is ippo of one agent."""
+"""Every method runs with one algorithm, the cheapest. The other rows are pairs: each kind of reward (as paid, by a decoder, by the
+function itself), each way to fit, raw features and factors meet each way to consume steps. The methods of one kind differ only
+in decoder and features, and these do not depend on the algorithm; `test_learner.py` tests them with many agents. ppo is ippo with
+one agent."""
 
 
 def task_of(kind):

@@ -206,7 +206,7 @@ def saved_host(directory: Path) -> dict[str, Any] | None:
 
 
 def fill(template: Filled, state: Mapping[str, np.ndarray]) -> Filled:
-    """The template with the saved arrays for its leaves. Those that are NumPy's stay NumPy's, with 64 bits.
+    """The template with the saved arrays for its leaves. A leaf that is a NumPy array stays one, and may have 64 bits.
 
     Raises `ValueError` where a shape or a type differs, `KeyError` where an array is missing.
     """
