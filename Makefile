@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check docs site setup clean
+.PHONY: demo test test-long check docs site setup clean
 
 demo: setup ## Train HalfCheetah on episodic rewards with recorded replies, and draw the report
 	@if [ -e runs/demo ]; then $(BIN)/lare train --resume runs/demo; \
@@ -13,6 +13,9 @@ demo: setup ## Train HalfCheetah on episodic rewards with recorded replies, and 
 
 test: check ## Lint, format, types, tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+test-long: setup ## The tests that repeat others with further algorithms, methods and tasks
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
 
 check: setup
 	$(BIN)/ruff check .

@@ -1,10 +1,10 @@
-"""What training many agents costs: ten updates of the policy and one fit of the decoder, by task and by method.
+"""The cost of training many agents: ten updates of the policy and one fit of the decoder, by task and by method.
 
     python benchmarks/agents_speed.py
 
 The contenders take turns; a turn is ten updates of one session, by the same `Session.advance` that `lare train` calls, so that
-it holds each thing as often as a whole run does. A run of 1000 updates takes a hundred turns, and its evaluations. The picture of
-cost by agents is docs/pictures/agents-cost.svg.
+each part of the work has the same share as in a whole run. A run of 1000 updates takes as long as a hundred turns and its
+evaluations. The picture of the cost by the number of agents is docs/pictures/agents-cost.svg.
 """
 
 import tempfile
@@ -25,7 +25,7 @@ from measure import advance, interleave, new_session, show, summary, write
 TASKS = ("TriangleArea", "CN-6", "CN-15", "CN-30")
 """3, 6, 15 and 30 agents."""
 FITTING = tuple(row.name for row in METHODS.values() if not row.for_one_only)
-"""Methods, on CN-6."""
+"""The methods that are measured on CN-6."""
 SEED = 0
 MINUTES = "minutes of 1000 updates"
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "agents-cost.svg"
@@ -58,7 +58,7 @@ def main(rounds: int = 3) -> None:
     """Measure.
 
     Args:
-        rounds: how often each has its turn.
+        rounds: number of turns of each contender.
     """
     found = {}
     with tempfile.TemporaryDirectory() as place:

@@ -1,9 +1,9 @@
-"""How proxy rewards go wrong: within an episode, among the agents, and in what they add up to.
+"""The errors of proxy rewards: within an episode, among the agents, and in their sums.
 
     python benchmarks/among_agents.py RUN [RUN ...]
 
-100 episodes of every seed's final policy, judged by its own decoder. Made for TriangleArea, whose true reward is the same for all
-agents, so that whatever proxy rewards differ by among them is wrong.
+100 episodes of every seed's final policy, with proxy rewards by its own decoder. Made for TriangleArea, whose true reward is the
+same for all agents, so that any difference between the agents' proxy rewards is an error.
 """
 
 import sys

@@ -1,10 +1,10 @@
-"""Which features a closed-form decoder should have: credit for scores that no text tells, by what its features are.
+"""Which features a closed-form decoder should have: the quality of its credit, by features, for scores that no task text describes.
 
     python benchmarks/basis.py RUN
 
-RUN is a finished run of HalfCheetah-v4 or Walker2d-v4 whose replay is still there. Its stored episodes are scored anew, in
-eight ways. Each basis is fitted in closed form to the returns of the first N episodes of a seed, and asked about the steps of the
-five that follow. Written down, for every basis: the mean over scores, N and seeds of the correlation with the true rewards of
+RUN is a finished run of HalfCheetah-v4 or Walker2d-v4 that still has its replay. Its stored episodes get new scores, in eight
+ways. Each basis is fitted in closed form to the returns of the first N episodes of a seed, and predicts the rewards of the steps of
+the next five. The results have, for every basis: the mean over scores, N and seeds of the correlation with the true rewards of
 those steps and of the mean error (in their standard deviations), and the median error.
 """
 
@@ -119,7 +119,7 @@ def fitted(means: Array, returns: Array, length: Array, group: tuple[int, ...]) 
 
 
 def standardised(rows: np.ndarray, known: int, until: int) -> Array:
-    """By the steps that are known."""
+    """Rows, standardised by the known steps."""
     deviation = rows[:known].std(axis=0)
     return jnp.asarray((rows[:until] - rows[:known].mean(axis=0)) / np.where(deviation > 0, deviation, 1))
 

@@ -1,4 +1,4 @@
-"""An environment that takes as much of a core as it is told to, and does nothing else; `workers.py` measures with it."""
+"""An environment that uses a given processor time in each step, and does nothing else. `workers.py` measures with it."""
 
 import time
 
@@ -29,7 +29,7 @@ class Burns:
         return self.shown
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        until = time.thread_time() + self.seconds  # of the processor: two that share a core take twice as long
+        until = time.thread_time() + self.seconds  # processor time: two processes on one core take twice as long
         while time.thread_time() < until:
             pass
         return self.shown

@@ -1,4 +1,4 @@
-"""How much of the true reward is in what agents observe, and how much in the factors.
+"""How strongly observations and factors correlate with the true reward.
 
     python benchmarks/correlation.py RUN [RUN ...]
 

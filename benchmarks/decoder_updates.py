@@ -1,9 +1,9 @@
-"""How much the decoders of many agents tell of single steps after so many updates, on data that stays as it is.
+"""How well decoders for many agents predict the rewards of single steps after a number of updates, on fixed data.
 
     python benchmarks/decoder_updates.py
 
-1,600 episodes of random actions on CN-6, one seed, updates on 32 episodes each. Judged on 200 other episodes: the correlation of
-proxy and true rewards, both as means over the agents, as deviations from their episode's mean, and of their sums.
+1,600 episodes of random actions on CN-6, one seed, updates on 32 episodes each. On 200 other episodes, with rewards averaged over
+the agents: the correlation of proxy and true rewards as deviations from their episode's mean, and the correlation of their sums.
 """
 
 from collections.abc import Iterator
@@ -30,11 +30,11 @@ from measure import apart, correlation, write
 
 ENV, STORED, JUDGED, AT_A_TIME = ParticleJaxEnv("CN-6"), 1600, 200, 100
 CONTENDERS = {"rd": (None, 3200), "arel": (None, 3200), "arel without its penalty": (0.0, 800)}
-"""The weight of AREL's penalty, if it is not the published one, and updates."""
+"""The weight of AREL's penalty (None: the published one), and the number of updates."""
 
 
 def config_of(name: str) -> TrainConfig:
-    """Each episode is stored in an environment of its own."""
+    """The configuration of a contender. Each episode is stored in its own environment."""
     ippo = ALGORITHMS["ippo"]
     return TrainConfig(
         env=ENV.spec,
@@ -58,7 +58,7 @@ def no_factors(episodes: int) -> np.ndarray:
 
 
 def random_episodes(key: int, count: int, config: TrainConfig) -> Trajectory:
-    """By networks of zeros, which prefer nothing."""
+    """Episodes of random actions, by networks of zeros, which have no preference."""
     actor = module_of(config).actor(new_learners(jax.random.key(0)[None], config), 0, config)
     return on_device(ENV, config, jax.tree.map(jnp.zeros_like, actor), count, key)[0]
 

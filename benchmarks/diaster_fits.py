@@ -1,10 +1,10 @@
-"""How many fits Diaster's decoder takes: on the replay of a finished run, beside RD's.
+"""How many fits Diaster's decoder needs, compared with RD's, on the replay of a finished run.
 
     python benchmarks/diaster_fits.py RUN [--fits 100 800 3200] [--seeds 3]
 
-New decoders, one for each of the run's first seeds, are fitted to the episodes that it stored: data that stays. After so many
-fits in all: mean |r_hat - r| and the correlation over the last 5,000 steps, and what the first step of an episode is said to pay.
-In a run Diaster gets one fit for 50 updates of the policy, RD one for each.
+New decoders, one for each of the run's first seeds, are fitted to its stored episodes, which do not change. After each number of
+fits: mean |r_hat - r| and the correlation over the last 5,000 steps, and r_hat of the first step of an episode. In training,
+Diaster gets one fit for 50 updates of the policy, RD one for each.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ AT_A_TIME = 50
 
 
 def untrained(learner: Learner, config: TrainConfig, key: jax.Array) -> Learner:
-    """With a new decoder, which knows the statistics of all that is stored."""
+    """The learner with a new decoder, which has the statistics of all stored steps."""
     (credit,) = common.init_credit([key], config)
     held = learner.replay
     every = replay.read(held, replay.newest(held, int(replay.size(held)[0])))
@@ -41,7 +41,7 @@ def untrained(learner: Learner, config: TrainConfig, key: jax.Array) -> Learner:
 
 
 def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: int) -> list[dict[str, float]]:
-    """What the decoder is worth after so many fits."""
+    """The accuracy of the decoder after each number of fits."""
     learner, found, begin = untrained(learner, config, jax.random.key(seed)), [], time.perf_counter()
     index = replay.newest(learner.replay, RECENT)
     recent = jax.tree.map(lambda rows: rows[0], replay.read(learner.replay, index))
@@ -73,9 +73,9 @@ def main(directory: tyro.conf.Positional[Path], fits: tuple[int, ...] = (100, 80
     """Measure.
 
     Args:
-        directory: a run of a single agent and a method that stores raw features, finished.
-        fits: numbers of fits in all, multiples of 50.
-        seeds: of the run's.
+        directory: a finished run of a single agent, with a method that stores raw features.
+        fits: total numbers of fits, multiples of 50.
+        seeds: number of the run's seeds to use.
     """
     run = open_run(directory)
     config, everyone, _, _ = load_learner(run)

@@ -1,4 +1,4 @@
-"""How models of Stable-Baselines3 and SBX are evaluated while they learn."""
+"""Evaluations of models of Stable-Baselines3 and SBX while they learn."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 
 def evaluate(model: Any, environment: gymnasium.Env, seed: int, episodes: int) -> float:
-    """Mean return of the deterministic policy, from the same starts at every evaluation."""
+    """Mean return of the deterministic policy, from the same initial states at every evaluation."""
     normal = model.get_vec_normalize_env()
     returns = np.zeros(episodes)
     for episode in range(episodes):
@@ -25,7 +25,7 @@ def evaluate(model: Any, environment: gymnasium.Env, seed: int, episodes: int) -
 
 
 class Evaluations(BaseCallback):
-    """Evaluates after the update that follows every so many steps."""
+    """Evaluates every so many steps, after the update that follows them."""
 
     def __init__(self, every: int, report: Callable[[int], None]):
         super().__init__()

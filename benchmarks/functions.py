@@ -1,10 +1,10 @@
-"""What the closed form makes of one `phi` or another: five draws, a factor left out, one that says nothing, none at all.
+"""How closed-form credit depends on `phi`: five draws, one factor left out, an irrelevant function, no function.
 
     python benchmarks/functions.py RUN
 
-RUN is a finished run on the body of HalfCheetah-v4 whose replay is still there. As in `basis.py`, its stored episodes are scored
-anew; each function is asked for its factors of all steps; the decoder of `lare-bayes`, and one that sees the factors alone, are
-fitted to the returns of the first N episodes of a seed, and asked about the steps of the five that follow.
+RUN is a finished run on the body of HalfCheetah-v4 that still has its replay. As in `basis.py`, its stored episodes get new scores.
+Each function computes its factors of all steps. The decoder of `lare-bayes`, and one that sees the factors alone, are fitted to
+the returns of the first N episodes of a seed, and predict the rewards of the steps of the next five.
 """
 
 import sys

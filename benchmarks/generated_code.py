@@ -2,7 +2,7 @@
 
 python benchmarks/generated_code.py refused     hostile and benign programs, recorded replies, the jail without the gate
 python benchmarks/generated_code.py fuzz        sweeps over all names, splices, mutants and garbage
-python benchmarks/generated_code.py cost        verification; phi in the jail against in process; its share of training
+python benchmarks/generated_code.py cost        verification; phi in the jail compared with in process; its share of training
 """
 
 import ast
@@ -22,7 +22,7 @@ import numpy as np
 
 import lare
 from lare.algorithms.settings import TD3Settings
-from lare.latent.function import Evaluator
+from lare.latent.evaluator import Evaluator
 from lare.latent.language import gate
 from lare.latent.language.program import Program
 from lare.latent.sandbox.jailed import JailedProgram, WorkerFailed
@@ -45,7 +45,7 @@ def steps(rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def judged(source: str) -> str:
-    """The stage that refuses a program; "accepted" where none does. An accepted one made no refused system call."""
+    """The stage that refuses a program, or "accepted". An accepted program has made no system call that the jail refuses."""
     with contextlib.ExitStack() as stack:
         try:
             program = stack.enter_context(contextlib.closing(JailedProgram(source, OBSERVATION, ACTION)))
@@ -63,7 +63,7 @@ def judged(source: str) -> str:
 
 
 def contained(source: str) -> str:
-    """What becomes of a program without the gate: it computes, fails, or ends its own process."""
+    """The outcome of a program without the gate: it computes, fails, or ends its own process."""
     try:
         with contextlib.closing(JailedProgram(source, OBSERVATION, ACTION, gated=False)) as program:
             outcome = program.failed or program.call(*steps(256))
@@ -73,7 +73,7 @@ def contained(source: str) -> str:
 
 
 def replies() -> dict[str, dict[str, int]]:
-    """Recorded replies as they came, by task: those that pass every check, of all."""
+    """By task: how many recorded replies pass every check without a correction, and how many there are."""
     found: dict[str, Counter[str]] = {}
     for kind in sorted(SHIPPED.iterdir(), key=lambda entry: entry.name):
         for entry in sorted(kind.iterdir(), key=lambda entry: entry.name):
@@ -88,7 +88,7 @@ def replies() -> dict[str, dict[str, int]]:
 
 
 def timed(cases: list[dict[str, str]], seconds: list[float]) -> Counter[str]:
-    """Where each of some programs ends. How long that took is added to `seconds`."""
+    """The outcomes of some programs. The time that each takes is added to `seconds`."""
     found: Counter[str] = Counter()
     for case in cases:
         start = time.perf_counter()
@@ -130,7 +130,7 @@ np.add.at(observation,0,1) np.add(observation,1,observation) np.fromfile('x') np
 
 
 def names() -> Iterator[str]:
-    """Programs that name everything there is in NumPy, and every attribute of every type that can be reached."""
+    """Expressions with every name in NumPy, and with every attribute of every type that can be reached."""
     for name in dir(np):
         yield f"np.{name}(observation)"
         yield f"np.{name}"
@@ -161,7 +161,7 @@ def in_function(expression: str) -> str:
 
 
 def spliced(source: str, choice: random.Random) -> str:
-    """A program with a hostile expression in the place of one of its own."""
+    """A program in which a hostile expression replaces one of its own."""
     tree = ast.parse(source)
     places = [node for node in ast.walk(tree) if isinstance(node, ast.expr) and hasattr(node, "lineno")]
     place = choice.choice(places)
@@ -175,7 +175,7 @@ def spliced(source: str, choice: random.Random) -> str:
 
 
 def crossed(sources: list[str], choice: random.Random) -> str:
-    """Lines of two programs, one behind the other."""
+    """The first lines of one program and the last lines of another."""
     one, other = (choice.choice(sources).split("\n") for _ in range(2))
     return "\n".join(one[: choice.randrange(len(one) + 1)] + other[choice.randrange(len(other) + 1) :])
 
@@ -268,7 +268,7 @@ def cost(rounds: int = 7) -> None:
 
 
 def share(phi: Any, steps_of_run: int = 3000) -> dict[str, float]:
-    """How much of a training run's time goes to phi."""
+    """The share of a training run's time that phi takes."""
     import tempfile
 
     settings = lare.Settings(method="lare-rrdu", seed=SEED, td3=TD3Settings(warmup=1000))

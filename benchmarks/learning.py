@@ -1,12 +1,12 @@
 """Learning curves on MuJoCo: the methods side by side, 3 seeds, 100 thousand steps.
 
-    python benchmarks/learning.py run RUNS [TASK/LABEL ...]   train what is missing, go on with the rest
-    python benchmarks/learning.py keep RUNS                   copy what is finished to results/learning
-    python benchmarks/learning.py table                       from there: results/learning.json, docs/pictures, a table
+    python benchmarks/learning.py run RUNS [TASK/LABEL ...]   train missing runs, resume the others
+    python benchmarks/learning.py keep RUNS                   copy finished runs to results/learning
+    python benchmarks/learning.py table                       from these: results/learning.json, docs/pictures, a table
 
-Every experiment is a run directory RUNS/TASK/LABEL; its settings and metrics are kept as they are. The curve of SBX's TD3
-(`sbx_learning.py RUNS/TASK/sbx-dense`) is one of them. Two processes on one core each train 1.1 times as much as one on two.
-The pictures take the newer runs of `sweeps/closed-form.toml` where there are some: the same settings, trained again.
+Every experiment is a run directory RUNS/TASK/LABEL; its settings and metrics are kept unchanged. The curve of SBX's TD3
+(`sbx_learning.py RUNS/TASK/sbx-dense`) is one of them. Two processes with one core each train 1.1 times as fast as one process
+with two cores. The pictures use the newer runs of `sweeps/closed-form.toml` if they exist, which have the same settings.
 """
 
 import json
@@ -48,12 +48,12 @@ EXPERIMENTS: dict[str, dict[str, dict[str, Any]]] = {
     "Walker2d-v4": OTHERS,
     "HumanoidStandup-v4": OTHERS,
 }
-"""For each task the runs, and the settings of each."""
+"""The runs of each task, and the settings of each run."""
 COMMON: dict[str, Any] = {"steps": 100_000, "seeds": 3}
 KEPT = Path(__file__).parent / "results" / "learning"
 SWEPT = KEPT.parent / "sweeps" / "closed-form"
 PICTURED = ("lare-bayes", "lare-rrdu", "rrdu", "dense", "episodic", "lare-rrdu-published")
-"""Those of all tasks first, so that a method has one colour."""
+"""Runs that all tasks have come first, so that a method has the same colour in all pictures."""
 
 
 def run(directory: Path, wanted: list[str]) -> None:
@@ -68,7 +68,7 @@ def run(directory: Path, wanted: list[str]) -> None:
 
 
 def keep(directory: Path) -> None:
-    """Settings and metrics of every run that has come to its end."""
+    """Copy settings and metrics of every finished run."""
     for metrics in sorted(directory.glob("*/*/metrics.jsonl")):
         place = KEPT / metrics.parent.relative_to(directory)
         config, lines = read(metrics.parent)
@@ -81,7 +81,7 @@ def keep(directory: Path) -> None:
 
 
 def config_of(directory: Path) -> Path:
-    """What a run depends on: ours, or that of `sbx_learning.py`."""
+    """The file with the configuration of a run: ours, or that of `sbx_learning.py`."""
     ours = directory / "config.json"
     return ours if ours.exists() else directory / "protocol.json"
 
@@ -109,7 +109,7 @@ def row(directory: Path) -> dict[str, Any]:
 
 
 def mean_and_spread(values: Sequence[Any]) -> list[float]:
-    """A single seed has no spread: 0."""
+    """Mean and standard deviation; 0 as the deviation of a single seed."""
     return [float(np.mean(values)), float(np.std(values, ddof=len(values) > 1))]
 
 

@@ -1,4 +1,4 @@
-"""What the benchmarks share: interleaved rounds, sessions to time, and results that say where they come from."""
+"""Shared by the benchmarks: interleaved rounds, sessions to time, and results with their provenance."""
 
 import json
 import os
@@ -59,7 +59,7 @@ PPO = {
     "gae_lambda": 0.95,
     "ent_coef": 0.01,
 }
-"""The same of ours of PPO; its networks of 256-256 with tanh are named in each library's own way."""
+"""Hyperparameters of our PPO, likewise. Each library has its own names for the networks (256-256 with tanh)."""
 
 
 def apart(rewards: Float[np.ndarray, "episodes steps *agents"]) -> Float[np.ndarray, "episodes steps *agents"]:
@@ -68,7 +68,7 @@ def apart(rewards: Float[np.ndarray, "episodes steps *agents"]) -> Float[np.ndar
 
 
 def correlation(one: np.ndarray, other: np.ndarray) -> float:
-    """Pearson's, over all entries."""
+    """Pearson's correlation over all entries."""
     return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
 
 
@@ -77,7 +77,7 @@ def interleave(
 ) -> dict[str, list[float]]:
     """Seconds that each contender took in each round: A B C A B C ..., after one round that compiles and is not counted.
 
-    `time.process_time` counts the processor's time: on a machine that others use too.
+    On a machine that others use too, take `time.process_time`, which counts processor time.
     """
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for number in range(rounds + 1):
@@ -90,12 +90,12 @@ def interleave(
 
 
 def ratio(seconds: Sequence[float], reference: Sequence[float]) -> float:
-    """Median over the rounds of the ratio within a round: what slows a whole round down cancels."""
+    """Median over the rounds of the ratio within a round, so that a slowdown of a whole round cancels out."""
     return median(one / other for one, other in zip(seconds, reference, strict=True))
 
 
 def summary(seconds: Mapping[str, Sequence[float]], per: int, reference: str) -> dict[str, dict[str, Any]]:
-    """Milliseconds for one of the `per` things that a round does, and the ratio to `reference`."""
+    """Milliseconds for one of the `per` units of work in a round, and the ratio to `reference`."""
     table = {}
     for name, values in seconds.items():
         ms = [1000 * value / per for value in values]
@@ -115,7 +115,7 @@ def show(title: str, table: Mapping[str, Mapping[str, Any]], reference: str) -> 
 
 
 def write(name: str, figures: Mapping[str, Any]) -> None:
-    """results/NAME.json: the figures, the command, and everything they depend on."""
+    """Write results/NAME.json: the figures, the command, and everything that they depend on."""
     out = Path(__file__).parent / "results" / f"{name}.json"
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps({**provenance(), **figures}, indent=1) + "\n")
@@ -145,14 +145,14 @@ def machine() -> dict[str, Any]:
 
 
 def new_session(directory: Path, task_name: str, settings: lare.Settings) -> Session:
-    """What `lare.train` starts, without the loop around it."""
+    """The session that `lare.train` starts, without its loop."""
     task = lare.load_task(task_name)
     resolved = decide(settings, task)
     return start(create(directory, task, resolved, chosen_functions(task, resolved, None)))
 
 
 def advance(session: Session, steps: int) -> None:
-    """`steps` environment steps of each seed, to the last computation."""
+    """Make `steps` environment steps of each seed, and wait for all computations."""
     for _ in range(steps // session.settings.iteration_steps):
         session.advance()
     jax.block_until_ready(session.learner)

@@ -1,10 +1,10 @@
-"""What a decoder makes of a `phi` that leaves a factor out, and of one that has nothing to do with the score.
+"""How decoders learn with a `phi` that leaves a factor out, and with one that has nothing to do with the score.
 
-    python benchmarks/missing_factors.py run RUNS [TASK/METHOD/FUNCTION ...]   train what is missing, go on with the rest
-    python benchmarks/missing_factors.py keep RUNS                             copy what is finished to results/missing
+    python benchmarks/missing_factors.py run RUNS [TASK/METHOD/FUNCTION ...]   train missing runs, resume the others
+    python benchmarks/missing_factors.py keep RUNS                             copy finished runs to results/missing
     python benchmarks/table.py benchmarks/results/missing
 
-FUNCTION is `all` (draw 0 of the recorded functions), `without-f_NAME` (the same, one factor left out of what it returns) or
+FUNCTION is `all` (draw 0 of the recorded functions), `without-f_NAME` (the same function without this factor in its result) or
 `irrelevant`. Every run is a run directory RUNS/TASK/METHOD/FUNCTION.
 """
 
@@ -30,12 +30,12 @@ FACTORS = {
 }
 METHODS = {"HalfCheetah-v4": ("lare-bayes", "lare-rrdu"), "PP-6": ("lare-bayes", "lare-rd")}
 NEEDED = {"HalfCheetah-v4": "f_forward", "PP-6": "f_catch"}
-"""The factor that is most of the score: the gradient decoders train without this one only."""
+"""The factor that makes up most of the score. It is the only one that is left out for gradient-trained decoders."""
 IRRELEVANT = {
     "HalfCheetah-v4": "[np.sin(3 * observation[:, 2:3]), np.square(observation[:, 3:4])]",
     "PP-6": "[np.sin(5 * observation[:, 4:5]), np.square(observation[:, 5:6])]",
 }
-"""An angle of the hind leg; where the nearest obstacle is."""
+"""Functions of an angle of the hind leg, and of the place of the nearest obstacle."""
 KEPT = Path(__file__).parent / "results" / "missing"
 
 
@@ -50,7 +50,7 @@ def experiments() -> list[str]:
 
 
 def source(task: str, function: str) -> str:
-    """The recorded function without a factor, or one that says nothing."""
+    """The recorded function, whole or without a factor, or an irrelevant function."""
     if function == "irrelevant":
         return f"import numpy as np\n\n\ndef evaluation_func(observation, action):\n    return {IRRELEVANT[task]}\n"
     recorded = lare.design(lare.load_task(task)).source
@@ -80,7 +80,7 @@ def run(directory: Path, wanted: list[str]) -> None:
 
 
 def keep(directory: Path) -> None:
-    """Settings and metrics of every run that has come to its end."""
+    """Copy settings and metrics of every finished run."""
     for name in experiments():
         if not (directory / name / "metrics.jsonl").exists():
             continue

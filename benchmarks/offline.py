@@ -1,11 +1,11 @@
-"""An offline learner on logged episodes: trained on true rewards, on the return at the end, and on what `lare relabel` pays.
+"""An offline learner on logged episodes: trained on true rewards, on the return at the end, and on rewards by `lare relabel`.
 
     lare train HalfCheetah-v4 --method dense --steps 60000 --evaluate-every 20000 --out RUN
     python benchmarks/offline.py RUN
 
-The log is all that the run met while it learned: 60 episodes, from random play on. `lare relabel` sees the return of each
-episode only. The learner is TD3+BC, `examples/offline_td3_bc.py`, with seeds 0 to 2 for each kind of rewards. The returns of
-all evaluations, and how well the proxy rewards agree with the true ones, go to results/offline.json.
+The log has all 60 episodes of the run's training, from random actions on. `lare relabel` sees only the return of each episode.
+The learner is TD3+BC, `examples/offline_td3_bc.py`, with seeds 0 to 2 for each kind of rewards. The returns of all evaluations,
+and how well the proxy rewards agree with the true ones, are written to results/offline.json.
 """
 
 import sys
@@ -30,7 +30,7 @@ METHODS = ("lare-bayes", "bayes")
 
 
 def write_log(run: lare.Run, out: Path) -> list[float]:
-    """The episodes that the first seed of a run has met, as .npz files with their scores; what they returned."""
+    """Write the training episodes of a run's first seed as .npz files with their scores. Returns the episodes' returns."""
     _, learner, host, _ = load_learner(run)
     buffer = of_seed(learner).replay
     steps = replay.read(buffer, replay.newest(buffer, host["step"]))

@@ -1,10 +1,10 @@
-"""What a step of cooperative navigation costs, beside the one of mpe2 (`simple_spread`), the contenders taking turns.
+"""The cost of a step of cooperative navigation, compared with mpe2's `simple_spread`. The contenders take turns.
 
     python benchmarks/particles.py
 
-Random actions, episodes of 25 steps, all observations and rewards computed. Ours are whole batches of worlds in one
-compiled call; mpe2, the maintained home of the multi-agent particle environments, steps one world with as many agents
-and landmarks. Its task is not quite ours (`docs/particle-tasks.md` has the differences), the work is.
+Random actions, episodes of 25 steps, all observations and rewards computed. Our environment steps whole batches of worlds in one
+compiled call. mpe2, the maintained package of the multi-agent particle environments, steps one world with the same numbers of
+agents and landmarks. Its task differs slightly from ours (see `docs/particle-tasks.md`), but the work is the same.
 """
 
 import warnings
@@ -27,7 +27,7 @@ with warnings.catch_warnings():
 
 @partial(jax.jit, static_argnums=(0, 2))
 def episodes(task: ParticleTask, key: PRNGKeyArray, worlds: int) -> Float[Array, "worlds steps"]:
-    """One episode in each world; the sums make sure that nothing is left out."""
+    """One episode in each world. The sums keep the compiler from leaving anything out."""
 
     def step(state: State, key: PRNGKeyArray):
         action_key, key = jax.random.split(key)
@@ -55,8 +55,8 @@ def main(rounds: int = 7, batches: tuple[int, ...] = (64, 1024)) -> None:
     """Measure.
 
     Args:
-        rounds: how often each has its turn.
-        batches: numbers of worlds of ours in one call.
+        rounds: number of turns of each contender.
+        batches: numbers of our worlds in one call.
     """
     figures = {}
     for name in ("CN-6", "CN-30"):

@@ -1,16 +1,16 @@
-"""What each adapter adds to a step: processor milliseconds with `lare-bayes` (of PettingZoo `bayes`) beside the library alone.
+"""What each adapter adds to a step: processor milliseconds with `lare-bayes` (`bayes` for PettingZoo), and of the library alone.
 
     python benchmarks/plugs_cost.py                  results/plugs/cost.json
-    python benchmarks/plugs_cost.py --sbx            the same of SBX's SAC, where SBX is installed: results/plugs/cost_sbx.json
+    python benchmarks/plugs_cost.py --sbx            the same for SBX's SAC, if SBX is installed: results/plugs/cost_sbx.json
 
 A turn is a thousand environment steps of HalfCheetah-v4: one episode ends in it, and one decoder is fitted in closed form. With
-PettingZoo it is forty episodes of CN-6. By turns within one process, on one core. What is stepped:
+PettingZoo it is forty episodes of CN-6. The contenders take turns within one process, on one core:
 
-    Gymnasium            a single environment with random actions, paid r_hat at every step
-    PettingZoo           six agents with random actions, paid r_hat at every step
-    TorchRL              a replay buffer: 1,000 rows in, then one draw of 256 for each of them
-    Stable-Baselines3    PPO as in `plugs_sb3.py`, a rollout of two episodes. What its TD3 costs is measured there
-    SBX                  SAC as in `plugs_sb3.py`, an update at each step
+    Gymnasium            a single environment with random actions, with r_hat at every step
+    PettingZoo           six agents with random actions, with r_hat at every step
+    TorchRL              a replay buffer: 1,000 rows are stored, then 256 rows are drawn for each of them
+    Stable-Baselines3    PPO as in `plugs_sb3.py`, a rollout of two episodes. The cost of its TD3 is measured there
+    SBX                  SAC as in `plugs_sb3.py`, with an update at each step
 """
 
 import time
@@ -100,7 +100,7 @@ def of_torchrl(task: lare.TaskSpec) -> Turns:
 
 
 def of_ppo(task: lare.TaskSpec) -> Turns:
-    """A rollout, and what is learned from it."""
+    """A rollout, and the updates on it."""
 
     def learning(rewards: str) -> Callable[[], object]:
         model, callbacks = ppo(task, rewards, 0)
@@ -124,8 +124,8 @@ def main(rounds: int = 5, sbx: bool = False) -> None:
     """Measure.
 
     Args:
-        rounds: how often each has its turn, after one that is not counted.
-        sbx: SBX's SAC alone.
+        rounds: number of turns of each contender, after one that is not counted.
+        sbx: measure only SBX's SAC.
     """
     task = lare.load_task(TASK)
     contenders = {

@@ -1,14 +1,14 @@
-"""What `lare.plugs.sb3` costs Stable-Baselines3, and what it gives.
+"""The cost of `lare.plugs.sb3` in Stable-Baselines3, and learning curves with it.
 
     python benchmarks/plugs_sb3.py cost                                      results/plugs/sb3_cost.json
     python benchmarks/plugs_sb3.py learn --algorithm td3 --rewards lare-bayes   results/plugs/td3-lare-bayes.jsonl
 
-`cost`: processor time of a whole step of TD3 on HalfCheetah-v4 with networks of 256-256, plain and with the plug, by turns within
-one process. A turn is one episode, so that a decoder in closed form is fitted in it. One core does.
+`cost`: processor time of a whole step of TD3 on HalfCheetah-v4 with networks of 256-256, with and without the plug, by turns within
+one process. A turn is one episode, so that a closed-form decoder is fitted in it. One core is enough.
 
-`learn`: true returns of the deterministic policy. `episodic` and `dense` are Stable-Baselines3 alone; everything else is a method,
-with the plug, and sees the return of whole episodes only. Hyperparameters of TD3 are the paper's; those of PPO and of SBX's SAC are
-those of `sbx_learning.py`.
+`learn`: true returns of the deterministic policy. `episodic` and `dense` are Stable-Baselines3 alone; every other name is a method
+with the plug, which sees the returns of whole episodes only. The hyperparameters of TD3 are the paper's; those of PPO and of SBX's
+SAC are those of `sbx_learning.py`.
 """
 
 import json
@@ -38,19 +38,19 @@ PPO_SETTINGS: dict[str, Any] = {**PPO_COMMON, "policy_kwargs": {"net_arch": [256
 
 
 def assigner(method: str, task: lare.TaskSpec, seed: int, **more: Any) -> lare.CreditAssigner:
-    """With the function of the recorded replies, where the method needs one."""
+    """An assigner, with the function of the recorded replies if the method needs one."""
     phi = lare.design(task) if method.startswith("lare-") else None
     return lare.CreditAssigner(method, phi, task=task, seed=seed, **more)
 
 
 def environment_of(task: lare.TaskSpec, dense: bool) -> gymnasium.Env:
-    """A true reward at every step, or the return at the end."""
+    """The environment with a true reward at every step, or with the return at the end."""
     made = gymnasium.make(task.environment)
     return made if dense else lare.EpisodicReward(made)
 
 
 def plug_of(task: lare.TaskSpec, rewards: str, seed: int) -> dict[str, Any]:
-    """What an algorithm with a replay buffer is given; nothing where it learns from what its environment pays."""
+    """The plug's arguments for an algorithm with a replay buffer; empty if it learns from its environment's rewards."""
     if rewards in ("dense", "episodic"):
         return {}
     credit = assigner(rewards, task, seed, capacity=TD3_SETTINGS["buffer_size"])
@@ -75,7 +75,7 @@ def td3(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> TD3:
 
 
 def sbx_sac(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> Any:
-    """SBX's SAC, likewise. SBX is imported here: it is not needed for the others."""
+    """SBX's SAC, likewise. SBX is imported here, because the others do not need it."""
     from sbx import SAC
 
     from sbx_learning import OFF_POLICY
@@ -85,7 +85,7 @@ def sbx_sac(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> Any:
 
 
 def ppo(task: lare.TaskSpec, rewards: str, seed: int) -> tuple[PPO, list[CreditCallback]]:
-    """PPO, normalised by VecNormalize; and what makes it learn from a method."""
+    """PPO, normalised by VecNormalize, and the callback with which it learns from a method."""
     environment = VecNormalize(DummyVecEnv([partial(environment_of, task, rewards == "dense")]))
     settings: Any = PPO_SETTINGS | {"policy_kwargs": dict(PPO_SETTINGS["policy_kwargs"])}
     model = PPO("MlpPolicy", environment, seed=seed, device="cpu", **settings)
@@ -98,9 +98,9 @@ def cost(rounds: int = 4, steps: int = 1000, methods: tuple[str, ...] = ("lare-b
     """Measure a step.
 
     Args:
-        rounds: how often each has its turn, after one that is not counted.
+        rounds: number of turns of each contender, after one that is not counted.
         steps: environment steps in a turn, a multiple of an episode.
-        methods: of the plug.
+        methods: methods of the plug.
     """
     task = lare.load_task(TASK)
     models = {name: td3(task, name, 0, steps) for name in ("episodic", *methods)}
@@ -131,13 +131,13 @@ def learn(
     """Train, and append a line of JSON for each evaluation to results/plugs/ALGORITHM-REWARDS.jsonl.
 
     Args:
-        algorithm: whose learning curve.
+        algorithm: the algorithm to train.
         rewards: `episodic`, `dense`, or a method for the plug.
-        task: of the package.
-        seeds: how many seeds, from 0, one after the other.
+        task: a task of the package.
+        seeds: number of seeds, from 0, one after the other.
         steps: environment steps of each seed.
-        evaluate_every: environment steps between two evaluations; of ppo a multiple of 2000.
-        episodes: in one evaluation.
+        evaluate_every: environment steps between two evaluations; a multiple of 2000 for ppo.
+        episodes: number of episodes in one evaluation.
         warmup: random steps before the first update; ppo has none.
     """
     spec = lare.load_task(task)

@@ -1,10 +1,10 @@
-"""How steady a decoder's credit is: fitted anew on the replay of a finished run, compared with the true rewards on the way.
+"""How stable a decoder's credit is: new decoders are fitted to the replay of a finished run, and compared with the true rewards.
 
     python benchmarks/refit.py RUN [RUN ...]
 
-For each run (of a method with a decoder, first seed): its own fit as it is, the same with targets left in the units of the
-environment, and RRD's biased loss; every 5,000 of 20,000 updates the correlation with the true rewards and the mean error
-on the last 5,000 stored steps. And the ceiling: the best linear map of the features to the true rewards of those steps.
+For each run (of a method with a decoder, first seed) there are three fits: the method's own, the same with targets in the units of
+the environment, and RRD's biased loss. After every 5,000 of 20,000 updates: the correlation with the true rewards and the mean
+error on the last 5,000 stored steps. The ceiling is the best linear map from the features to the true rewards of those steps.
 """
 
 import sys

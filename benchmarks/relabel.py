@@ -1,9 +1,9 @@
-"""Steps a second of `lare.relabel`, in closed form: a million synthetic steps of 11 entries and 3 actions, in memory.
+"""Steps per second of `lare.relabel`, in closed form: a million synthetic steps of 11 entries and 3 actions, in memory.
 
     python benchmarks/relabel.py [STEPS]
 
-Reading is a slice of an array; writing is one .npz file an episode of 1,000 steps. What is measured is the wall clock of the whole,
-of the pass that fits and of the pass that pays and writes, and the peak of the process's memory.
+Reading is a slice of an array; writing is one .npz file for each episode of 1,000 steps. Measured are the wall-clock time in all,
+of the pass that fits and of the pass that writes, and the peak memory of the process.
 """
 
 import resource
@@ -22,7 +22,7 @@ LENGTH, ENTRIES, ACTIONS = 1000, 11, 3
 
 
 class Log:
-    """Episodes that are made when they are asked for, always the same."""
+    """Episodes that are generated on demand, always the same."""
 
     def __init__(self, episodes: int):
         self.count = episodes

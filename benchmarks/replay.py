@@ -1,11 +1,11 @@
-"""The replay: what a draw costs, however much is stored, and how much memory a full one takes.
+"""The replay: the cost of a draw by the number of stored transitions, and the memory of a full replay.
 
     python benchmarks/replay.py             a draw at 10 thousand, 100 thousand and 1 million transitions
     python benchmarks/replay.py --memory    peak memory of a whole process that trains on a full replay
 
-A draw is what one update of LaRe-RRDu reads on HalfCheetah-v4: 256 transitions, and 64 steps of each of 4 episodes; the
-three replays take turns. For the memory, a session on HumanoidStandup-v4 (376 numbers an observation) has its replay of a
-million observations filled with random numbers, the way it stores its own steps, and then goes on training.
+A draw has the data of one update of LaRe-RRDu on HalfCheetah-v4: 256 transitions, and 64 steps of each of 4 episodes. The three
+replays take turns. For the memory, a session on HumanoidStandup-v4 (376 numbers in an observation) has its replay of a million
+observations filled with random numbers, in the same way as with its own steps, and then continues training.
 """
 
 import resource
@@ -55,11 +55,11 @@ CONFIG = TrainConfig(
     steps=1_000_000,
     fit_updates=1,
 )
-"""Of a size with HalfCheetah-v4."""
+"""A configuration with the sizes of HalfCheetah-v4."""
 
 
 def filled(transitions: int) -> Replay:
-    """A replay as whole episodes of 1000 random steps would leave it, with a leading seed axis of 1."""
+    """A replay of whole episodes of 1000 random steps, with a leading seed axis of 1."""
     random, number = np.random.default_rng(SEED), np.arange(transitions)
     episodes, held = transitions // EPISODE, replay.empty(CONFIG.columns, 1, CONFIG.capacity, 1)
 
@@ -80,7 +80,7 @@ def filled(transitions: int) -> Replay:
 
 
 def reads(held: Replay, key: jax.Array) -> Any:
-    """Everything that 50 updates read, one after the other; what the last one read is returned."""
+    """Read the data of 50 updates, one after the other; returns the data of the last one."""
     draws = off_policy.sample(held, key, UPDATES, CONFIG)
 
     def one(draw: off_policy.UpdateSample) -> Any:
@@ -96,7 +96,7 @@ def reads(held: Replay, key: jax.Array) -> Any:
 
 
 def draws(rounds: int, calls: int) -> None:
-    """Time it."""
+    """Measure the time of draws."""
     compiled = jax.jit(jax.vmap(reads))
 
     def work(held: Replay) -> None:
@@ -110,7 +110,7 @@ def draws(rounds: int, calls: int) -> None:
 
 
 def fill(session: Session, transitions: int) -> None:
-    """Random steps into a session's replay, by its own compiled `store`."""
+    """Put random steps into a session's replay, by its own compiled `store`."""
     config, random = session.config, np.random.default_rng(SEED)
     env, rollout = config.env, config.rollout_steps
     every = {
@@ -141,13 +141,13 @@ def fill(session: Session, transitions: int) -> None:
 
 
 def used() -> dict[str, int]:
-    """Bytes of this process, now and at most so far."""
+    """Memory of this process in bytes, now and at its peak so far."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     return {"resident": psutil.Process().memory_info().rss, "peak": peak}
 
 
 def memory(transitions: int) -> None:
-    """Fill a replay, train on, and see what it took."""
+    """Fill a replay, continue training, and measure the memory."""
     stages = {"packages imported": used()}
     with tempfile.TemporaryDirectory() as place:
         settings = lare.Settings(method="lare-rrdu", seed=SEED)
@@ -171,12 +171,12 @@ def memory(transitions: int) -> None:
 
 @dataclass
 class Arguments:
-    """What is to be measured."""
+    """What to measure."""
 
     memory: bool = False
-    """Memory, not time."""
+    """Measure memory instead of time."""
     rounds: int = 7
-    """How often each replay has its turn."""
+    """Number of turns of each replay."""
     calls: int = 40
     """Calls, of 50 draws each, in a turn."""
     transitions: int = 1_000_000

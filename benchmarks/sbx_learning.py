@@ -1,11 +1,11 @@
-"""Learning curves of SBX's algorithms on the true rewards, to be laid over ours.
+"""Learning curves of SBX's algorithms on the true rewards, for a comparison with ours.
 
     python benchmarks/sbx_learning.py OUT --algorithm sac      OUT/metrics.jsonl, as `lare train --method dense` writes it
 
-Hyperparameters and protocol are ours. What still differs: SBX's targets follow at every update, not every second one, and its
-TD3's actor ascends the smaller of the two critics, not the first; its PPO has observations and rewards normalised by
-Stable-Baselines3's VecNormalize, where ours normalises observations and what the critic predicts. Seeds are trained one after the
-other; one core does (`taskset -c 0 python ...`).
+Hyperparameters and protocol are ours. Differences remain: SBX's targets move at every update, not at every second one. Its TD3's
+actor ascends the smaller of the two critics, not the first. For its PPO, Stable-Baselines3's VecNormalize normalises observations
+and rewards; ours normalises observations and the critic's targets. Seeds are trained one after the other; one core is enough
+(`taskset -c 0 python ...`).
 """
 
 import json
@@ -30,7 +30,7 @@ PPO = {**PPO_COMMON, "policy_kwargs": {"net_arch": [256, 256], "activation_fn": 
 
 
 def model_of(algorithm: str, environment: gymnasium.Env, warmup: int, seed: int) -> Any:
-    """One of SBX's learners, with the figures that ours has."""
+    """One of SBX's models, with our hyperparameters."""
     assert isinstance(environment.action_space, gymnasium.spaces.Box)
     actions = environment.action_space.shape
     noise = NormalActionNoise(np.zeros(actions), 0.1 * np.ones(actions))
@@ -61,18 +61,20 @@ def main(
 
     Args:
         out: a new directory for the results.
-        algorithm: whose learning curve.
+        algorithm: the algorithm to train.
         task: Gymnasium id.
         steps: environment steps of each seed.
-        seeds: how many seeds, from 0.
-        evaluate_every: environment steps between two evaluations; 5000, or 10,000 for ppo, unless given.
+        seeds: number of seeds, from 0.
+        evaluate_every: environment steps between two evaluations; the default is 5000, and 10,000 for ppo.
         episodes: episodes in one evaluation.
         warmup: random steps before the first update; ppo has none.
     """
     every = evaluate_every or (10_000 if algorithm == "ppo" else 5000)
     turn = int(PPO["n_steps"]) if algorithm == "ppo" else 1
     if every % turn or steps % every:
-        raise SystemExit(f"steps = {steps} must be a multiple of evaluate-every = {every}, and that one of {turn}")
+        raise SystemExit(
+            f"steps = {steps} must be a multiple of evaluate-every = {every}, which must be a multiple of {turn}"
+        )
     out.mkdir(parents=True)
     settings = {"steps": steps, "seeds": seeds}
     (out / "protocol.json").write_text(

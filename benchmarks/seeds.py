@@ -1,4 +1,4 @@
-"""What five seeds in one process cost, against one: LaRe-RRDu on HalfCheetah-v4, the two taking turns.
+"""The cost of five seeds in one process, compared with one seed: LaRe-RRDu on HalfCheetah-v4. The two take turns.
 
     python benchmarks/seeds.py
 
@@ -22,9 +22,9 @@ def main(rounds: int = 7, steps: int = 1000, seeds: int = 5, method: str = "lare
     """Measure.
 
     Args:
-        rounds: how often each of the two has its turn.
+        rounds: number of turns of each of the two.
         steps: environment steps of each seed in a turn, a multiple of 50.
-        seeds: how many seeds are compared with one.
+        seeds: number of seeds that are compared with one.
         method: how credit is assigned.
     """
     contenders = {}

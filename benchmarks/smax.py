@@ -1,9 +1,8 @@
-"""What a step of a battle costs, by battle and by how many are played at once.
+"""The cost of a step of a battle, by battle and by the number of battles at once.
 
     taskset -c 0 python benchmarks/smax.py
 
-Random legal choices, observations and states read, the first 60 steps of each battle. A whole batch
-is one compiled call.
+The first 60 steps of each battle, with random legal choices; observations and states are read. A whole batch is one compiled call.
 """
 
 import time
@@ -19,12 +18,12 @@ from lare.tasks.smax.env import SMAX
 from measure import interleave, show, summary, write
 
 STEPS = 60
-"""Of each battle, in one call."""
+"""Steps of each battle in one call."""
 
 
 @partial(jax.jit, static_argnums=(0, 2))
 def battles(env: SMAX, key: PRNGKeyArray, worlds: int) -> Float[Array, "worlds steps"]:
-    """The sums make sure that nothing is left out."""
+    """Play a batch of battles. The sums keep the compiler from leaving anything out."""
 
     def step(carry, key: PRNGKeyArray):
         state, seen = carry
@@ -45,7 +44,7 @@ def main(rounds: int = 7, batches: tuple[int, ...] = (1, 32, 256), calls: int = 
     """Measure.
 
     Args:
-        rounds: how often each has its turn.
+        rounds: number of turns of each contender.
         batches: numbers of battles in one call.
         calls: about how many battles in a turn.
     """

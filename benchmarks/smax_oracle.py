@@ -1,14 +1,14 @@
-"""Whether our battles are those of SMAX in JaxMARL: both are played with the same choices and the same chance, and compared.
+"""Whether our battles agree with SMAX in JaxMARL: both are played with the same choices and the same random numbers, and compared.
 
-    pip install jaxmarl==0.2.0        # brings flax and others: best into an environment of its own
+    pip install jaxmarl==0.2.0        # installs flax and others, so use a separate environment
     python benchmarks/smax_oracle.py
 
-Whole battles. Ours makes each step from JaxMARL's state; a second one, which begins at JaxMARL's start and is never set right,
-shows what rounding grows to where units push each other. Our side mixes JaxMARL's heuristic, retreats and random legal
-choices; the enemy is JaxMARL's, whose choices go to both. Only where an enemy unit walks while it sees several of ours is its
-choice left out of the comparison: whom it walks to is another draw. JaxMARL's `max_steps` is one less than the limit,
-because it compares before it counts. Of each task, steps of one battle can be kept for the tests
-(`--pin tests/tasks/smax/pinned.npz`).
+Whole battles are played. Our game makes each step from JaxMARL's state. A second game of ours begins in JaxMARL's initial state and
+is never corrected; it shows how rounding errors grow when units push each other. Our side mixes JaxMARL's heuristic, retreats and
+random legal choices. The enemy is JaxMARL's, and its choices are used in both games. An enemy's choice is left out of the
+comparison only if the unit walks while it sees several of our units, because its target is then a separate random draw. JaxMARL's
+`max_steps` is one less than the limit, because JaxMARL compares before it counts. Steps of one battle of each task can be saved for
+the tests (`--pin tests/tasks/smax/pinned.npz`).
 """
 
 import sys
@@ -34,7 +34,7 @@ from jaxmarl.environments.smax.heuristic_enemy import create_heuristic_policy  #
 from jaxmarl.environments.smax.heuristic_enemy_smax_env import HeuristicEnemySMAX  # noqa: E402
 from jaxmarl.environments.smax.smax_env import Scenario as Theirs  # noqa: E402
 
-sys.stdout, sys.stderr = streams  # which the import has replaced
+sys.stdout, sys.stderr = streams  # the import has replaced them
 
 
 class Style(NamedTuple):
@@ -45,17 +45,17 @@ class Style(NamedTuple):
     kites: bool = False
     """Whether a unit walks away from the enemy while its weapon is not ready."""
     waits: bool = False
-    """Whether nobody does anything, the enemy neither: until the time is over."""
+    """Whether no unit does anything, on either side, until the time limit."""
 
 
 STYLES = (Style(0.1), Style(0.4), Style(1.0), Style(), Style(0.05, kites=True), Style(kites=True))
 SHOWN = "observation", "state", "reward", "ends", "legal actions"
 PINNED = {"2s3z": "won", "3s_vs_5z": "lost", "1c3s5z": "lost"}
-"""The longest battle that ends so is kept for the tests."""
+"""For each task, the longest battle with this end is saved for the tests."""
 
 
 def theirs(scenario: Scenario) -> HeuristicEnemySMAX:
-    """JaxMARL's, with the colossus appended to its kinds where the battle has one."""
+    """JaxMARL's environment, with the colossus appended to its unit types if the battle has one."""
     table = list(UNIT_TYPES.values())[: scenario.unit_types]
     figures = {
         "unit_type_velocities": [kind.speed for kind in table],
@@ -66,7 +66,7 @@ def theirs(scenario: Scenario) -> HeuristicEnemySMAX:
         "unit_type_health": [kind.health for kind in table],
         "unit_type_weapon_cooldowns": [kind.cooldown for kind in table],
     }
-    # Its own kinds keep its own figures, so that ours are compared too.
+    # Its own unit types keep their own figures, so that our figures are compared, too.
     arguments: dict[str, Any] = {}
     if scenario.unit_types > 6:
         defaults = HeuristicEnemySMAX()._env
@@ -83,7 +83,7 @@ def theirs(scenario: Scenario) -> HeuristicEnemySMAX:
 
 @dataclass
 class Worst:
-    """The largest deviation of each thing, and how many were compared."""
+    """For each name: the largest deviation, or how many values differ, and how many were compared."""
 
     deviation: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     differing: dict[str, int] = field(default_factory=lambda: defaultdict(int))
@@ -102,12 +102,12 @@ class Worst:
         self.differing[name] += int((one != other).sum())
 
     def off(self, name: str) -> str:
-        """The largest deviation, or how many differ."""
+        """The largest deviation, or how many values differ."""
         return format(self.deviation[name], ".1e") if name in self.deviation else str(self.differing.get(name, ""))
 
 
 def drawn(key: jax.Array, units: int) -> jax.Array:
-    """What JaxMARL's `step_env` adds to the cooldowns, drawn as it draws it."""
+    """The random numbers that JaxMARL's `step_env` adds to the cooldowns, drawn in the same way."""
     key, _ = jax.random.split(key)
     rows = []
     for _ in range(battle.TICKS):
@@ -133,7 +133,7 @@ class Match:
         return jnp.stack([of[f"{side}_{i}"] for i in range(count)])
 
     def _choose(self, key, state, memories, style):
-        """What both sides do; the enemy always follows JaxMARL's heuristic."""
+        """The actions of both sides; the enemy always follows JaxMARL's heuristic."""
         allies = self.scenario.allies
         seen = self.env.get_obs(state)
         keys = jax.random.split(key, 4)
@@ -148,7 +148,7 @@ class Match:
         return jnp.where(style.waits, battle.STOP, action).astype(jnp.int32), (first, second)
 
     def _retreat(self, state):
-        """Away from the enemies, the near ones most, and from the border."""
+        """The directions away from the enemies, mostly from near ones, and from the border."""
         allies, position = self.scenario.allies, state.unit_positions
         offset = position[:allies, None] - position[allies:]
         nearness = state.unit_alive[allies:, None] / (jnp.sum(offset**2, axis=-1, keepdims=True) + 1)
@@ -174,7 +174,7 @@ class Match:
         return after, memory, choice, sees, shown
 
     def begin(self, key: jax.Array, worst: Worst):
-        """JaxMARL's start, and ours from the same draws."""
+        """JaxMARL's initial state, and ours from the same draws."""
         scenario = self.scenario
         _, state = self.env.reset(key)
         _, *keys = jax.random.split(key, 3)
@@ -188,7 +188,7 @@ class Match:
         return state, mine
 
     def play(self, seed: int, style: Style, worst: Worst, alone: Worst) -> tuple[str, dict[str, np.ndarray]]:
-        """One battle to its end: how it ended, and all of JaxMARL's."""
+        """Play one battle to its end; returns how it ended, and all of JaxMARL's data."""
         scenario, allies = self.scenario, self.scenario.allies
         start, key = jax.random.split(jax.random.key(seed))
         state, mine = self.begin(start, worst)
@@ -241,7 +241,9 @@ class Match:
 
 
 def used(scenario: Scenario, longer: jax.Array, cooldown: jax.Array) -> np.ndarray:
-    """Of the draws of a step's ticks, that of each unit's attack; nobody attacks twice in a step. 0 where there was none."""
+    """The random draw that each unit's attack used, among those of a step's ticks; 0 without an attack. No unit attacks twice in a
+    step.
+    """
     left = battle.TICK * (battle.TICKS - 1 - np.arange(battle.TICKS))[:, None]
     off = np.abs(scenario.each("cooldown") + np.asarray(longer) - left - np.asarray(cooldown))
     chosen = np.take_along_axis(np.asarray(longer), off.argmin(0)[None], axis=0)[0]
@@ -249,7 +251,7 @@ def used(scenario: Scenario, longer: jax.Array, cooldown: jax.Array) -> np.ndarr
 
 
 def pinned(kept: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What the tests need of a battle: some of its steps, each with what was put in and what came of it."""
+    """The data of a battle that the tests need: some of its steps, each with inputs and outputs."""
     last = len(kept["action"]) - 1
     some = np.unique(np.linspace(0, last, 16).astype(int))
     few = np.isin(some, some[[3, 8, -1]])
@@ -263,9 +265,9 @@ def main(battles: int = 12, tasks: tuple[str, ...] = NAMES, pin: Path | None = N
     """Play and compare.
 
     Args:
-        battles: of each task; there is one more, in which all stand and wait.
-        tasks: which.
-        pin: where to keep a battle of each task for the tests.
+        battles: number of battles of each task; there is one more, in which all units stand and wait.
+        tasks: the tasks to compare.
+        pin: a file in which to save a battle of each task for the tests.
     """
     figures, keep = {}, {}
     for name in tasks:

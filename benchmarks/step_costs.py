@@ -1,11 +1,11 @@
-"""What a step costs with every algorithm and every method that fits it: one environment step of HalfCheetah-v4, and its share of
+"""The cost of a step with every algorithm and every method that fits it: one environment step of HalfCheetah-v4, and its share of
 the updates.
 
     python benchmarks/step_costs.py
 
-The methods of an algorithm take turns; a turn is so many steps of one session, by the same `Session.advance` that `lare train`
-calls. Algorithms that consume transitions update at every step, after random ones that fill the replay with whole episodes; of
-ppo a turn is one rollout of 2000 steps with its updates. Many agents: `agents_speed.py`.
+The methods of an algorithm take turns; a turn is a number of steps of one session, by the same `Session.advance` that `lare train`
+calls. Algorithms that consume transitions update at every step, after random steps that fill the replay with whole episodes. A turn
+of ppo is one rollout of 2000 steps with its updates. For many agents, see `agents_speed.py`.
 """
 
 import tempfile
@@ -27,7 +27,7 @@ FITTING = [row.name for row in METHODS.values() if not row.for_many_only]
 
 
 def session(directory: Path, algorithm: str, method: str) -> Session:
-    """One that has just begun to update."""
+    """A session that has just begun to update."""
     chosen = ALGORITHMS[algorithm]
     rollouts = chosen.consumes is Consumes.ROLLOUTS
     figures = {} if rollouts else {algorithm: chosen.settings.model_copy(update={"warmup": BEFORE})}
@@ -43,9 +43,9 @@ def main(rounds: int = 3, steps: int = 500, algorithms: tuple[str, ...] = tuple(
     """Measure.
 
     Args:
-        rounds: how often each has its turn.
+        rounds: number of turns of each contender.
         steps: environment steps in a turn of an algorithm that consumes transitions, a multiple of 50.
-        algorithms: which ones.
+        algorithms: the algorithms to measure.
     """
     tables = {}
     for algorithm in algorithms:

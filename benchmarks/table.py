@@ -1,8 +1,8 @@
-"""Kept runs as the rows of a table: mean and standard deviation over seeds.
+"""The kept runs as rows of a table: mean and standard deviation over seeds.
 
     python benchmarks/table.py [--at STEPS] DIRECTORY ...
 
-A DIRECTORY is a run, or has runs somewhere below it (`benchmarks/results/sweeps/closed-form`).
+A DIRECTORY is a run, or contains runs at any depth (`benchmarks/results/sweeps/closed-form`).
 """
 
 import argparse
@@ -15,7 +15,7 @@ COLUMNS = ("credit/correlation", "credit/error", "credit/return_r2")
 
 
 def cell(values: list[float]) -> str:
-    """Three figures of the mean, two of the spread."""
+    """The mean with four digits and the spread with two."""
     if not values:
         return "-"
     mean, spread = mean_and_spread(values)

@@ -1,12 +1,12 @@
-"""The scripted prey of predator and prey: trained here, by PPO, and measured.
+"""The scripted prey of the predator-prey tasks: its training by PPO, and its measurement.
 
     python benchmarks/train_prey.py train        writes src/lare/tasks/particles/prey.npz
     python benchmarks/train_prey.py measure      writes benchmarks/results/prey.json
 
-The published tasks ship the weights of a prey that was trained for a quarter of its time; theirs are not ours to give on.
-So ours learns against greedy predators, each of which moves towards its nearest prey, and its training stops where these
-predators earn as much as they do from the published prey: +29.5 an episode in PP-6, against +80.2 from preys that move
-at random (measured on the published weights, 300 episodes).
+The published tasks ship the weights of a prey that was trained for a quarter of its time, which we may not redistribute. So our
+prey learns against greedy predators, each of which moves towards its nearest prey. Its training stops when these predators earn as
+much as they do from the published prey: +29.5 in an episode of PP-6, compared with +80.2 from preys that move at random (measured
+on the published weights, 300 episodes).
 """
 
 from collections.abc import Callable
@@ -41,7 +41,7 @@ from lare.tasks.particles.world import State, move, push
 from measure import write
 
 TARGET = 29.5
-"""What greedy predators earn from the published prey, summed over predators and steps of a PP-6 episode."""
+"""The reward of greedy predators against the published prey, summed over predators and steps of a PP-6 episode."""
 SHIPPED = Path(prey.__file__).with_name("prey.npz")
 
 WORLDS = 256
@@ -49,7 +49,7 @@ PASSES, MINIBATCHES = 4, 4
 RATE, CLIP, ENTROPY, DISCOUNT, TRACE = 3e-4, 0.2, 0.01, 0.95, 0.95
 REWARD_SCALE = 0.1
 LATEST = 5
-"""Iterations over which the predators' earnings are averaged before they are compared with TARGET."""
+"""The predators' rewards are averaged over so many iterations, and then compared with TARGET."""
 
 
 class Networks(NamedTuple):
@@ -58,7 +58,7 @@ class Networks(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """One prey's steps; leading axes (world, step, prey) or one of all of them."""
+    """Steps of preys, with the leading axes (world, step, prey), or with these flattened into one."""
 
     observation: Float[Array, "*lead observation"]
     action: Int[Array, "*lead"]
@@ -86,7 +86,7 @@ def act_all(size: Size, state: State, preys: Int[Array, " preys"]) -> State:
 def advantages(
     reward: Float[Array, "steps preys"], value: Float[Array, "steps preys"], last: Float[Array, " preys"]
 ) -> Float[Array, "steps preys"]:
-    """Generalised advantage estimation (Schulman et al., 2016). The end of the time is not an end: `last` is V there."""
+    """Generalised advantage estimation (Schulman et al., 2016). The time limit is not a termination: `last` is V there."""
     following = jnp.concatenate([value[1:], last[None]])
     delta = reward + DISCOUNT * following - value
 
@@ -98,7 +98,7 @@ def advantages(
 
 
 def episode(size: Size, networks: Networks, key: PRNGKeyArray) -> tuple[Samples, Float[Array, ""]]:
-    """One episode of preys against greedy predators, and what the predators earned."""
+    """One episode of preys against greedy predators, and the predators' total reward."""
 
     def step(state: State, key: PRNGKeyArray):
         observation = observe_preys(size, state)
@@ -134,7 +134,7 @@ def loss(networks: Networks, batch: Samples) -> Float[Array, ""]:
 def iterate(
     networks: Networks, optimizer: optax.OptState, key: PRNGKeyArray
 ) -> tuple[Networks, optax.OptState, Float[Array, ""]]:
-    """WORLDS episodes, PASSES over their steps, and the mean of what the predators earned before."""
+    """Collect WORLDS episodes and make PASSES passes over their steps; also returns the predators' mean reward in them."""
     collect_key, order_key = jax.random.split(key)
     run = partial(episode, SIZES["PP-6"], networks)
     samples, earned = jax.vmap(run)(jax.random.split(collect_key, WORLDS))
@@ -154,8 +154,8 @@ def train(seed: int = 0, longest: int = 400) -> None:
     """Train until greedy predators earn as much as from the published prey.
 
     Args:
-        seed: of everything.
-        longest: iterations after which to give up.
+        seed: the random seed.
+        longest: the most iterations.
     """
     key = jax.random.key(seed)
     sees = SIZES["PP-6"].prey_sees.observation_size
@@ -176,7 +176,7 @@ def train(seed: int = 0, longest: int = 400) -> None:
                 arrays |= {f"weight_{number}": np.asarray(weight), f"bias_{number}": np.asarray(bias)}
             np.savez(SHIPPED, **arrays)
             return print(f"written to {SHIPPED}")
-    raise SystemExit(f"not there after {longest} iterations")
+    raise SystemExit(f"the target was not reached after {longest} iterations")
 
 
 Policy = Callable[[Size, State, PRNGKeyArray], Int[Array, " preys"]]
@@ -192,7 +192,7 @@ def at_random(size: Size, state: State, key: PRNGKeyArray) -> Int[Array, " preys
 
 @partial(jax.jit, static_argnums=(0, 1, 3))
 def earnings(size: Size, policy: Policy, key: PRNGKeyArray, episodes: int) -> Float[Array, " episodes"]:
-    """What greedy predators earn in each of some episodes, summed over predators and steps."""
+    """The reward of greedy predators in each of some episodes, summed over predators and steps."""
 
     def step(state: State, key: PRNGKeyArray):
         state = act_all(size, state, policy(size, state, key))
@@ -209,8 +209,8 @@ def measure(seed: int = 1, episodes: int = 2000) -> None:
     """Let greedy predators chase the shipped prey, and preys that move at random, in all three sizes.
 
     Args:
-        seed: of everything.
-        episodes: how many for each mean.
+        seed: the random seed.
+        episodes: number of episodes for each mean.
     """
     table: dict[str, dict[str, Any]] = {}
     for name, size in SIZES.items():

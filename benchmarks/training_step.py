@@ -1,10 +1,10 @@
-"""What a training step costs: one environment step of HalfCheetah-v4 and one update, side by side with others' TD3.
+"""The cost of a training step: one environment step of HalfCheetah-v4 and one update, compared with TD3 of other libraries.
 
     python benchmarks/training_step.py
 
-LaRe's methods, TD3 of Stable-Baselines3 and TD3 of SBX take turns in one process; all with batches of 256, networks of
-256-256, one update a step, the actor every second one, a replay for a million transitions. `matrix products` are those
-of one LaRe-RRDu update alone, in a compiled loop, on random numbers. A second table has LaRe-RRDu by the steps of its rollouts.
+LaRe's methods, TD3 of Stable-Baselines3 and TD3 of SBX take turns in one process. All have batches of 256, networks of 256-256, one
+update for each step, an actor update for every second one, and a replay for a million transitions. `matrix products` are those of
+one LaRe-RRDu update alone, in a compiled loop, on random numbers. A second table shows LaRe-RRDu by the length of its rollouts.
 """
 
 import tempfile
@@ -30,7 +30,7 @@ from measure import TD3, advance, interleave, new_session, ratio, show, summary,
 
 TASK, SEED = "HalfCheetah-v4", 0
 BEFORE = 2000
-"""Random steps before the first update: every method has whole episodes to draw."""
+"""Random steps before the first update, so that every method has whole episodes to draw."""
 ROLLOUTS = (1, 10, 50, 200, 1000)
 
 
@@ -64,7 +64,7 @@ Weights = list[Array]
 
 
 def forward(weights: Weights, x: Array) -> tuple[list[Array], Array]:
-    """One product a layer; returns what each layer was given, and the output."""
+    """One product for each layer; returns each layer's input, and the output."""
     given = []
     for weight in weights:
         given.append(x)
@@ -75,7 +75,7 @@ def forward(weights: Weights, x: Array) -> tuple[list[Array], Array]:
 def backward(
     weights: Weights, given: list[Array], gradient: Array, *, to_weights: bool = True, to_input: bool = False
 ) -> Weights:
-    """Two products a layer, that to the first layer's input only where it is wanted."""
+    """Two products for each layer; the one to the first layer's input only if `to_input`."""
     found = []
     for layer in reversed(range(len(weights))):
         if to_weights:
@@ -92,7 +92,7 @@ def matrix_products(factors: int, observation: int, action: int, updates: int = 
     target actor, both target critics: forward;  both critics: forward and backward
     every second update: actor and first critic forward, back through the critic to its input, back through the actor
 
-    Every product's result is carried on, or used by another that is, so that none can be left out.
+    Every product's result is returned, or used by another product, so that the compiler cannot leave one out.
     """
     draw = np.random.default_rng(SEED)
 
@@ -173,7 +173,7 @@ def main(rounds: int = 7, steps: int = 1000) -> None:
     """Measure.
 
     Args:
-        rounds: how often each contender has its turn.
+        rounds: number of turns of each contender.
         steps: environment steps in a turn, a multiple of 50.
     """
     with tempfile.TemporaryDirectory() as place:

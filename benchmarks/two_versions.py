@@ -1,12 +1,12 @@
-"""What a training step costs in two versions of LaRe: each in a process of its own, by turns, in seconds of the processor.
+"""The cost of a training step in two versions of LaRe, in processor seconds. Each has its own process, and they take turns.
 
     git worktree add ../before COMMIT
     python benchmarks/two_versions.py ../before .
 
-A case is an algorithm, a method and, for ippo, a task (CN-6, unless it is named). A turn is 500 environment steps of
-HalfCheetah-v4 with as many updates (td3, ddpg, sac), one rollout of 2000 steps with its updates (ppo), or ten iterations with one
-fit of the decoder (ippo), by each version's own `step_costs.py` and `agents_speed.py`.
-Both processes are bound to the same core, and one waits while the other works.
+A case is an algorithm, a method and, for ippo, a task (the default is CN-6). A turn is 500 environment steps of HalfCheetah-v4 with
+as many updates (td3, ddpg, sac), one rollout of 2000 steps with its updates (ppo), or ten iterations with one fit of the decoder
+(ippo), by each version's own `step_costs.py` and `agents_speed.py`. Both processes are bound to the same core, and one waits while
+the other works.
 """
 
 import json
@@ -22,7 +22,7 @@ import tyro
 from measure import write
 
 TURN = {"ppo": 2000, "td3": 500, "ddpg": 500, "sac": 500}
-"""Environment steps."""
+"""Environment steps in a turn."""
 CASES = ("td3 lare-rrdu", "ppo lare-rrdu", "ippo lare-rd")
 
 PROGRAM = """
@@ -70,7 +70,7 @@ class Version:
         return line.strip()
 
     def turn(self) -> float:
-        """Seconds of the processor."""
+        """Make a turn; returns its processor seconds."""
         assert self.process.stdin is not None
         self.process.stdin.write("go\n")
         self.process.stdin.flush()
@@ -88,7 +88,7 @@ def measured(before: Path, after: Path, case: str, rounds: int, core: int) -> di
     assert all(version.answer() == "ready" for version in versions)
     turns: list[list[float]] = [[], []]
     for number in range(rounds):
-        for place in (0, 1) if number % 2 else (1, 0):  # who is first changes
+        for place in (0, 1) if number % 2 else (1, 0):  # they alternate in being first
             turns[place].append(versions[place].turn())
     for version in versions:
         version.close()
@@ -114,10 +114,10 @@ def main(
 
     Args:
         before: a checkout.
-        after: another one.
-        cases: what is timed.
-        rounds: how often each has its turn.
-        core: which both run on.
+        after: another checkout.
+        cases: the cases to measure.
+        rounds: number of turns of each version.
+        core: the core on which both run.
         out: the name of the file in benchmarks/results.
     """
     found = {}

@@ -1,9 +1,9 @@
-"""What worker processes save: lanes that step in this process against lanes that step in processes of their own.
+"""The speed-up by worker processes: environments (lanes) that step in this process, compared with lanes in worker processes.
 
     python benchmarks/workers.py
 
-One environment takes 20 ms of a core for a step, another none: the second says what it costs to ask a worker. All take
-turns; what else runs on the machine takes from both.
+One environment takes 20 ms of a core for a step, another one takes none, which shows the cost of calling a worker. All contenders
+take turns, so that other load on the machine affects all of them.
 """
 
 from functools import partial
@@ -28,11 +28,11 @@ def main(lanes: int = 4, processes: int = 2, burn_ms: float = 20, steps: int = 2
     """Measure.
 
     Args:
-        lanes: environments.
-        processes: among which they are dealt.
-        burn_ms: of a core, for a step of the first environment.
-        steps: of every lane in a turn.
-        rounds: how often each has its turn.
+        lanes: number of environments.
+        processes: number of worker processes among which the environments are divided.
+        burn_ms: milliseconds of a core for a step of the first environment.
+        steps: steps of every lane in a turn.
+        rounds: number of turns of each contender.
     """
     found = {}
     for title, seconds, many in ((f"{burn_ms:g} ms a step", burn_ms / 1000, steps), ("0 ms a step", 0.0, 40 * steps)):

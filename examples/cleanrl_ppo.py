@@ -1,11 +1,11 @@
-"""PPO in a single file, after CleanRL's `ppo_continuous_action.py`, on rewards that LaRe assigns to steps.
+"""PPO in a single file, after CleanRL's `ppo_continuous_action.py`, trained on the proxy rewards of LaRe.
 
     python examples/cleanrl_ppo.py --env-id HalfCheetah-v5
-    python examples/cleanrl_ppo.py --method dense   # what the environment pays
+    python examples/cleanrl_ppo.py --method dense   # the rewards of the environment
 
-The lines that end in `# LaRe` are all that LaRe adds.
+LaRe adds only the lines that end in `# LaRe`.
 """
-# Spaces and modules say little of their types here, as in CleanRL.
+# The types of spaces and modules are imprecise here, as in CleanRL.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false, reportOperatorIssue=false
 # pyright: reportPossiblyUnboundVariable=false, reportOptionalIterable=false
 
@@ -84,7 +84,7 @@ class Agent(nn.Module):
 
 
 def main(args: Args) -> list[float]:
-    """Train; the returns of the episodes, as the environment pays."""
+    """Train. Gives the returns of the episodes (sums of the rewards of the environment)."""
     batch_size = args.num_envs * args.num_steps
     minibatch_size = batch_size // args.num_minibatches
     random.seed(args.seed)

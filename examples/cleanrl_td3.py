@@ -1,11 +1,11 @@
-"""TD3 in a single file, after CleanRL's `td3_continuous_action.py`, on rewards that LaRe assigns to steps.
+"""TD3 in a single file, after CleanRL's `td3_continuous_action.py`, trained on the proxy rewards of LaRe.
 
     python examples/cleanrl_td3.py --env-id HalfCheetah-v5
-    python examples/cleanrl_td3.py --method dense   # what the environment pays
+    python examples/cleanrl_td3.py --method dense   # the rewards of the environment
 
-The lines that end in `# LaRe` are all that LaRe adds.
+LaRe adds only the lines that end in `# LaRe`.
 """
-# Spaces and modules say little of their types here, as in CleanRL.
+# The types of spaces and modules are imprecise here, as in CleanRL.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false, reportOperatorIssue=false
 # pyright: reportPossiblyUnboundVariable=false, reportOptionalIterable=false
 
@@ -103,7 +103,7 @@ class Actor(nn.Module):
 
 
 def main(args: Args) -> list[float]:
-    """Train; the returns of the episodes, as the environment pays."""
+    """Train. Gives the returns of the episodes (sums of the rewards of the environment)."""
     random.seed(args.seed)
     np.random.seed(args.seed)
     torch.manual_seed(args.seed)
@@ -134,7 +134,7 @@ def main(args: Args) -> list[float]:
     envs.action_space.seed(args.seed)
     obs, _ = envs.reset(seed=args.seed)
     for global_step in range(0, args.total_timesteps, args.num_envs):
-        # What to do.
+        # Choose actions.
         if global_step < args.learning_starts:
             actions = envs.action_space.sample()
         else:
@@ -145,7 +145,7 @@ def main(args: Args) -> list[float]:
 
         next_obs, rewards, terminations, truncations, infos = envs.step(actions)
 
-        # An episode that ended led to its own last observation, not to the first of the next one.
+        # After the last step of an episode, `next_obs` is the first observation of the next episode: use `final_obs`.
         real_next_obs = next_obs.copy()
         for idx in np.flatnonzero(terminations | truncations):
             real_next_obs[idx] = infos["final_obs"][idx]

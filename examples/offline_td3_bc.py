@@ -1,11 +1,11 @@
-"""TD3+BC on logged episodes (Fujimoto and Gu, 2021), in one file as CORL has it: on any rewards that a data set holds.
+"""TD3+BC on logged episodes (Fujimoto and Gu, 2021), in one file, in the style of CORL.
 
     lare relabel DATASET --out NEW
     python examples/offline_td3_bc.py NEW --rewards rewards --environment Pendulum-v1     # on r_hat
-    python examples/offline_td3_bc.py NEW --rewards paid                                  # on what was paid
+    python examples/offline_td3_bc.py NEW --rewards paid                                  # on the rewards of the log
     python examples/offline_td3_bc.py NEW --rewards end                                   # on the return, at the end
 
-NEW is what `lare relabel` has written: a directory of .npz files, or a Minari id. Actions are rows of numbers.
+NEW is the output of `lare relabel`: a directory of .npz files, or a Minari id. Actions must be rows of numbers.
 """
 
 import argparse

@@ -1,8 +1,9 @@
-"""Latent rewards in a training loop of your own, whatever it is made of.
+"""Proxy rewards of a latent function in your own training loop.
 
     python examples/own_loop.py
 
-Here actions are random and nothing is trained: what is printed is how near r_hat comes to rewards that were never shown.
+Actions are random, and no policy is trained. The script prints the correlation of r_hat with the true rewards,
+which the assigner never receives.
 """
 
 import gymnasium
@@ -12,9 +13,9 @@ import lare
 
 
 def main(episodes: int = 40) -> float:
-    """Play; the correlation of r_hat with the true rewards of the last episode."""
+    """Play. Gives the correlation of r_hat with the true rewards of the last episode."""
     task = lare.load_task("HalfCheetah-v4")
-    phi = lare.design(task)  # from the recorded replies; `lare.load_function("phi.py", task)` for one of your own
+    phi = lare.design(task)  # from the recorded replies; `lare.load_function("phi.py", task)` for your own function
     credit = lare.CreditAssigner("lare-bayes", phi, task=task)
     environment = lare.EpisodicReward(gymnasium.make(task.environment))  # pays at the end of an episode
     environment.action_space.seed(0)
@@ -26,9 +27,9 @@ def main(episodes: int = 40) -> float:
             action = environment.action_space.sample()
             after, paid, terminated, truncated, info = environment.step(action)
             steps += credit.add([before], [action], [after], [paid], [terminated], [truncated]).tolist()
-            true.append(info["true_reward"])  # which only the last line looks at
+            true.append(info["true_reward"])  # used only by the last line of this function
             before, over = after, terminated or truncated
-        r_hat = credit.rewards_at(steps)  # what your algorithm trains on: asked for anew whenever it samples
+        r_hat = credit.rewards_at(steps)  # your algorithm trains on these; ask again whenever it samples
     credit.close()
     return float(np.corrcoef(r_hat, true)[0, 1])
 

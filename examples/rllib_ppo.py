@@ -1,29 +1,29 @@
-"""PPO of RLlib, on a Pendulum that pays its return at the end of an episode only.
+"""PPO of RLlib on a Pendulum that pays its return only at the end of an episode.
 
     pip install 'ray[rllib]==2.60.0' torch
     python examples/rllib_ppo.py
 
-`Credit` is the outermost wrapper of each environment: it shows every step to the assigner, and puts its number into
-`info`. `PayCredit` is a piece of the learner's connector: once a rollout is whole, it fits the decoder and pays all
-steps, before PPO computes advantages. The episodes keep the environment's rewards, and so do the returns that RLlib
-reports.
+`Credit` is the outermost wrapper of each environment. It passes every step to the assigner, and puts the number of the
+step into `info`. `PayCredit` is part of the learner's connector. When a rollout is complete, it fits the decoder and
+pays all steps, before PPO computes advantages. The episodes keep the environment's rewards, so the returns that RLlib
+reports do not change.
 
-* Actions: RLlib brings them into the environment's units before it takes a step.
-* Ends: RLlib resets by Gymnasium's NEXT_STEP mode and leaves resets out. `Credit`, inside of that, sees episodes as
-  they are.
+* Actions: RLlib converts them to the environment's units before it takes a step.
+* Ends: RLlib uses Gymnasium's NEXT_STEP mode and leaves resets out. `Credit` wraps each single environment, so it
+  receives no reset as a step.
 
-What does not work: `num_env_runners` or `num_learners` above 0. Environments and learner are then other processes, and
-the assigner lives in this one. With runners RLlib stops, since they do not find the environment. With learners
-`PayCredit` has a copy of the assigner that was shown nothing, and raises `LareError`. `num_envs_per_env_runner` may be
+What does not work: `num_env_runners` or `num_learners` above 0. Environments or learner then run in other processes,
+and the assigner is in this one. With runners, RLlib stops, because they do not find the environment. With learners,
+`PayCredit` has a copy of the assigner that received no steps, and raises `LareError`. `num_envs_per_env_runner` may be
 any number.
 
-With a latent function (docs/bring-your-own-task.md), this makes the assigner:
+With a latent function (docs/bring-your-own-task.md), create the assigner like this:
 
     task = lare.load_task("pendulum.toml")
     credit = lare.CreditAssigner("lare-bayes", lare.load_function("phi.py", task), task=task)
 
-It ran with RLlib 2.60.0, torch 2.13.0, Python 3.11 and Gymnasium 1.2.2, which this RLlib asks for: give it a virtual
-environment of its own. It took a minute on one core. Seed 0 printed, behind warnings of RLlib's own:
+It ran with RLlib 2.60.0, torch 2.13.0, Python 3.11 and Gymnasium 1.2.2, the version that this RLlib requires: use a
+separate virtual environment. It took a minute on one core. Seed 0 printed, after warnings of RLlib itself:
 
     iteration 0: mean return -1432
     iteration 13: mean return -873
@@ -31,8 +31,8 @@ environment of its own. It took a minute on one core. Seed 0 printed, behind war
     iteration 39: mean return -178
     {'credit/return_r2': 0.9990494251251221, 'credit/episodes': 320.0, 'credit/dropped': 0.0, ...}
 
-Seeds 1 and 2: from -1185 to -80, and from -1191 to -80. On the return as it is paid, without `learner_connector`,
-seed 0 goes from -1432 to -1631.
+Seeds 1 and 2: from -1185 to -80, and from -1191 to -80. Without `learner_connector`, PPO trains on the return at the
+end, and seed 0 goes from -1432 to -1631.
 """
 
 import gymnasium
@@ -48,7 +48,7 @@ from lare.plugs.gymnasium import Credit
 
 
 class PayCredit(ConnectorV2):
-    """Pays the steps of a rollout, once it is whole and before PPO computes advantages."""
+    """Pays the steps of a complete rollout, before PPO computes advantages."""
 
     def __init__(self, credit):
         super().__init__()
@@ -57,7 +57,7 @@ class PayCredit(ConnectorV2):
     def __call__(self, *, batch, episodes, **others):
         self.credit.fit()
         for episode in self.single_agent_episode_iterator(episodes, agents_that_stepped_only=False):
-            rows = len(episode)  # its steps and one more: PPO has put a row behind them, which is no step
+            rows = len(episode)  # its steps and one more: PPO has added a last row, which is not a step
             steps = [info["credit_step"] for info in episode.get_infos(slice(1, rows))]
             rewards = np.append(self.credit.rewards_at(steps), 0)
             self.add_n_batch_items(batch, Columns.REWARDS, rewards, rows, episode)
@@ -65,8 +65,8 @@ class PayCredit(ConnectorV2):
 
 
 def main(iterations: int = 40, seed: int = 0) -> list[float]:
-    """Train; the mean return of each iteration's episodes, as the environment pays."""
-    # Before the assigner: Ray forks, and JAX warns of that once it runs.
+    """Train. Gives the mean return of each iteration (sums of the rewards of the environment)."""
+    # Before the assigner: Ray forks, and JAX warns about forks once it runs.
     ray.init(include_dashboard=False)
     one = gymnasium.make("Pendulum-v1")
     credit = lare.CreditAssigner("bayes", observation_space=one.observation_space, action_space=one.action_space)
@@ -75,7 +75,7 @@ def main(iterations: int = 40, seed: int = 0) -> list[float]:
         env = lare.EpisodicReward(gymnasium.make("Pendulum-v1", **settings))
         return Credit(env, credit, pay="environment")
 
-    # By Gymnasium. Ray's own `register_env` would copy the assigner, and the environments would show their steps to the copy.
+    # Register with Gymnasium: Ray's `register_env` would copy the assigner, and the steps would go to the copy.
     gymnasium.register("EpisodicPendulum-v0", entry_point=make)
     config = (
         PPOConfig()

@@ -1,18 +1,19 @@
-"""TD3 of skrl, on a Pendulum that pays its return at the end of an episode only.
+"""TD3 of skrl on a Pendulum that pays its return only at the end of an episode.
 
     pip install skrl==2.1.1
     python examples/skrl_td3.py
 
-`VectorCredit` watches the vector environment: skrl does not tell a memory which episodes a time limit has cut.
-`CreditMemory` takes the place of a `RandomMemory`. When it is sampled, it asks what these steps are worth by now.
+`VectorCredit` wraps the vector environment and passes its steps to the assigner. The memory cannot do this, because
+skrl does not tell it which episodes a time limit has truncated. `CreditMemory` replaces a `RandomMemory`. When it is
+sampled, it asks the assigner for the current proxy rewards of these steps.
 
-* Actions: the actor's are in the environment's units, so memory and environment have the same.
-* Ends: in SAME_STEP mode every row is a step, but skrl would store the next episode's first observation as what the
-  last step led to. `CreditTD3` stores `final_obs`. In NEXT_STEP mode, Gymnasium's usual one, skrl stores resets as if
-  they were steps.
+* Actions: the actor's actions are in the environment's units, so memory and environment have the same actions.
+* Ends: in SAME_STEP mode every row is a step. But after the last step of an episode, skrl would store the first
+  observation of the next episode. `CreditTD3` stores `final_obs`. In NEXT_STEP mode, Gymnasium's default, skrl stores
+  resets as if they were steps.
 * The memory asks by observations and actions, not by numbers of steps. The method `ircr` needs numbers.
 
-With a latent function (docs/bring-your-own-task.md), this makes the assigner:
+With a latent function (docs/bring-your-own-task.md), create the assigner like this:
 
     task = lare.load_task("pendulum.toml")
     credit = lare.CreditAssigner("lare-bayes", lare.load_function("phi.py", task), task=task)
@@ -22,8 +23,8 @@ It ran with skrl 2.1.1, Gymnasium 1.4.0, torch 2.13.0 and Python 3.11, for a min
     mean return of the first and of the last ten episodes: -1319, -139
     {'credit/return_r2': 0.9985870718955994, 'credit/episodes': 50.0, 'credit/dropped': 0.0, ...}
 
-Seeds 1 and 2: from -1237 to -147, and from -1381 to -184. On the return as it is paid, with
-`RandomMemory(memory_size=50_000, num_envs=2)`, seed 0 goes from -1373 to -948.
+Seeds 1 and 2: from -1237 to -147, and from -1381 to -184. With `RandomMemory(memory_size=50_000, num_envs=2)`, TD3
+trains on the return at the end, and seed 0 goes from -1373 to -948.
 """
 
 import gymnasium
@@ -46,7 +47,7 @@ from lare.plugs.gymnasium import VectorCredit
 
 
 class CreditMemory(RandomMemory):
-    """Pays the steps that are sampled by the newest decoder."""
+    """Replaces the rewards of sampled steps by those of the newest decoder."""
 
     def __init__(self, credit, **settings):
         super().__init__(**settings)
@@ -56,19 +57,19 @@ class CreditMemory(RandomMemory):
         self.credit.fit_owed()
         batches = super().sample_by_index(names, indexes=indexes, mini_batches=mini_batches)
         for batch in batches:
-            rows = dict(zip(names, batch, strict=True))  # copies of what is stored
+            rows = dict(zip(names, batch, strict=True))  # copies of the stored rows
             r_hat = self.credit.rewards(rows["observations"], rows["actions"], rows["next_observations"])
             rows["rewards"][:, 0] = torch.as_tensor(r_hat)
         return batches
 
 
 class CreditTD3(TD3):
-    """Stores what the last step of an episode led to, where skrl stores the first observation of the next episode."""
+    """Stores the last observation of an episode, where skrl stores the first observation of the next one."""
 
     def record_transition(self, *, next_observations, infos, **others):
         if "final_obs" in infos:
             ended = infos["_final_obs"]
-            next_observations = next_observations.clone()  # skrl's trainer goes on from the other one
+            next_observations = next_observations.clone()  # skrl's trainer continues from the original
             next_observations[ended] = torch.as_tensor(np.stack(infos["final_obs"][ended]))
         super().record_transition(next_observations=next_observations, infos=infos, **others)
 
@@ -86,7 +87,7 @@ class Actor(Network):
         return 2 * torch.tanh(self.layers(inputs["observations"])), {}  # Pendulum's actions are from -2 to 2
 
     def random_act(self, inputs, *, role=""):
-        # skrl 2.1's own gives the same actions in every call (github.com/Toni-SM/skrl/issues/453).
+        # skrl 2.1's own method gives the same actions in every call (github.com/Toni-SM/skrl/issues/453).
         return 4 * torch.rand(len(inputs["observations"]), 1) - 2, {}
 
 
@@ -96,7 +97,7 @@ class Critic(Network):
 
 
 def main(steps: int = 10_000, seed: int = 0) -> list[float]:
-    """Train; mean returns of the first ten episodes and of the last ten."""
+    """Train. Gives the mean returns of the first ten episodes and of the last ten."""
     torch.set_num_threads(1)
     set_seed(seed)
     makers = [lambda: lare.EpisodicReward(gymnasium.make("Pendulum-v1"))] * 2

@@ -1,18 +1,18 @@
-"""TD3 of Tianshou, on a Pendulum that pays its return at the end of an episode only.
+"""TD3 of Tianshou on a Pendulum that pays its return only at the end of an episode.
 
     pip install tianshou==2.0.1
     python examples/tianshou_td3.py
 
-`CreditReplayBuffer` takes the place of a `VectorReplayBuffer`. It shows each new step to the assigner. When a batch is
-sampled, it asks what these steps are worth by now, and writes that where Tianshou looks for their rewards. What the
-environment paid is not kept.
+`CreditReplayBuffer` replaces a `VectorReplayBuffer`. It passes each new step to the assigner. When a batch is sampled,
+it asks the assigner for the current proxy rewards of these steps, and writes them to the array from which Tianshou
+reads rewards. The rewards of the environment are not kept.
 
-* Actions: Tianshou stores them between -1 and 1. The assigner is shown what the environment was given.
-* Ends: Tianshou's collector resets environments itself, so `obs_next` is an episode's own last observation, and no row
-  is a reset. A time limit ends an episode like any other.
-* Returns of n steps: `CreditReplayBuffer(..., n_step=n)`, with the algorithm's `n_step_return_horizon`.
+* Actions: Tianshou stores them between -1 and 1. The assigner receives them in the environment's units.
+* Ends: Tianshou's collector resets environments itself, so `obs_next` is the last observation of the episode itself,
+  and no row is a reset. A time limit ends an episode like any other.
+* n-step returns: `CreditReplayBuffer(..., n_step=n)`, with the algorithm's `n_step_return_horizon`.
 
-With a latent function (docs/bring-your-own-task.md), this makes the assigner:
+With a latent function (docs/bring-your-own-task.md), create the assigner like this:
 
     task = lare.load_task("pendulum.toml")
     credit = lare.CreditAssigner("lare-bayes", lare.load_function("phi.py", task), task=task)
@@ -22,11 +22,11 @@ printed:
 
     mean return before training: -1238
     mean return after training: -149
-    correlation of r_hat with the true rewards, which nobody was shown: 0.97
+    correlation of r_hat with the true rewards, which were not used: 0.97
     {'credit/return_r2': 0.9768619537353516, 'credit/episodes': 54.0, 'credit/dropped': 0.0, ...}
 
-Seeds 1 and 2: from -1349 to -156, and from -1530 to -177. On the return as it is paid, with
-`VectorReplayBuffer(100_000, 2)`, seed 0 goes from -1238 to -1508.
+Seeds 1 and 2: from -1349 to -156, and from -1530 to -177. With `VectorReplayBuffer(100_000, 2)`, TD3 trains on the
+return at the end, and seed 0 goes from -1238 to -1508.
 """
 
 import gymnasium
@@ -47,7 +47,7 @@ import lare
 
 
 class CreditReplayBuffer(VectorReplayBuffer):
-    """Shows every step to an assigner as it comes in, and pays those that are sampled by the newest decoder."""
+    """Passes new steps to an assigner, and sets the rewards of sampled steps to those of the newest decoder."""
 
     def __init__(self, size, environments, credit, policy, n_step=1):
         super().__init__(size, environments)
@@ -60,20 +60,20 @@ class CreditReplayBuffer(VectorReplayBuffer):
         ends = batch.terminated, batch.truncated
         steps = self.credit.add(batch.obs, action, batch.obs_next, batch.rew, *ends, lanes=lanes)
         rows, *rest = super().add(batch, buffer_ids)
-        self.steps[rows], self.rew[rows] = steps, 0  # what the environment paid is not kept
+        self.steps[rows], self.rew[rows] = steps, 0  # the rewards of the environment are not kept
         return (rows, *rest)
 
     def sample(self, batch_size):
         self.credit.fit_owed()
         rows = ahead = self.sample_indices(batch_size)
-        for _ in range(self.n_step):  # targets are computed from `self.rew`, of the sampled row and the n - 1 behind it
+        for _ in range(self.n_step):  # targets read `self.rew` of the sampled row and the n - 1 after it
             self.rew[ahead] = self.credit.rewards_at(self.steps[ahead])
             ahead = self.next(ahead)
         return self[rows], rows
 
 
 def main(steps: int = 10_000, seed: int = 0) -> list[float]:
-    """Train; mean returns of ten episodes before and after."""
+    """Train. Gives the mean returns of ten episodes before and after."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     np.random.seed(seed)
@@ -115,7 +115,7 @@ def main(steps: int = 10_000, seed: int = 0) -> list[float]:
     print(f"mean return after training: {returns[-1]:.0f}")
     known = buffer.steps >= 0
     found = np.corrcoef(credit.rewards_at(buffer.steps[known]), buffer.info["true_reward"][known])[0, 1]
-    print(f"correlation of r_hat with the true rewards, which nobody was shown: {found:.2f}")
+    print(f"correlation of r_hat with the true rewards, which were not used: {found:.2f}")
     print(credit.metrics())
     return returns
 

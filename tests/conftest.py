@@ -13,12 +13,15 @@ from jax_toys import Echo, echo_spec
 from lare import cli
 from lare.algorithms.settings import PPOSettings
 from lare.algorithms.table import ALGORITHMS
+from lare.deploy import export
+from lare.experiments import evaluation, policy, watch
 from lare.latent.function import LatentFunction, verified
 from lare.run.settings import Settings
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import FAMILIES, Family
 from lare.training import explain
 from lare.training import session as sessions
+from lare.training.compiled import compiled
 from toys import PHI, REWARD, Chase, toy_spec
 
 # Most of a small run's time is compilation, and many tests compile the same. JAX may have been imported already, and
@@ -44,6 +47,7 @@ for option, value in CACHE.items():
 
 collect_ignore = [
     "toys.py",
+    "tiers.py",
     "jax_toys.py",
     "hosts.py",
     "parallel_toys.py",
@@ -67,24 +71,30 @@ def forget_what_was_compiled():
 
 @pytest.fixture(autouse=True, scope="module")
 def compile_once():
-    """A run that is resumed, or trained or explained again, has the functions that were compiled for it the first time.
+    """Functions that are compiled for a configuration serve every run of a module that has it: one that is resumed, evaluated,
+    explained, or trained again.
 
-    A few of them are kept, until a module's last test.
+    A few of them are kept, until the module's last test.
     """
-    kept, ahead, explaining = {}, sessions.compile_ahead, explain.explaining
+    kept, explaining, ahead = {}, explain.explaining, sessions.ahead
 
     def once(key, make):
         kept[key] = kept.pop(key) if key in kept else make()
-        if len(kept) > 8:
+        if len(kept) > 40:
             del kept[next(iter(kept))]
         return kept[key]
 
-    def of_run(run, config, functions):
-        return once((repr(config), len(run.seeds)), lambda: ahead(run, config, functions))
+    def of_config(config):
+        return once(repr(config), lambda: compiled(config))
+
+    def of_shapes(function, *shapes):
+        return once((function, str(jax.tree.map(jax.typeof, shapes))), lambda: ahead(function, *shapes))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sessions, "compile_ahead", of_run)
-        patch.setattr(explain, "explaining", lambda config: once(repr(config), lambda: explaining(config)))
+        for module in (sessions, export, evaluation, watch, policy):
+            patch.setattr(module, "compiled", of_config)
+        patch.setattr(sessions, "ahead", of_shapes)
+        patch.setattr(explain, "explaining", lambda config: once((repr(config), "explain"), lambda: explaining(config)))
         yield
 
 

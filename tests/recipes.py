@@ -116,7 +116,7 @@ def untrained(config, seed=0):
 def with_steps(learner, config, steps, factors=None):
     """A learner that has met these steps too, and been told of the episodes that have finished."""
     factors = factors_for(config, steps) if factors is None else factors
-    learner = jitted(common.store, config)(learner, jax.tree.map(jnp.asarray, steps), factors)
+    learner = jitted(common.store, config)(learner, steps, factors)
     return told(learner, config) if learner.credit else learner
 
 

@@ -36,22 +36,22 @@ for call in json.load(sys.stdin):
 """
 
 LISTENER = (
-    "a listener has the methods started, stepped, evaluated, said and stopped (lare.training.progress.Listener): "
+    "a listener must have the methods started, stepped, evaluated, said and stopped (lare.training.progress.Listener): "
 )
 TASK = "a task is a shipped name, the path of a task file, or a lare.TaskSpec; it is "
 POLICY = "an observation is 2 numbers, and a batch has rows of them: "
 CALLS = {
-    "lare.train(task, {'method': 'rrdu'})": "settings are a lare.Settings, as lare.Settings(method='rrdu', steps=100_000); they "
-    "are {'method': 'rrdu'}",
+    "lare.train(task, {'method': 'rrdu'})": "settings must be a lare.Settings, such as "
+    "lare.Settings(method='rrdu', steps=100_000), and are {'method': 'rrdu'}",
     "lare.train(7)": f"{TASK}7",
     "lare.train({'name': 'x'})": f"{TASK}{{'name': 'x'}}",
-    "lare.train(task, function=7)": "a latent function is the path of its file, or what lare.design and lare.load_function give; "
-    "it is 7: write its source to a file, which is verified",
-    "lare.train(task, listeners=[7])": f"{LISTENER}7 has not",
-    "lare.train(task, function='none.py')": "the function file none.py is not there",
-    "lare.resume(7)": "a run is its directory, or what lare.train and lare.open_run give; it is 7",
+    "lare.train(task, function=7)": "a latent function must be the path of its file, or come from lare.design or "
+    "lare.load_function, and is 7: write its source to a file, which is verified",
+    "lare.train(task, listeners=[7])": f"{LISTENER}7 does not",
+    "lare.train(task, function='none.py')": "the function file none.py does not exist",
+    "lare.resume(7)": "a run must be a directory, or come from lare.train or lare.open_run, and is 7",
     "lare.resume('none')": "none is not a run: there is no config.json in it",
-    "lare.evaluate_run(7)": "a run is its directory, or what lare.train and lare.open_run give; it is 7",
+    "lare.evaluate_run(7)": "a run must be a directory, or come from lare.train or lare.open_run, and is 7",
     "lare.evaluate_run('run', 1.5)": "episodes = 1.5: a whole number, 1 or more",
     "lare.policy_of('none')": "none is not a run: there is no config.json in it",
     "lare.policy_of(run, 7)": "run has no seed 7; its seeds: 0",
@@ -60,18 +60,18 @@ CALLS = {
     "policy(np.zeros((0, 2)))": f"{POLICY}the shape is (0, 2)",
     "lare.export('none', 'out')": "none is not a run: there is no config.json in it",
     "lare.write_report([])": "say which runs to report on",
-    "lare.load_function('none.py', task)": "the function file none.py is not there",
-    "lare.load_function(listening.__code__.co_argcount, task)": "a latent function is read from the path of its file; it is 0",
-    "lare.load_function('none.py', 7)": "the function file none.py is not there",
+    "lare.load_function('none.py', task)": "the function file none.py does not exist",
+    "lare.load_function(listening.__code__.co_argcount, task)": "a latent function is read from the path of a file, not from 0",
+    "lare.load_function('none.py', 7)": "the function file none.py does not exist",
     "lare.design(7)": f"{TASK}7",
-    "lare.design(task, model='gpt')": "a model has a name and a method reply(messages, sample): 'gpt' has not",
+    "lare.design(task, model='gpt')": "a model must have a name and a method reply(messages, sample): 'gpt' does not",
     "lare.reflect(phi, 7, None)": f"{TASK}7",
-    "phi([[0, 0]] * 5, [[0]] * 4)": "there are 5 observations and 4 actions: each step has one of both",
-    "phi([0, 0, 0], [0])": "observations are of shape (batch, 2), or (2,) of a single step: the shape is (3,)",
-    "phi([[0, 0]], 'left')": "actions are arrays of numbers: no array can be made of 'left'",
-    "phi([[0, 0]], [[0, 0]])": "actions are of shape (batch, 1), or (1,) of a single step: the shape is (1, 2)",
-    "phi(0, 0)": "observations are of shape (batch, 2), or (2,) of a single step: the shape is ()",
-    "lare.CreditAssigner('lare-bayes', 7, task=task)": "phi is what lare.design and lare.load_function give; it is 7",
+    "phi([[0, 0]] * 5, [[0]] * 4)": "there are 5 observations and 4 actions: each step needs one observation and one action",
+    "phi([0, 0, 0], [0])": "observations must have the shape (batch, 2), or (2,) for a single step: the shape is (3,)",
+    "phi([[0, 0]], 'left')": "actions must be arrays of numbers: 'left' cannot be converted to one",
+    "phi([[0, 0]], [[0, 0]])": "actions must have the shape (batch, 1), or (1,) for a single step: the shape is (1, 2)",
+    "phi(0, 0)": "observations must have the shape (batch, 2), or (2,) for a single step: the shape is ()",
+    "lare.CreditAssigner('lare-bayes', 7, task=task)": "phi must be a function from lare.design or lare.load_function, and is 7",
     "lare.CreditAssigner('lare-bayes', phi, task=7)": f"{TASK}7",
     "lare.CreditAssigner('lare-bayes', phi, task=pick_spec())": "the latent function was written for the task 'Chase', and this is "
     "'Pick': choose another one or, if this one is right for both, say so by dataclasses.replace(function, task='Pick')",

@@ -41,13 +41,17 @@ def test_tasks_are_listed(command):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("train Task --steps 1e5", "--steps 1e5: not a whole number, as 10000; see lare train --help"),
+        ("train Task --steps 1e5", "--steps 1e5: not a whole number, such as 10000; see lare train --help"),
         ("train Task --step 9", "unrecognized options: --step, 9 (did you mean '--steps'?); see lare train --help"),
         ("trian", "unrecognized options: trian (did you mean 'train'?); see lare --help"),
         ("evaluate a b", "unrecognized options: b; see lare evaluate --help"),
-        ("evaluate", "Missing from lare evaluate: RUN a run directory. (required); see lare evaluate --help"),
+        ("evaluate", "lare evaluate needs RUN (a run directory); see lare evaluate --help"),
         ("design Task --price 1", "--price 1: not of the kind {FLOAT FLOAT}; see lare design --help"),
-        ("train Task --seeds", "Missing value for argument '--seeds'. Expected 1 values; see lare train --help"),
+        ("train Task --seeds", "--seeds needs a value; see lare train --help"),
+        (
+            "export a",
+            "lare export needs --out DIR (the directory to write, which must not exist); see lare export --help",
+        ),
         (
             "train Task --td3.gamma high",
             "Error parsing --td3.gamma: could not convert string to float: 'high'; see lare train --help",
@@ -62,10 +66,8 @@ def test_a_mistake_on_the_command_line_is_one_line(arguments, line, command):
 
 def test_an_unknown_choice_lists_those_there_are(command):
     status, _, err = command("train", "Task", "--algorithm", "dqn")
-    assert status == 2
-    assert err.startswith("lare: invalid choice 'dqn' for argument '--algorithm'. Expected one of (")
-    assert all(repr(name) in err for name in ALGORITHMS)
-    assert "'None'" not in err
+    known = ", ".join(sorted(ALGORITHMS))
+    assert (status, err) == (2, f"lare: --algorithm dqn: not one of {known}; see lare train --help\n")
 
 
 @pytest.mark.parametrize(
@@ -85,7 +87,7 @@ def test_an_unknown_choice_lists_those_there_are(command):
             "Reacher-v4 --draw 1 --function phi.py",
             "draw and candidates choose a recorded function, and a function is given: leave either out",
         ),
-        ("Reacher-v4 --seed 2147483647 --seeds 2", "seed = 2147483647 and 1 that follow it: the largest is 2147483647"),
+        ("Reacher-v4 --seed 2147483647 --seeds 2", "seed = 2147483647 with seeds = 2: the largest seed is 2147483647"),
     ],
 )
 def test_settings_that_make_no_difference_are_refused(arguments, message, command, tmp_path):
@@ -158,14 +160,14 @@ def test_verify_says_how_much_of_the_score_the_factors_explain(command, phi, spe
     )
     assert found
     assert float(found[1]) > 0.9
-    assert "And fitted to all 30 episodes:\nThe factors explain " in out
+    assert "\nFitted to all 30 episodes:\nThe factors explain " in out
 
 
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--fit", "10"], "fit = 10: fewer than 20 episodes say too little of a function"),
-        (["--policy", "run"], "--policy plays the episodes for --fit, where there is no --data: say how many"),
+        (["--fit", "10"], "fit = 10: at least 20 episodes are needed"),
+        (["--policy", "run"], "--policy plays the episodes for --fit: give --fit a number of episodes, and no --data"),
     ],
 )
 def test_a_fit_that_says_nothing_is_refused_at_once(command, phi, spec_file, more, message):
@@ -195,7 +197,7 @@ def test_verify_gives_advice(command, spec_file, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("none.py --task Reacher-v4", "the function file none.py is not there"),
+        ("none.py --task Reacher-v4", "the function file none.py does not exist"),
         ("phi.py --task Reacher", "no task 'Reacher' (did you mean 'Reacher-v4'?): "),
     ],
 )
@@ -267,7 +269,7 @@ def test_the_ablation_without_pre_verification_keeps_what_runs(command):
             "train --resume runs/none --seed 1",
             "--resume goes on with the run's own settings: give it no task and no other setting than --steps",
         ),
-        ("train Reacher-v4 --function none.py", "the function file none.py is not there"),
+        ("train Reacher-v4 --function none.py", "the function file none.py does not exist"),
         ("train Reacher-v4 --steps 120", "steps = 120 is not a multiple of rollout_steps = 50: take 100"),
         ("train Reacher-v4 --seed -1", "seed = -1: input should be greater than or equal to 0"),
         (
@@ -352,7 +354,7 @@ def test_help_breaks_no_line_where_the_source_does(command):
     assert "--algorithm" in out
     lines = [line.strip(" |│") for line in out.splitlines()]
     assert "one --function for each, in the order of the task. (repeatable)" not in lines
-    assert "actions, td3 for all others. (default: None)" not in lines
+    assert "qmix if there are a global state and action masks, else ippo. (default: None)" not in lines
 
 
 def test_from_training_to_report(command, spec_file, phi):
@@ -386,7 +388,8 @@ def test_from_training_to_report(command, spec_file, phi):
     assert command("train", spec_file(), *TINY, "--function", phi, "--out", run) == (
         2,
         "",
-        f"lare: {run} exists, and a run never overwrites another: choose another --out, or go on with --resume\n",
+        f"lare: {run} exists, and a run never overwrites another: choose another directory, or continue "
+        "the run with --resume (lare.resume)\n",
     )
     assert (run / "metrics.jsonl").read_bytes() == metrics
 

@@ -15,7 +15,7 @@ def test_what_cannot_be_written_leaves_what_was_there(tmp_path):
     path = tmp_path / "table.csv"
     path.write_bytes(b"whole")
     with pytest.raises(
-        LareError, match=r"table\.csv cannot be written \(No space left on device\); what was there is as it was"
+        LareError, match=r"table\.csv cannot be written \(No space left on device\); an existing file is unchanged"
     ):
         write_atomically(path, failing)
     assert [(one.name, one.read_bytes()) for one in tmp_path.iterdir()] == [("table.csv", b"whole")]

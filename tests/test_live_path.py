@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lare.errors import LareError
 from lare.latent.design import design
-from lare.latent.function import load
+from lare.latent.saved import load
 from lare.llm import prompts
 from lare.llm.budget import Budget
 from lare.llm.live import LiveModel
@@ -86,7 +86,7 @@ def test_a_recording_is_not_overwritten(serve, command, tmp_path):
     server = serve(recorded_answers)
     status, _, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--record", "talk.json")
     assert status == 2
-    assert "lare: talk.json exists, and is not overwritten; choose another --record" in err
+    assert "lare: talk.json exists, and is not overwritten; choose another file" in err
     assert (tmp_path / "talk.json").read_text() == "mine"
 
 
@@ -108,7 +108,7 @@ def test_when_nothing_passes_every_attempt_is_kept(serve, command, tmp_path):
     ("arguments", "said"),
     [
         (["--requests", 2], "lare: the budget of 2 requests is spent"),
-        (["--budget", 100], "lare: the next request might pass the budget of 100 tokens (0 are used)"),
+        (["--budget", 100], "lare: the next request might exceed the budget of 100 tokens (0 are used)"),
     ],
 )
 def test_a_budget_ends_a_design(serve, command, arguments, said):
@@ -170,25 +170,28 @@ def test_what_a_model_says_does_not_steer_the_terminal(serve, command):
         (["--base-url", "http://h/v1"], "--base-url is for a live model: say which one with --model NAME"),
         (
             ["--model", "m", "--draw", 2],
-            "--draw chooses among recordings, and a live model says something new each time: leave it out",
+            "--draw chooses a recording, and a live model uses none: leave --draw out",
         ),
         (["--model", "m", "--budget", -5], "budget = -5: at least one is needed"),
         (["--model", "m", "--requests", 0], "requests = 0: at least one is needed"),
-        (["--model", "m", "--minutes", 0], "minutes = 0.0: a number above 0"),
-        (["--model", "m", "--temperature", "nan"], "temperature = nan: a number from 0 on"),
+        (["--model", "m", "--minutes", 0], "minutes = 0.0: a number above 0 is needed"),
+        (["--model", "m", "--temperature", "nan"], "temperature = nan: a number, 0 or more, is needed"),
         (
             ["--temperature", 1],
             "--budget, --requests, --minutes, --price and --temperature are for a live model: say which one with --model NAME",
         ),
-        (["--policy", "runs/x"], "--policy plays episodes for --reflect: say how many rounds"),
-        (["--reflect", -1], "reflect = -1: there can be no fewer rounds than none"),
+        (
+            ["--policy", "runs/x"],
+            "--policy plays the episodes for --reflect: give --reflect too, with a number of rounds",
+        ),
+        (["--reflect", -1], "reflect = -1: the number of rounds cannot be negative"),
         (["--out", "."], ". is not the name of a file; choose another --out"),
         (["--out", "no/phi.py"], "no/phi.py cannot be written: there is no directory no; choose another --out"),
         (["--record", "no/r.json"], "no/r.json cannot be written: there is no directory no; choose another --record"),
         (["--record", "r.json", "--out", "r.py"], "--out writes r.json too: choose another --record"),
         (["--record", "./r.json", "--out", "../{here}/r"], "--out writes r.json too: choose another --record"),
         (["--out", "n" * 300], f"{'n' * 300} cannot be written: File name too long"),
-        (["--model", "m", "--price", -1, 2], "price = -1.0 2.0: two numbers from 0 on"),
+        (["--model", "m", "--price", -1, 2], "price = -1.0 2.0: two numbers, 0 or more, are needed"),
         (["--reflect", 1, "--policy", "nowhere"], "nowhere is not a run: there is no config.json in it"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Table 1 of the paper: how much of the true reward is in states and in factors, and how many replies run as they come."""
+"""Table 1 of the paper: correlations of states and factors with the true reward, and how many replies pass without correction."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -25,10 +25,11 @@ PRINTED = {
 """The paper's figures."""
 
 DIFFERENCES = (
-    "The steps are of uniformly random actions, for states and factors alike; the paper does not say whose its are.",
-    "States and factors are those that a step led to, the rewards those that it paid; of many agents, each agent's own.",
-    "The mean is over the absolute correlations of all entries that vary; the paper does not say whether its are absolute. So "
-    "a state with a few telling entries among many has a low mean; what a decoder could find is nearer to the best entry.",
+    "The steps are of uniformly random actions, for states and factors alike; the paper does not say which policy it used.",
+    "States and factors are those after a step, the rewards those of the step; with many agents, each agent's own.",
+    "The mean is over the absolute correlations of all entries that vary; the paper does not say whether its correlations are "
+    "absolute. So a state with a few informative entries among many has a low mean; the best entry tells more about what a decoder "
+    "could find.",
     "The recorded replies are of a newer language model than the paper's, and the prompt says more.",
 )
 
@@ -40,11 +41,11 @@ class Steps(NamedTuple):
     action: Float[np.ndarray, "steps action"]
     after: Float[np.ndarray, "steps observation"]
     reward: Float[np.ndarray, " steps"]
-    """True."""
+    """True rewards."""
 
 
 def page_of(budget: Budget, command: str) -> Page:
-    """Measure, and write it beside the paper's figures."""
+    """Measure, and make a page with the results beside the paper's figures."""
     rows = []
     for task in map(load_task, PRINTED):
         functions = designed(task, budget.functions)
@@ -77,7 +78,7 @@ def page_of(budget: Budget, command: str) -> Page:
 
 
 def designed(task: TaskSpec, draws: int) -> list[LatentFunction | None]:
-    """The function of each draw; None where no attempt passed."""
+    """The function of each draw; None if no attempt passed."""
     found: list[LatentFunction | None] = []
     for draw in range(draws):
         try:
@@ -104,7 +105,7 @@ def of_entries(steps: Steps, judges: Judges, functions: Sequence[LatentFunction]
 
 
 def of_replies(task: TaskSpec, draws: int) -> str:
-    """Share of single candidates that pass as they come."""
+    """The share of single candidates that pass without correction."""
     recordings = [one for draw in range(draws) for one in shipped_recordings("factors", draw)]
     exchanges = [exchange for one in recordings if one.task == task.name for exchange in one.exchanges]
     replies = [reply for exchange in exchanges if exchange.stage == "candidate" for reply in exchange.replies]
@@ -113,7 +114,7 @@ def of_replies(task: TaskSpec, draws: int) -> str:
 
 
 def random_steps(task: TaskSpec, episodes: int) -> Steps:
-    """Whole episodes of uniformly random actions; of all agents, one behind the other."""
+    """Whole episodes of uniformly random actions, with the rows of all agents one after the other."""
     played = episodes_of(task, episodes)
 
     def rows(part: Callable[[Episode], np.ndarray]) -> np.ndarray:

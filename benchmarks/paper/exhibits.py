@@ -1,7 +1,7 @@
-"""The exhibits of the LaRe paper that need training: `exhibits/NAME.toml`, read and checked; `budgets.toml`; and the runs of both.
+"""The exhibits of the LaRe paper that need training: reads and checks `exhibits/NAME.toml` and `budgets.toml`, and lists the runs.
 
-An exhibit compares *contenders*, methods as the paper's figure names them, on tasks, and holds the paper's *claims* against the
-runs. Two exhibits need no training: `correlations.py` (table 1) and `regret.py` (propositions 1 and 2).
+An exhibit is a figure or a table of the paper. It compares *contenders*, methods as the figure names them, on tasks, and checks the
+paper's *claims* by the runs. Two exhibits need no training: `correlations.py` (table 1) and `regret.py` (propositions 1 and 2).
 """
 
 import functools
@@ -30,21 +30,21 @@ Names = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
 class Contender(Checked):
-    """A method, as the paper's figure shows it. In the TOML file it stands under its label; a text is the method alone."""
+    """A method, as the paper's figure shows it. In the TOML file its key is its label; a string gives the method alone."""
 
     method: str
     algorithm: Name | None = None
-    """The task's own, unless given."""
+    """The default is the task's own."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """That differ from the usual ones."""
+    """Settings that differ from the default ones."""
     draws: int = 1
-    """Of the language model, at most."""
+    """The most draws of the language model."""
     ending: str = ""
-    """Of the names of its runs, where another contender differs by settings alone."""
+    """The ending of its runs' names, needed if another contender differs in settings alone."""
 
 
 class Claim(Checked):
-    """The paper says: on every task that is shown, one contender is better than the others."""
+    """A claim of the paper: on every task that is shown, one contender is better than the others."""
 
     better: str
     than: Names
@@ -57,18 +57,18 @@ class Exhibit(Checked):
 
     title: str
     source: str
-    """Its place in the paper; `OURS`, where the paper does not have it."""
+    """Its place in the paper; `OURS` if it is not in the paper."""
     tasks: Names
-    """The smoke budget takes the first."""
+    """The tasks. The smoke budget takes the first one."""
     laptop: tuple[str, ...] = ()
-    """The tasks of the laptop budget: all, unless given."""
+    """The tasks of the laptop budget; the default is all tasks."""
     contenders: dict[str, Contender]
-    """By label."""
+    """Contenders by label."""
     algorithms: tuple[Name, ...] = ()
     """Every contender is trained, and every claim is tested, with each of them; their labels end with the algorithm."""
     claims: tuple[Claim, ...]
     steps: int | None = None
-    """Environment steps of every run; those of the budget, unless given."""
+    """Environment steps of every run; the default is the budget's number."""
     measure: str = RETURN
     """The key of metrics.jsonl that is shown."""
     printed: dict[str, dict[str, str]] = Field(default_factory=dict)
@@ -83,7 +83,7 @@ class Exhibit(Checked):
 
 
 class Tabular(Checked):
-    """Of the tabular problems."""
+    """The size of the tabular problems."""
 
     episodes: int
     runs: int
@@ -94,24 +94,24 @@ class Budget(Checked):
 
     seeds: int
     draws: int
-    """Of the language model, at most."""
+    """The most draws of the language model."""
     functions: int
-    """Draws of the language model where nothing is trained."""
+    """Draws of the language model in an exhibit without training."""
     episodes: int
-    """Over which correlations are taken."""
+    """The number of episodes over which correlations are computed."""
     tabular: Tabular
     steps: int | None = None
-    """Environment steps of one agent; the task's own, unless given."""
+    """Environment steps of a run with one agent; the default is the task's own number."""
     steps_of_many: int | None = None
     """Environment steps of a run with many agents."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """That differ from the usual ones."""
+    """Settings that differ from the default ones."""
     algorithms: dict[str, dict[str, Any]] = Field(default_factory=dict)
     """Settings for some of the algorithms."""
 
 
 def read(path: Path) -> dict[str, Any]:
-    """A TOML file. Raises `LareError` with its name where it is none."""
+    """Read a TOML file. Raises `LareError` with its name if it is not one."""
     try:
         return read_toml(read_text(path, LARGEST_SETTINGS))
     except ValueError as error:
@@ -120,13 +120,13 @@ def read(path: Path) -> dict[str, Any]:
 
 @functools.cache
 def budgets() -> dict[str, Budget]:
-    """By name: `smoke`, `laptop`, `paper`."""
+    """The budgets by name: `smoke`, `laptop`, `paper`."""
     return {name: Budget(**values) for name, values in read(PLACE / "budgets.toml").items()}
 
 
 @functools.cache
 def exhibits() -> dict[str, Exhibit]:
-    """By name, in the order of the alphabet."""
+    """The exhibits by name, in alphabetical order."""
     paths = sorted((PLACE / "exhibits").glob("*.toml"))
     return {path.stem: with_algorithms(Exhibit(**read(path))) for path in paths}
 
@@ -158,16 +158,16 @@ def with_algorithms(exhibit: Exhibit) -> Exhibit:
 
 
 Jobs = Mapping[str, Mapping[str, Sequence[Job]]]
-"""By task and label, one for each draw."""
+"""Jobs by task and label, one for each draw."""
 
 
 def tasks_of(exhibit: Exhibit, budget: str) -> tuple[str, ...]:
-    """Those of a budget."""
+    """The tasks of an exhibit for a budget."""
     return {"smoke": exhibit.tasks[:1], "laptop": exhibit.laptop or exhibit.tasks, "paper": exhibit.tasks}[budget]
 
 
 def jobs_of(exhibit: Exhibit, budget: str, root: Path) -> Jobs:
-    """Every run that an exhibit needs. Exhibits that need the same one share it."""
+    """Every run that an exhibit needs. Exhibits that need the same run share it."""
     common = budgets()[budget]
     if exhibit.steps is not None and budget != "smoke":
         common = common.model_copy(update={"steps": exhibit.steps})

@@ -1,4 +1,4 @@
-"""A page of Markdown with its pictures beside it. What a person wrote under its last heading outlives the next writing."""
+"""Markdown pages with their pictures. Remarks that a person wrote under the last heading are kept when a page is written again."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,24 +8,24 @@ from lare.errors import LareError
 from lare.files import write_atomically
 
 REMARKS = "\n## Remarks\n"
-"""The heading of what a person adds."""
+"""The heading of the remarks that a person adds."""
 
 
 @dataclass(frozen=True)
 class Page:
-    """What is to be written."""
+    """A page to write."""
 
     name: str
     text: str
     pictures: Mapping[str, str] = field(default_factory=dict)
-    """SVG by file name, as the text refers to them."""
+    """SVG pictures by file name, as in the text's links."""
 
 
 def write_page(page: Page, directory: Path) -> Path:
-    """Write a page and its pictures into a directory that is there, and keep the remarks of the one before.
+    """Write a page and its pictures into an existing directory, and keep the remarks of the old page.
 
     Raises:
-        LareError: they cannot be written.
+        LareError: the files cannot be written.
     """
     path = directory / f"{page.name}.md"
     try:
@@ -36,7 +36,7 @@ def write_page(page: Page, directory: Path) -> Path:
         text = page.text.rstrip() + "\n" + remarks
         write_atomically(path, lambda file: file.write(text.encode()))
     except UnicodeDecodeError as error:
-        raise LareError(f"{path} is there and is no text, so no remarks can be kept: move it away") from error
+        raise LareError(f"{path} exists and is not a text, so that its remarks cannot be kept: move it away") from error
     except OSError as error:
         raise LareError(f"{path} cannot be written: {error.strerror or error}") from error
     return path

@@ -1,4 +1,4 @@
-"""Propositions 1 and 2 of the paper on small tabular problems: does the bound hold, and does the latent regret grow?"""
+"""Propositions 1 and 2 of the paper on small tabular problems: whether the bound holds, and how the regret grows with the table."""
 
 import itertools
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from paper.pages import Page, items, table
 TITLE = "Regret with a latent table, and with a raw one"
 CORES, ACTIONS, HORIZON, DELTA = 3, 2, 5, 0.1
 REDUNDANT = (1, 2, 4, 8, 16)
-"""Redundant states for each that matters. With one, raw and latent table are the same; the latent one stays as it is."""
+"""Redundant forms of each relevant state. With one form, raw and latent table are the same; the latent table never changes."""
 PICTURE = "theory-regret.svg"
 
 
@@ -29,11 +29,11 @@ def page_of(budget: Budget, command: str) -> Page:
     rows = [row(redundant, history, latent) for redundant, history in found.items()]
     parts = [
         f"# {TITLE}",
-        f"Propositions 1 and 2 of the paper (section Analysis, appendix B), by `{command}`: OFUL with an episode's sum of rewards "
-        f"for feedback, on {runs} random problems of {CORES} states that matter and {ACTIONS} actions, horizon {HORIZON}, "
-        f"{episodes:,} episodes, lambda = {HORIZON}, delta = {DELTA}. Each state is met in one of so many redundant forms, drawn "
-        "anew at every step. The raw table has an entry for each form and action; phi forgets the form, so the latent table is "
-        "always that of the first row.",
+        f"Propositions 1 and 2 of the paper (section Analysis, appendix B), by `{command}`: OFUL with an episode's sum of "
+        f"rewards for feedback, on {runs} random problems of {CORES} states that matter and {ACTIONS} actions, "
+        f"horizon {HORIZON}, {episodes:,} episodes, lambda = {HORIZON}, delta = {DELTA}. Each state appears in one of several "
+        "redundant forms, which is random at every step. The raw table has an entry for each form and action; phi leaves "
+        "the form out, so the latent table is always that of the first row.",
         f"![regret]({PICTURE})",
         table(
             [
@@ -55,14 +55,14 @@ def page_of(budget: Budget, command: str) -> Page:
                 "for every table.",
                 "Proposition 2, the regret with |D| entries is bounded lower than with |S||A|: the raw table's regret is "
                 f"{np.mean(last(found[REDUNDANT[-1]])) / latent:.1f} times the latent one's with {REDUNDANT[-1]} forms, and "
-                f"{growth(found)}. The latent one's does not change with the forms, since phi forgets them.",
+                f"{growth(found)}. The latent one's does not change with the forms, because phi leaves them out.",
             )
         ),
         "## What differs from the paper",
         items(
             (
-                "The paper proves; it plays nothing. Problems, sizes and policies (all deterministic ones that go by what matters, "
-                "so that OFUL's maximum is exact) are ours.",
+                "The paper has proofs, and no experiment. Problems, sizes and policies (all deterministic ones that depend on the "
+                "relevant state only, so that OFUL's maximum is exact) are ours.",
             )
         ),
     ]
@@ -71,7 +71,7 @@ def page_of(budget: Budget, command: str) -> Page:
 
 
 def played(redundant: int, episodes: int, runs: int) -> History:
-    """A problem for each run, the same whatever the table."""
+    """One problem for each run, the same for every table."""
 
     def one(key: PRNGKeyArray) -> History:
         problem, luck = jax.random.split(key)
@@ -115,7 +115,7 @@ def label(redundant: int) -> str:
 
 
 def band(history: History) -> Band:
-    """Episodes, mean regret, and a standard deviation on both sides."""
+    """Episodes, mean regret, and one standard deviation on both sides."""
     regret = np.asarray(history.regret)
     every = max(1, regret.shape[1] // 200)
     shown = regret[:, ::every]

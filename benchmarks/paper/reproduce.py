@@ -21,7 +21,7 @@ UNTRAINED: dict[str, tuple[str, str, Callable[[Budget, str], Page]]] = {
 """Exhibits that need no training: place in the paper, title, and the page."""
 
 Watching = Callable[[Sequence[Job]], AbstractContextManager[Callable[[str], None]]]
-"""Shows the progress of the runs that are to be trained: gives the function that takes its lines."""
+"""Shows the progress of jobs; yields the function that prints messages."""
 
 
 def listed() -> Iterator[tuple[str, str, str]]:
@@ -31,7 +31,7 @@ def listed() -> Iterator[tuple[str, str, str]]:
 
 
 def quiet(jobs: Sequence[Job]) -> AbstractContextManager[Callable[[str], None]]:
-    """Shows nothing."""
+    """A `Watching` that shows nothing."""
     return nullcontext(lambda text: None)
 
 
@@ -44,10 +44,10 @@ def reproduce(
     ray: str | None = None,
     watching: Watching = quiet,
 ) -> Path:
-    """Train the runs of an exhibit that are missing, and write its page. Finished runs are used as they are.
+    """Train the missing runs of an exhibit, and write its page. Finished runs are used without training.
 
     Args:
-        name: of the exhibit.
+        name: name of the exhibit.
         budget: `smoke`, `laptop` or `paper`.
         root: the directory for all runs of all budgets.
         out: the directory for pages, OUT/BUDGET/NAME.md. All metrics of the runs are there too, as NAME.csv.
@@ -59,7 +59,7 @@ def reproduce(
     names = [one for one, _, _ in listed()]
     if name not in names:
         raise LareError(f"no exhibit {name!r}; the exhibits are {', '.join(names)}")
-    # Before the first run is trained: a page that cannot be written would fail only after hours.
+    # Checked before the first run is trained, because otherwise an error would come only after hours.
     place = room_for(out / budget, name)
     if name in UNTRAINED:
         page_of = UNTRAINED[name][-1]
@@ -81,7 +81,7 @@ def reproduce(
 
 
 def room_for(directory: Path, name: str) -> Path:
-    """The directory, made where it was missing. Raises `LareError` where the page and its table cannot be written into it."""
+    """Create the directory if it is missing. Raises `LareError` if the page and its table cannot be written into it."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for path in (directory / f"{name}.md", directory / f"{name}.csv"):

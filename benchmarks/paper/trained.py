@@ -1,4 +1,4 @@
-"""The page of an exhibit: what came out of its runs, beside what the paper says."""
+"""The page of an exhibit: the results of its runs, beside those of the paper."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -34,15 +34,15 @@ MEANING = {
 """The keys of metrics.jsonl that an exhibit shows, in words."""
 
 SEEDS, STEPS, STEPS_OF_MANY, STEPS_OF_STARCRAFT = 5, 1_000_000, 2_050_000, 10_050_000
-"""Of the paper's runs."""
+"""Numbers of the paper's runs."""
 
 LEVEL = 0.025
-"""A claim counts as decided where luck alone would give as many pairs at most so often."""
+"""A claim is decided if the probability of as many pairs by chance is at most this."""
 JUDGED = (
     "A cell counts the pairs of runs, one run of each side, in which the claim holds. A run is a seed; where both sides "
     "have several draws of the language model, it is a draw, with the mean over its seeds. p is the probability of as many "
-    "pairs or more by luck, over all tasks (Mann and Whitney's exact test). A claim, or its opposite, is decided at p up to "
-    f"{LEVEL}. Each claim is tested by itself: where there is no difference, one claim of twenty is decided all the same. A "
+    "pairs or more by chance, over all tasks (Mann and Whitney's exact test). A claim, or its opposite, is decided at p up to "
+    f"{LEVEL}. Each claim is tested by itself: even without any difference, one claim in twenty is decided. A "
     "claim must also win half of the pairs on every task. 'At least as good' is not refuted unless the opposite is decided. "
     "Three seeds on one task decide nothing: their p is at least 0.05."
 )
@@ -52,7 +52,7 @@ OF_ONE_AGENT = (
     "observation before the step.",
 )
 ALWAYS = (
-    "Running statistics normalise the returns and the inputs of all decoders that descend a gradient, those of the baselines too "
+    "Running statistics normalise the returns and the inputs of all gradient-trained decoders, also those of the baselines "
     "(the paper normalises nothing).",
     "The recorded replies come from a newer language model than the paper's.",
     "The seed of training and the draw of the language model are independent; in the paper they change together.",
@@ -61,10 +61,10 @@ ALWAYS = (
 
 
 def page_of(name: str, exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
-    """What came out of the runs, beside what the paper says.
+    """The results of the runs, beside those of the paper.
 
     Raises:
-        LareError: the runs do not make up a whole table.
+        LareError: the table of runs is incomplete.
     """
     runs = {
         task: {label: [read_measured(job.directory) for job in some] for label, some in of_task.items()}
@@ -94,7 +94,7 @@ def page_of(name: str, exhibit: Exhibit, budget: Budget, jobs: Jobs, command: st
 
 
 def differences(exhibit: Exhibit, budget: Budget, tasks: int, runs: Sequence[Run]) -> Iterator[str]:
-    """From the paper, a sentence each."""
+    """Differences from the paper, one sentence each."""
     if budget.seeds != SEEDS:
         yield f"Seeds: {budget.seeds} (the paper: {SEEDS})."
     if tasks < len(exhibit.tasks):
@@ -127,7 +127,7 @@ def protocol(runs: Sequence[Run]) -> str:
 
 
 def span(name: str, numbers: Sequence[int]) -> str:
-    """In words."""
+    """A range of numbers in words."""
     return f"{name} {numbers[0]}" if len(numbers) == 1 else f"{name}s {numbers[0]} to {numbers[-1]}"
 
 
@@ -167,7 +167,7 @@ def of_one_task(
 
 
 def mean_and_spread(runs: Sequence[Run], key: str, step: int) -> str:
-    """Mean and standard deviation over the seeds at a step, each seed a mean over its draws; a dash where there is none."""
+    """Mean and standard deviation over the seeds at a step, each seed a mean over its draws; a dash without any values."""
     by_seed: dict[int, list[float]] = {}
     for line in (line for run in runs for line in run.metrics()):
         if line["step"] == step and line.get(key) is not None:
@@ -178,7 +178,7 @@ def mean_and_spread(runs: Sequence[Run], key: str, step: int) -> str:
 
 
 def picture(found: Comparison, exhibit: Exhibit) -> str:
-    """Learning curves; a panel for each algorithm, where there are several."""
+    """Learning curves, with a panel for each algorithm if there are several."""
     across, up = "environment steps", f"{MEANING[exhibit.measure]}, IQM"
     panels: dict[str, dict[str, Band]] = {}
     for label, one in exhibit.contenders.items():
@@ -190,7 +190,7 @@ def picture(found: Comparison, exhibit: Exhibit) -> str:
 
 
 def claimed(claim: Claim, other: str, exhibit: Exhibit, found: Mapping[str, Comparison]) -> list[str]:
-    """A row: what is claimed, in how many pairs of runs it is so on each task, and what that says of all of them."""
+    """A table row: the claim, the number of pairs of runs in which it holds on each task, p, and the verdict over all tasks."""
     pairs = [units(one.groups[claim.better], one.groups[other]) for one in found.values()]
     if exhibit.measure == ERROR:
         pairs = [(-ours, -theirs) for ours, theirs in pairs]
@@ -209,14 +209,16 @@ def claimed(claim: Claim, other: str, exhibit: Exhibit, found: Mapping[str, Comp
 
 
 def units(one: Group, other: Group) -> tuple[np.ndarray, np.ndarray]:
-    """What two labels are compared by at the last step: their draws where both have several, else their seeds."""
+    """The scores by which two labels are compared at the last step: by draw if both have several draws, else by seed."""
     axis = 1 if min(len(one.draws), len(other.draws)) > 1 else 0
     ours, theirs = (group.scores[..., 0, -1].mean(axis=axis) for group in (one, other))
     return ours, theirs
 
 
 def verdict(chance: float, contrary: float, everywhere: bool, at_least: bool) -> str:
-    """Of a claim, by the chances of as many pairs for it and against it, and whether it wins half of them on every task."""
+    """The verdict on a claim, from the probabilities of as many pairs for it and against it by chance, and from whether it wins
+    half of the pairs on every task.
+    """
     if contrary <= LEVEL:
         return "the other way round"
     if chance <= LEVEL:

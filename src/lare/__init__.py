@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lare.experiments.report import write_report as write_report
     from lare.latent.design import design as design
     from lare.latent.function import LatentFunction as LatentFunction
-    from lare.latent.function import load as load_function  # noqa: F401
+    from lare.latent.saved import load as load_function  # noqa: F401
     from lare.logs.relabel import relabel as relabel
     from lare.logs.steps import logged_steps as logged_steps
     from lare.plugs.assigner import CreditAssigner as CreditAssigner
@@ -40,7 +40,7 @@ HOMES = {
     "export": "lare.deploy.export",
     "design": "lare.latent.design",
     "LatentFunction": "lare.latent.function",
-    "load_function": "lare.latent.function:load",
+    "load_function": "lare.latent.saved:load",
     "relabel": "lare.logs.relabel",
     "logged_steps": "lare.logs.steps",
     "CreditAssigner": "lare.plugs.assigner",
@@ -54,7 +54,7 @@ HOMES = {
     "resume": "lare.training.train",
     "train": "lare.training.train",
 }
-"""Where each public name lives. They are imported when first asked for, so that `lare --help`, and the process that
+"""The module of each public name. A name is imported on its first use, so that `lare --help`, and the process that
 verifies generated code, need not wait for JAX."""
 
 __all__ = ["__version__", *HOMES]  # pyright: ignore[reportUnsupportedDunderAll]

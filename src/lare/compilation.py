@@ -2,8 +2,8 @@
 
 A run compiles for half a minute before its first step. The next process that needs the same programs reads them.
 
-The environment variable LARE_CACHE names another directory, or is `off`. Where JAX has been given a cache of the user's own, by
-JAX_COMPILATION_CACHE_DIR or in a program, that one is used and nothing here makes a difference.
+The environment variable LARE_CACHE names another directory, or is `off`. If the user has given JAX a cache, by
+JAX_COMPILATION_CACHE_DIR or in a program, JAX uses that one and this module does nothing.
 """
 
 import hashlib
@@ -19,10 +19,10 @@ from platformdirs import user_cache_path
 SETTING, OFF = "LARE_CACHE", "off"
 
 LARGEST = 2**30
-"""Bytes that are kept at most. JAX removes what has not been read for the longest time."""
+"""The largest size of the cache in bytes. JAX removes the least recently read programs."""
 
 SHORTEST = 0.1
-"""Seconds: what compiles faster is not kept."""
+"""Seconds. Programs that compile faster are not kept."""
 
 OF_JAX = "JAX_COMPILATION_CACHE_DIR"
 
@@ -31,9 +31,9 @@ PROGRAM, TIME = "-cache", "-atime"
 
 
 def variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Environment variables that make JAX keep programs, for a process in which it has not been imported, and for its children.
+    """Environment variables that make JAX keep programs, for a process that has not imported JAX yet, and for its children.
 
-    None where the user said `off`, has chosen a cache for JAX, or has no place where one can be written.
+    Empty if the user said `off` or has chosen a cache for JAX, or if no cache can be written.
     """
     if OF_JAX in environment or (directory := prepared(environment)) is None:
         return {}
@@ -45,7 +45,7 @@ def variables(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def keep() -> None:
-    """Make JAX keep programs from now on, in a process in which it is at work already."""
+    """Make JAX keep programs from now on, in a process that has already imported it."""
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
@@ -59,7 +59,7 @@ def keep() -> None:
 
 
 def prepared(environment: Mapping[str, str]) -> Path | None:
-    """The directory of this kind of processor, made and whole; None where there is to be none, or can be none."""
+    """The cache directory for this kind of processor, created and repaired; None if it is off or cannot be written."""
     said = environment.get(SETTING, "")
     if said == OFF:
         return None
@@ -73,8 +73,8 @@ def prepared(environment: Mapping[str, str]) -> Path | None:
 
 
 def mend(directory: Path) -> None:
-    """Remove what a process that was killed has left half written: JAX would stumble over it for ever."""
-    with FileLock(directory / ".lockfile", timeout=5):  # JAX's own lock: nobody is writing
+    """Remove files that a killed process has left incomplete; JAX would fail to read them every time."""
+    with FileLock(directory / ".lockfile", timeout=5):  # JAX's own lock, so that no process is writing
         programs, times = (
             {file.name.removesuffix(ending) for file in directory.glob(f"*{ending}")} for ending in (PROGRAM, TIME)
         )
@@ -84,7 +84,7 @@ def mend(directory: Path) -> None:
 
 
 def processor() -> str:
-    """A short name of what this processor can do: a home directory may be shared by several, and programs fit one kind."""
+    """A hash of this processor's features. Compiled programs fit one kind of processor, and several may share a home directory."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
         able = sorted(set(re.findall(r"^(?:flags|Features)\s*:\s*(.*)$", text, re.MULTILINE)))

@@ -1,25 +1,25 @@
-"""What the user is told when something that they gave cannot be used."""
+"""Errors for the user, about input that cannot be used."""
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 LONGEST_VALUE = 100
-"""Characters of a value that a message quotes."""
+"""The largest number of characters that a message quotes of a value."""
 
 
 class LareError(Exception):
-    """A mistake that its reader can mend.
+    """An error that the user can correct.
 
     The message is one line: what was wrong, where, and what would be right. The command line prints it without a
     traceback.
     """
 
     status = 2
-    """What the command line exits with."""
+    """The exit status of the command line."""
 
 
 def pip_install(extra: str, package: Path = Path(__file__).parent) -> str:
@@ -31,24 +31,24 @@ def pip_install(extra: str, package: Path = Path(__file__).parent) -> str:
 
 
 def needs_extra(what: str, extra: str) -> LareError:
-    """What to say where a library that only some users have is not installed."""
+    """The error for an optional library that is not installed."""
     return LareError(f"{what} needs an extra: {pip_install(extra)}")
 
 
 class Checked(BaseModel):
-    """Values that came from outside. Frozen; what does not fit is a `LareError` of one line."""
+    """Validated values from outside. They are frozen, and an invalid one raises a `LareError` of one line."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        for field in cls.model_fields.values():  # docstrings, as `--help` shows them: lines are broken there
+        for field in cls.model_fields.values():  # docstrings, without line breaks, which `--help` sets itself
             field.description = " ".join((field.description or "").split()) or None
 
     @model_validator(mode="before")
     @classmethod
     def with_the_defaults_of_their_places(cls, values: Any) -> Any:
-        """What settings within settings leave open has the default of its place, which need not be that of its class."""
+        """Complete nested settings by the default of the field that holds them, which may differ from the class's own defaults."""
         if not isinstance(values, Mapping):
             return values
         defaults = {name: cls.model_fields[name].default for name in values if name in cls.model_fields}
@@ -58,11 +58,19 @@ class Checked(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise LareError(first_problem(error, tuple(type(self).model_fields))) from None
+            raise LareError(first_problem(error, keys_of(type(self)))) from None
+
+
+def keys_of(settings: type[Checked]) -> Iterator[str]:
+    """The keys of settings, and of the settings within them as `td3.gamma`."""
+    for name, field in settings.model_fields.items():
+        yield name
+        if isinstance(field.default, Checked):
+            yield from (f"{name}.{inner}" for inner in keys_of(type(field.default)))
 
 
 def completed(default: Any, given: Any) -> Any:
-    """What was given and, where that is settings or a table for them, whatever of the default it leaves open."""
+    """The given value. If it is settings, or a mapping for settings, its missing keys are taken from the default."""
     if isinstance(default, Checked) and isinstance(given, type(default)):
         given = {name: getattr(given, name) for name in given.model_fields_set}
     if not (isinstance(default, Checked) and isinstance(given, Mapping)):
@@ -72,25 +80,26 @@ def completed(default: Any, given: Any) -> Any:
 
 
 def shortened(value: Any) -> str:
-    """How a value is written, as far as it fits into a line."""
+    """The repr of a value, cut to fit into a line."""
     try:
-        text = " ".join(map(str.strip, repr(value).splitlines()))  # arrays take several
-    except Exception:  # it may be anybody's: nested too deep, or of a class that cannot be shown
+        text = " ".join(map(str.strip, repr(value).splitlines()))  # arrays have several lines
+    except Exception:  # the value may be nested too deep, or of a class whose repr fails
         return f"a {type(value).__name__} that cannot be shown"
     return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]}..."
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """A hint at the nearest of the names that there are, or at one that holds this one, if there is any."""
+    """A hint at the closest known name, or at one that contains this name; empty if there is none."""
     names = list(known)
+    ends = [one for one in names if one.endswith(f".{name.lstrip('-')}")]
     within = [one for one in names if len(name) > 2 and name.lower() in one.lower()]
-    close = difflib.get_close_matches(name, names, n=1) or within[:1]
+    close = ends[:1] or difflib.get_close_matches(name, names, n=1) or within[:1]
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def first_problem(error: ValidationError, known: Iterable[str] = ()) -> str:
-    """The first thing that pydantic found wrong, in one line, and how many more there are; `known` keys are what was meant."""
-    # A key that is wrong says more than that another one is missing.
+    """The first problem that pydantic found, in one line, and the number of others. Unknown keys get a hint at `known` ones."""
+    # Unknown keys come first, because a misspelt key is also a missing one.
     problems = sorted(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
     where, what = ".".join(str(part) for part in first["loc"]), first["msg"].removeprefix("Value error, ")

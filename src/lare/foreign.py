@@ -1,6 +1,6 @@
-"""Reading what somebody else may have written: texts of a bounded size, JSON and TOML of a bounded depth.
+"""Reading files that somebody else may have written: texts of a bounded size, JSON and TOML of a bounded depth.
 
-Everything that is read back goes through here, our own files too: they may be damaged, or another's.
+Files that LaRe wrote are read by these functions too: they may be damaged, or come from somebody else.
 """
 
 import json
@@ -12,23 +12,23 @@ from typing import Any
 from lare.errors import LareError
 
 DEEPEST = 64
-"""Objects within objects."""
+"""The largest depth of objects within objects."""
 
 MOST_DIGITS = 1000
-"""Of a whole number. Python itself gives up at 4300, with advice that is for programmers."""
+"""The most digits of a whole number. Python's own limit is 4300, and its message is for programmers."""
 
 DOTS = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{DEEPEST}}}""")
-"""A name of a table within tables, for which the parser takes quadratic time."""
+"""A name of deeply nested tables, for which the parser takes quadratic time."""
 
 LARGEST_TEXT = 64 << 20
-"""Bytes of a file that holds texts: a recording of a hundred long replies has as many."""
+"""The largest size in bytes of a file of texts, such as a recording of a hundred long replies."""
 
 LARGEST_SETTINGS = 1 << 20
-"""Bytes of a file that somebody wrote by hand."""
+"""The largest size in bytes of a file that is written by hand."""
 
 
 def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
-    """A file's text. Raises `LareError` where it has none, or more than it may."""
+    """A file's text. Raises `LareError` if it cannot be read, or is larger than `largest`."""
     try:
         if path.exists() and not path.is_file():
             raise LareError(f"{path} is not a file")
@@ -38,14 +38,15 @@ def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
             raise LareError(f"{path} is larger than {largest >> 20} MB")
         return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except (OSError, UnicodeDecodeError) as error:
-        raise LareError(f"{path} cannot be read: {error}") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise LareError(f"{path} cannot be read: {reason}") from error
 
 
 def read_json(text: str | bytes, strict: bool = True) -> Any:
-    """What a text says in JSON. Raises `ValueError` where it says nothing, or is nested too deep.
+    """The value of a JSON text. Raises `ValueError` if it is not JSON, or is nested too deep.
 
     Args:
-        strict: without it, lines may end within a string.
+        strict: if false, a string may contain line breaks.
     """
     try:
         return shallow(json.loads(text, strict=strict, parse_int=integer))
@@ -54,7 +55,7 @@ def read_json(text: str | bytes, strict: bool = True) -> Any:
 
 
 def read_toml(text: str) -> dict[str, Any]:
-    """What a text says in TOML. Raises `ValueError` as `read_json`."""
+    """The value of a TOML text. Raises `ValueError` like `read_json`."""
     if DOTS.search(text):
         raise ValueError(TOO_DEEP)
     try:
@@ -67,7 +68,7 @@ TOO_DEEP = f"it is nested more than {DEEPEST} deep"
 
 
 def shallow(value: Any) -> Any:
-    """The value. Raises `ValueError` where it is nested too deep for whoever walks through it."""
+    """The value. Raises `ValueError` if it is nested too deep for recursive functions."""
     level = [value]
     for _ in range(DEEPEST):
         level = [

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 
 class Linear(eqx.Module):
-    """x W + b. The weight lies as (in, out), so that neither pass over a batch has to transpose it."""
+    """x W + b. The weight is stored as (in, out), so that neither the forward nor the backward pass has to transpose it."""
 
     weight: Float[Array, "*stack in out"]
     bias: Float[Array, "*stack out"]
@@ -27,11 +27,11 @@ class Linear(eqx.Module):
 
 
 class MLP(eqx.Module):
-    """Linear layers with an activation between them, ReLU unless another is given.
+    """Linear layers with an activation between them, ReLU by default.
 
     `MLP(3, (256, 256), 1, key=key)` is `Linear(3, 256)`, ReLU, `Linear(256, 256)`, ReLU, `Linear(256, 1)`.
     Weights and biases start uniform in ±1/sqrt(fan-in). Every leaf is an array, so that a whole training state can
-    be scanned, vmapped and saved without being taken apart.
+    be scanned, vmapped and saved as one pytree.
     """
 
     layers: tuple[Linear, ...]
@@ -61,7 +61,7 @@ class MLP(eqx.Module):
 
 
 class GRU(eqx.Module):
-    """A gated recurrent unit (Cho et al., 2014), in the form that cuDNN and PyTorch have.
+    """A gated recurrent unit (Cho et al., 2014), as in cuDNN and PyTorch.
 
         z = s(x U_z + h W_z)    r = s(x U_r + h W_r)    n = tanh(x U_n + r * (h W_n))    h' = (1 - z) n + z h
 
@@ -69,9 +69,9 @@ class GRU(eqx.Module):
     """
 
     given: Linear
-    """U: of z, r and n side by side."""
+    """U_z, U_r and U_n side by side."""
     kept: Linear
-    """W, likewise."""
+    """W_z, W_r and W_n side by side."""
 
     def __init__(self, features: int, size: int, *, key: PRNGKeyArray):
         given_key, kept_key = jax.random.split(key)
@@ -87,7 +87,7 @@ class GRU(eqx.Module):
 
 
 def orthogonal(network: MLP, last_gain: float, *, key: PRNGKeyArray) -> MLP:
-    """The same network with orthogonal weights (Saxe et al., 2014), of gain 1 and at last `last_gain`, and no biases."""
+    """The same network with orthogonal weights (Saxe et al., 2014), of gain 1 (`last_gain` in the last layer), and zero biases."""
     keys = jax.random.split(key, len(network.layers))
     gains = (1.0,) * (len(network.layers) - 1) + (last_gain,)
     started = tuple(
@@ -118,7 +118,7 @@ def descend(
 
 
 def clipped(gradient: Parameters, most: float) -> Parameters:
-    """The gradient, cut down to the length `most` where it is longer (Pascanu et al., 2013)."""
+    """The gradient, scaled down to the norm `most` if its norm is larger (Pascanu et al., 2013)."""
     shrink = most / jnp.maximum(optax.tree.norm(gradient), most)
     return jax.tree.map(lambda leaf: leaf * shrink, gradient)
 

@@ -1,4 +1,4 @@
-"""Running statistics, kept in the training state, that let features and returns of any scale train alike."""
+"""Running statistics, kept in the training state, so that the scale of features and returns does not matter."""
 
 from typing import NamedTuple
 
@@ -6,21 +6,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 CLIP = 10.0
-"""Normalised features are cut off at this many standard deviations."""
+"""Normalised features are clipped to this many standard deviations."""
 
 
 class RunningMeanStd(NamedTuple):
-    """Mean and spread of every row so far, one of each per feature."""
+    """Mean and spread of each feature over all rows so far."""
 
     rows: Float[Array, ""]
-    """How many there were."""
+    """The number of rows."""
     mean: Float[Array, " features"]
     squares: Float[Array, " features"]
     """Sum of the squared deviations from the mean."""
 
 
 def new_mean_std(features: int) -> RunningMeanStd:
-    """Statistics of no rows."""
+    """Empty statistics."""
     return RunningMeanStd(jnp.zeros(()), jnp.zeros(features), jnp.zeros(features))
 
 
@@ -29,7 +29,7 @@ def observe(
 ) -> RunningMeanStd:
     """Add a batch (the parallel update of Chan, Golub and LeVeque, 1983: no catastrophic cancellation).
 
-    Rows where `mask` is false are passed over.
+    Rows where `mask` is false are ignored.
     """
     if mask is None:
         added, mean = rows.shape[0], jnp.mean(rows, axis=0)
@@ -52,7 +52,7 @@ def deviation(statistics: RunningMeanStd) -> Float[Array, " features"]:
 
 
 def standardise(statistics: RunningMeanStd, rows: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
-    """(x - mean) / std, cut off at ±10. A feature that never varied becomes 0."""
+    """(x - mean) / std, clipped to ±10. A feature that never varied becomes 0."""
     spread = deviation(statistics)
     scaled = (rows - statistics.mean) / jnp.where(spread > 0, spread, 1)
     return jnp.where(spread > 0, jnp.clip(scaled, -CLIP, CLIP), 0)
@@ -61,27 +61,27 @@ def standardise(statistics: RunningMeanStd, rows: Float[Array, "*batch features"
 def standardise_if_known(
     statistics: RunningMeanStd, rows: Float[Array, "*batch features"]
 ) -> Float[Array, "*batch features"]:
-    """The same; the rows as they are as long as there are no statistics."""
+    """Like `standardise`, but the rows are unchanged while the statistics are empty."""
     return jnp.where(statistics.rows > 0, standardise(statistics, rows), rows)
 
 
 class Scale(NamedTuple):
-    """Of what size the mean reward of an episode is, R/T."""
+    """The scale of an episode's mean reward, R/T."""
 
     episodes: Float[Array, ""]
-    """How many there were."""
+    """The number of episodes."""
     mean_square: Float[Array, ""]
     lowest: Float[Array, ""]
     highest: Float[Array, ""]
 
 
 def new_scale() -> Scale:
-    """The scale of no episodes."""
+    """An empty scale."""
     return Scale(*(jnp.zeros(()) for _ in Scale._fields))
 
 
 def observe_scale(scale: Scale, values: Float[Array, " batch"], mask: Bool[Array, " batch"]) -> Scale:
-    """Add those of `values` where `mask` is true."""
+    """Add the values where `mask` is true."""
     count = scale.episodes + jnp.sum(mask)
     excess = jnp.sum(jnp.where(mask, values**2 - scale.mean_square, 0))
     known = scale.episodes > 0
@@ -97,11 +97,11 @@ def observe_scale(scale: Scale, values: Float[Array, " batch"], mask: Bool[Array
 
 
 def within_range(scale: Scale, values: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """(x - lowest) / (highest - lowest); 0.5 as long as they are the same: which is good is not known."""
+    """(x - lowest) / (highest - lowest); 0.5 while lowest and highest are the same."""
     width = scale.highest - scale.lowest
     return jnp.where(width > 0, (values - scale.lowest) / jnp.where(width > 0, width, 1), 0.5)
 
 
 def magnitude(scale: Scale) -> Float[Array, ""]:
-    """The scale, or 1 as long as every return was 0."""
+    """The root mean square of R/T, or 1 while every return is 0."""
     return jnp.where(scale.mean_square > 0, jnp.sqrt(scale.mean_square), 1)

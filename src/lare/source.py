@@ -1,4 +1,4 @@
-"""Which code this is: results are worth little without it."""
+"""The version of this code, which is saved with every result."""
 
 import functools
 import subprocess
@@ -11,7 +11,7 @@ import lare
 def source(directory: Path = Path(__file__).parent) -> str:
     """Version of the package; in a checkout also the last commit that touched it, and whether it was changed since.
 
-    Where `directory` merely lies in somebody else's repository, as a virtual environment may, that one's commits are not ours.
+    If `directory` only lies within another repository, as a virtual environment may, that repository's commits do not count.
     """
     commit = git(directory, "log", "-1", "--format=%h", "--abbrev=10", "--", ".")
     if not commit:
@@ -21,7 +21,7 @@ def source(directory: Path = Path(__file__).parent) -> str:
 
 
 def git(directory: Path, *arguments: str) -> str:
-    """What git says, or nothing."""
+    """The output of git; empty if it fails."""
     try:
         done = subprocess.run(("git", *arguments), cwd=directory, capture_output=True, text=True, timeout=5, check=True)
     except (OSError, subprocess.SubprocessError):

@@ -1,13 +1,13 @@
-"""Section "Analysis" and appendix B of the LaRe paper, made runnable on small tabular problems.
+"""Section "Analysis" and appendix B of the LaRe paper, as code for small tabular problems.
 
 An episode of T steps reveals only the sum of its rewards. The regularised least-squares estimator learns the reward of every
-entry of a table from such sums; the smaller the table, the fewer episodes it takes. The raw table has an entry for each state
-and action, |S||A| of them. The latent one has one for each value of the latent reward, |D| of them: states that differ in what does
-not matter share it. Propositions 1 and 2 bound the error and the regret of both.
+entry of a table from such sums; the smaller the table, the fewer episodes it needs. The raw table has an entry for each state
+and action, |S||A| of them. The latent table has an entry for each value of the latent reward, |D| of them: states that differ only
+in irrelevant parts share an entry. Propositions 1 and 2 bound the error and the regret of both.
 
-States are pairs (core, redundant): the core moves by the action and decides the reward, the redundant part is drawn anew at
-every step and decides nothing; phi forgets it. Policies go by the core, so that the maximum over all of them is exact in both
-tables.
+States are pairs (core, redundant). The action moves the core, and the core decides the reward. The redundant part is random at
+every step and decides nothing; phi leaves it out. Policies depend on the core only, so that the maximum over all of them is exact
+in both tables.
 """
 
 import itertools
@@ -30,7 +30,7 @@ class MDP(NamedTuple):
 
 
 class Table(NamedTuple):
-    """What the estimator has an entry for; `redundant` = 1 is the latent table."""
+    """The sizes of the estimator's table; `redundant` = 1 is the latent table."""
 
     cores: int
     redundant: int
@@ -52,10 +52,10 @@ class Estimator(NamedTuple):
 
 
 class History(NamedTuple):
-    """What happened, episode by episode."""
+    """Results, episode by episode."""
 
     regret: Float[Array, " episodes"]
-    """rho(k), the sum of V* - V^pi up to it."""
+    """rho(k), the sum of V* - V^pi up to episode k."""
     error: Float[Array, " episodes"]
     """|r - r_hat_k|_{A_k}."""
     radius: Float[Array, " episodes"]
@@ -70,12 +70,12 @@ def random_mdp(key: PRNGKeyArray, cores: int, actions: int) -> MDP:
 
 
 def policies(cores: int, actions: int) -> Int[Array, "policies cores"]:
-    """Every deterministic policy that goes by the core."""
+    """Every deterministic policy that depends on the core only."""
     return jnp.asarray(np.array(list(itertools.product(range(actions), repeat=cores))))
 
 
 def visits(mdp: MDP, policy: Int[Array, " cores"], horizon: int) -> Float[Array, "cores actions"]:
-    """h_pi: how often each core and action is met in an episode, in expectation; it begins in core 0."""
+    """h_pi: the expected number of visits to each core and action in an episode, which begins in core 0."""
     cores, actions = mdp.reward.shape
     moves = mdp.transition[jnp.arange(cores), policy]
 
@@ -97,7 +97,7 @@ def nothing_seen(size: int, ridge: float) -> Estimator:
 
 
 def update(state: Estimator, counts: Float[Array, " size"], total: Float[Array, ""]) -> Estimator:
-    """One more episode: how often it met each entry, and what it returned."""
+    """Add an episode: how often it visited each entry, and its return."""
     return Estimator(state.design + jnp.outer(counts, counts), state.products + counts * total)
 
 
@@ -123,7 +123,7 @@ def optimistic(state: Estimator, expected: Float[Array, "policies size"], width:
 def play(
     key: PRNGKeyArray, mdp: MDP, policy: Int[Array, " cores"], table: Table, horizon: int
 ) -> tuple[Float[Array, " size"], Float[Array, ""]]:
-    """An episode: how often it met each entry of the table, and the sum of its rewards."""
+    """Play an episode: how often it visited each entry of the table, and the sum of its rewards."""
 
     def step(core: Int[Array, ""], key: PRNGKeyArray):
         move_key, redundant_key, reward_key = jax.random.split(key, 3)
@@ -141,7 +141,7 @@ def play(
 def oful(key: PRNGKeyArray, mdp: MDP, redundant: int, horizon: int, episodes: int, delta: float = 0.1) -> History:
     """OFUL for per-trajectory feedback (Efroni et al., 2021; appendix B), with lambda = T.
 
-    It learns a table of `redundant` entries for each core and action; 1 is what phi leaves of any number of them.
+    It learns a table with `redundant` entries for each core and action. With phi, this number is always 1.
     """
     cores, actions = mdp.reward.shape
     table, ridge = Table(cores, redundant, actions), float(horizon)

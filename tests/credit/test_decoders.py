@@ -16,6 +16,7 @@ from lare.credit.decomposition import Episodes
 from lare.credit.methods import TABLE, Decoder, Fit
 from lare.credit.settings import CreditSettings
 from lare.credit.stas import STAS, USED, Coalitions, TimeLayer, dropout
+from tiers import long
 
 EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
 KEY = jax.random.key(1)
@@ -98,7 +99,7 @@ def test_arel_gives_every_agent_the_same_and_costs_its_variance():
     assert float(decoded.penalty.mean()) == pytest.approx(want, rel=1e-4)
 
 
-@pytest.mark.parametrize(("normalise", "sum_form"), [(False, True), (True, False)])
+@pytest.mark.parametrize(("normalise", "sum_form"), [long(False, True), (True, False)])
 def test_arels_loss_is_the_published_one_in_other_units(normalise, sum_form):
     """(R - sum_t y_t)^2 + 20 Var_t(y), as published, divided by T^2 for the mean form and by the square of the scale."""
     settings = CreditSettings(normalise=normalise, sum_form=sum_form)

@@ -144,5 +144,5 @@ def test_whole_episodes_and_padding():
 @pytest.mark.parametrize(("lengths", "message"), [((3, 5), "8 steps of 2 episodes"), ((3, 0), "3 steps of 2 episodes")])
 def test_episodes_that_have_no_room(lengths, message):
     features = [np.zeros((length, FEATURES), np.float32) for length in lengths]
-    with pytest.raises(LareError, match=f"{message}: each has one or more, and all at most 7"):
+    with pytest.raises(LareError, match=f"{message}: each needs at least one step, and all together at most 7"):
         decomposition.whole_episodes(features, [1.0, 1.0], 7)

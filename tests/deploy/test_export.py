@@ -25,24 +25,25 @@ from lare.training.compiled import compiled, new_memory
 from lare.training.learner import Paid
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
+from tiers import long
 from toys import pick_spec, toy_spec
 
 CASES = [
     ("td3", "lare-bayes"),
-    ("ddpg", "rrdu"),
+    long("ddpg", "rrdu"),
     ("sac", "vib-rrdu"),
-    ("td3", "lare-signs"),
-    ("td3", "diaster"),
-    ("sac", "dense"),
+    long("td3", "lare-signs"),
+    long("td3", "diaster"),
+    long("sac", "dense"),
     ("ppo", "lare-linear"),
-    ("ppo", "llm-reward"),
-    ("ppo", "rrdu-next"),
-    ("ippo", "lare-bayes"),
-    ("ippo", "lare-rd-shared"),
+    long("ppo", "llm-reward"),
+    long("ppo", "rrdu-next"),
+    long("ippo", "lare-bayes"),
+    long("ippo", "lare-rd-shared"),
     ("ippo-teams", "lare-rd"),
-    ("ippo-state", "rrdu-next"),
+    long("ippo-state", "rrdu-next"),
     ("qmix", "lare-bayes"),
-    ("vdn", "ircr"),
+    long("vdn", "ircr"),
 ]
 """Every kind of policy, and every kind of decoder and of what it is given."""
 
@@ -239,7 +240,7 @@ def test_a_phi_without_translation_runs_beside_the_decoder(small, command, tmp_p
     run = lare.train(toy_spec(), settings, function=function, out=tmp_path / "run", listeners=[])
     _, _, noted = command("export", run.directory, "--out", "out")
     assert noted == (
-        "reward takes the factors of phi as an input, for phi has no translation: it has a call of np.median\n"
+        "reward takes the factors of phi as an input, because phi cannot be translated: it has a call of np.median\n"
     )
     exported, random = loaded(tmp_path / "out"), np.random.default_rng(0)
     before, after = random.uniform(-1, 1, (2, 5, 2)).astype(np.float32)
@@ -266,7 +267,7 @@ def test_the_command_line(run, command, monkeypatch, tmp_path):
     assert noted == f"without the package onnx, no .onnx files were written: {pip_install('onnx')}\n"
     assert not list((tmp_path / "second").glob("*.onnx"))
     status, _, noted = command("export", run.directory, "--out", "second")
-    assert (status, noted) == (2, "lare: second exists, and is not overwritten; choose another --out\n")
+    assert (status, noted) == (2, "lare: second exists, and is not overwritten; choose another directory\n")
     status, _, noted = command("export", run.directory, "--out", "third", "--seed", "7")
     assert (status, noted) == (2, f"lare: {run.directory} has no seed 7; its seeds: 0, 1\n")
 

@@ -66,7 +66,7 @@ def test_a_page_shows_a_run_while_it_trains(small, tmp_path, monkeypatch):
     out = tmp_path / "run"
     lare.train(toy_spec(), small(method="dense", steps=120), out=out, listeners=[Reader(out)])
     assert opened == [(out / "watch.html").resolve().as_uri()]
-    assert [re.search(r"Step (\d+) of 120; read again every 10 seconds", page)[1] for page in pages] == ["60", "120"]
+    assert [re.search(r"Step (\d+) of 120; reloaded every 10 seconds", page)[1] for page in pages] == ["60", "120"]
     assert all('<meta http-equiv="refresh" content="10">' in page for page in pages)
     assert "refresh" not in (out / "watch.html").read_text()
 

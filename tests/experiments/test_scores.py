@@ -53,7 +53,7 @@ def test_two_tasks_of_one_name_are_not_compared(made):
     with pytest.raises(LareError) as error:
         grouped(by_label([first, second]), RETURN)
     assert str(error.value) == (
-        f"{second.directory} and {first.directory} are runs of two tasks that are both called Chase: compare them apart"
+        f"{second.directory} and {first.directory} are runs of two tasks that are both called Chase: compare them separately"
     )
 
 
@@ -62,7 +62,7 @@ def test_two_tasks_of_one_name_are_not_compared(made):
     [
         (
             [("a", "Chase", {}), ("b", "Reacher-v4", {})],
-            "there is no reference for Chase, so its returns cannot be laid beside those of other tasks: compare the runs of "
+            "there is no reference for Chase, so its returns cannot be compared with those of other tasks: compare the runs of "
             "each task by themselves",
         ),
         (

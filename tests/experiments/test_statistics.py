@@ -100,7 +100,7 @@ def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):
     assert [run.config.settings.method for run in found] == ["dense", "rd"]
     assert find_runs([tmp_path / "runs" / "Chase" / "a"])[0].directory == found[0].directory
     assert [run.directory for run in find_runs([tmp_path / "runs" / "Chase"])] == [run.directory for run in found]
-    with pytest.raises(LareError, match=r"nothing is no run, and there is none in it$"):
+    with pytest.raises(LareError, match=r"nothing is not a run, and contains none$"):
         find_runs([tmp_path / "nothing"])
 
 

@@ -195,7 +195,7 @@ def test_a_sweep_that_is_stopped_or_killed_leaves_a_saved_run_and_nobody_behind(
     if number is signal.SIGINT:
         assert sweeping.returncode == 130
         assert said.splitlines()[-1] == (
-            "lare: stopped; what was under way has saved itself, and the same command goes on"
+            "lare: stopped; all running runs were saved, and the same command continues them"
         )
     with open_run(job.directory).directory.joinpath("lock").open() as lock:
         while True:
@@ -206,7 +206,7 @@ def test_a_sweep_that_is_stopped_or_killed_leaves_a_saved_run_and_nobody_behind(
                 assert time.monotonic() < until
                 time.sleep(0.1)
     last = job.directory.with_name(job.directory.name + ".log").read_text().splitlines()[-1]
-    assert re.match(r"stopped at step \d+ and saved; go on with: lare train --resume ", last)
+    assert re.match(r"stopped at step \d+ and saved; to continue: lare train --resume ", last)
 
 
 def test_a_process_that_fails_says_why(file, tmp_path):
@@ -215,7 +215,8 @@ def test_a_process_that_fails_says_why(file, tmp_path):
     error = processes.in_a_process(jobs[0], [], processes.Running())
     log = jobs[0].directory.with_name("dense-td3.log")
     assert error == (
-        f"{jobs[0].directory} exists, and a run never overwrites another: choose another --out, or go on with --resume ({log})"
+        f"{jobs[0].directory} exists, and a run never overwrites another: choose another directory, or "
+        f"continue the run with --resume (lare.resume) ({log})"
     )
 
 
@@ -244,7 +245,7 @@ def test_how_a_process_ended(file, monkeypatch):
     monkeypatch.setattr(processes.sys, "executable", str(full))
     assert processes.in_a_process(jobs[0], [], running) == f"no space is left ({log})"
     running.stop()
-    assert processes.in_a_process(jobs[0], [], running) == "it was not begun: the others were being stopped"
+    assert processes.in_a_process(jobs[0], [], running) == "it was not started, because all runs were being stopped"
 
 
 @pytest.mark.parametrize(
@@ -299,7 +300,7 @@ def test_a_file_that_lies(change, message, file):
         ),
         (
             ("draws = [0, 3]", '[functions]\nReacher-v4 = ["phi.py"]'),
-            "the function file {}/phi.py is not there",
+            "the function file {}/phi.py does not exist",
         ),
     ],
 )
@@ -388,5 +389,7 @@ def test_a_damaged_run_does_not_keep_the_others_from_going_on(file, monkeypatch)
 
 
 def test_more_cores_than_there_are():
-    with pytest.raises(LareError, match=r"^processes = 1000 of cores = 3 are 3000 cores, and this machine lends \d+$"):
+    with pytest.raises(
+        LareError, match=r"^processes = 1000 with cores = 3 each need 3000 cores, and \d+ are usable here$"
+    ):
         shares(1000, 3)

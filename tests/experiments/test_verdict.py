@@ -27,9 +27,9 @@ def said(returns, random=CHANCE, **facts):
             [
                 "It learned. The return is 71 ± 1.41 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 0.816.",
                 "That is more than training on the return at the end alone gives here (12).",
-                "Its proxy rewards, from factors and raw features, tell nearly all of the score: R² of the last returns, before "
+                "Its proxy rewards, from factors and raw features, explain nearly all of the score: R² of the last returns, before "
                 "they were learned from, is 0.97.",
-                "Next: it was still rising. To go on: `lare train --resume runs/x --steps 16000`.",
+                "Next: it was still rising. To continue: `lare train --resume runs/x --steps 16000`.",
             ],
         ),
         (
@@ -37,11 +37,11 @@ def said(returns, random=CHANCE, **facts):
             {"return_r2": -3.0, "latent": True},
             [
                 "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 0.816.",
-                "Its proxy rewards, from factors and raw features, tell next to nothing of the score: R² of the last returns, "
+                "Its proxy rewards, from factors and raw features, explain next to nothing of the score: R² of the last returns, "
                 "before they were learned from, is 0.00.",
-                "Next: the score is made of something else. `lare design Toy --reflect 2 --model NAME` asks for another phi; "
-                "`--method bayes` goes without a phi.",
-                "One seed says little: another may end elsewhere (`--seeds 3`).",
+                "Next: the score depends on something else. `lare design Toy --reflect 2 --model NAME` asks for another phi; "
+                "`--method bayes` needs no phi.",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),
         (
@@ -49,11 +49,11 @@ def said(returns, random=CHANCE, **facts):
             {"return_r2": 0.9},
             [
                 "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 0.816.",
-                "Its proxy rewards, from raw features, tell nearly all of the score: R² of the last returns, before they were "
+                "Its proxy rewards, from raw features, explain nearly all of the score: R² of the last returns, before they were "
                 "learned from, is 0.90.",
-                "Next: the proxy rewards are good, so it is up to the algorithm: more `--steps`, or another `--algorithm` "
+                "Next: the proxy rewards are good, so it depends on the algorithm: more `--steps`, or another `--algorithm` "
                 "(`lare algorithms`).",
-                "One seed says little: another may end elsewhere (`--seeds 3`).",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),
         (
@@ -63,7 +63,7 @@ def said(returns, random=CHANCE, **facts):
                 "It learned. The return is 31 after 8,000 steps; random actions get 0 ± 0.816.",
                 "That is no more than training on the return at the end alone gives here (40).",
                 "Next: it was better before, 92 at step 4,000. `lare evaluate runs/x --best` plays the best policy of each seed.",
-                "One seed says little: another may end elsewhere (`--seeds 3`).",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),
         (
@@ -72,7 +72,7 @@ def said(returns, random=CHANCE, **facts):
             [
                 "It got worse than random actions. The return is -949 after 8,000 steps; random actions get 0 ± 0.816.",
                 "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
-                "One seed says little: another may end elsewhere (`--seeds 3`).",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),
         (np.full((1, 8), np.nan), {}, ["Nothing can be said: the last evaluation gave no return."]),

@@ -15,7 +15,7 @@ def test_no_request_has_more_tokens_than_bytes_and_a_few_for_each_message():
 def test_what_is_left_is_what_a_reply_may_have():
     budget = Budget(tokens=100, tokens_in=30, tokens_out=20)
     assert budget.allow(ASKED) == 100 - 50 - 23
-    with pytest.raises(BudgetSpent, match=r"might pass the budget of 100 tokens \(50 are used\)"):
+    with pytest.raises(BudgetSpent, match=r"might exceed the budget of 100 tokens \(50 are used\)"):
         budget.allow(ASKED * 3)
 
 

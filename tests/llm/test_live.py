@@ -75,7 +75,7 @@ def test_a_reply_that_was_cut_off_is_said_to_be(served):
 
 def test_no_request_is_made_that_leaves_no_room_for_a_reply(served):
     server, model, _ = served(says("hello"), budget=Budget(tokens=most_tokens(ASKED) + live.SHORTEST_REPLY - 1))
-    with pytest.raises(BudgetSpent, match="might pass the budget"):
+    with pytest.raises(BudgetSpent, match="might exceed the budget"):
         model.reply(ASKED, 0)
     assert server.requests == []
 
@@ -234,7 +234,7 @@ def test_a_server_that_counts_nothing_is_counted_by_bytes(served, usage):
     ("encoding", "times", "said"),
     [
         ("gzip", 1, "the answer has more than 8 MB"),
-        ("gzip, gzip", 2, "is packed as gzip, gzip, which nobody asked for"),
+        ("gzip, gzip", 2, "is packed as gzip, gzip, which was not asked for"),
     ],
 )
 def test_a_little_that_unpacks_to_a_lot(served, monkeypatch, encoding, times, said):
@@ -277,7 +277,7 @@ def test_half_a_character_is_none(served):
 def test_a_key_that_is_none(monkeypatch, key):
     monkeypatch.setenv("OPENAI_API_KEY", key)
     with pytest.raises(
-        ModelFailed, match="the environment variable OPENAI_API_KEY holds characters that are in no key"
+        ModelFailed, match="the environment variable OPENAI_API_KEY holds characters that no key can have"
     ):
         LiveModel("m", "http://127.0.0.1:1/v1")
 
@@ -307,7 +307,7 @@ def test_the_budget_of_tokens_is_never_passed(served):
 
     server, model, _ = served(greedy, budget=Budget(tokens=40_000))
     assert [model.reply(ASKED, number) for number in range(3)] == ["x"] * 3
-    with pytest.raises(BudgetSpent, match=r"might pass the budget of 40,000 tokens \(40,000 are used\)"):
+    with pytest.raises(BudgetSpent, match=r"might exceed the budget of 40,000 tokens \(40,000 are used\)"):
         model.reply(ASKED, 3)
     assert model.budget.tokens_in + model.budget.tokens_out == 40_000
     assert [request["max_completion_tokens"] for request in server.requests[:2]] == [live.REPLY_TOKENS] * 2
@@ -341,7 +341,7 @@ def test_nobody_is_sent_to_another_server(served, status, location, said):
     server, model, waited = served(raw(b"", status, Location=location))
     with pytest.raises(ModelFailed) as error:
         model.reply(ASKED, 0)
-    assert str(error.value).endswith(f"{said}: name that one if you mean it")
+    assert str(error.value).endswith(f"{said}: name that one to use it")
     assert (len(server.requests), waited) == (1, [])
 
 

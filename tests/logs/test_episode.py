@@ -33,7 +33,7 @@ def put_end(values, place):
         ),
         (
             {"observations": np.zeros((3, 2))},
-            "a.npz: observations must have 4, one more than there are actions (or next_observations be there), and the shape of "
+            "a.npz: observations must have 4, one more than there are actions (or give next_observations), and the shape of "
             "observations is (3, 2)",
         ),
         (
@@ -106,7 +106,7 @@ def test_whole_numbers_are_choices_where_a_task_says_so():
     assert str(error.value) == (
         "a: actions are whole numbers, choices maybe: say how many there are with a task (action_size)"
     )
-    with pytest.raises(LareError, match=r"\Aa: actions holds a choice that there is not: array\(\[0, 3, 1\]\)\Z"):
+    with pytest.raises(LareError, match=r"\Aa: actions holds a choice that does not exist: array\(\[0, 3, 1\]\)\Z"):
         checked("a", values | {"actions": np.array([0, 3, 1])}, form, None)
 
 

@@ -94,10 +94,10 @@ def test_spaces_of_any_kind():
 def test_what_cannot_be_is_refused(datasets, tmp_path):
     made("log-v0", logged(10))
     for out, message in (
-        ("new", "new is no id of Minari's, as cheetah/relabelled-v0: a name, -v and a number"),
+        ("new", "new is not a Minari id, such as cheetah/relabelled-v0: a name, -v and a number"),
         (
             "log-v0",
-            f"{datasets / 'log-v0'} exists: choose another --out, or replace it with --overwrite (overwrite=True)",
+            f"{datasets / 'log-v0'} exists: choose another directory, or replace it with --overwrite (overwrite=True)",
         ),
     ):
         with pytest.raises(LareError) as error:

@@ -90,8 +90,14 @@ COUNT = len(ROWS)
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (ROWS.drop_columns("episode"), "{path} must have one column episode, which the step is of; its columns are "),
-        (ROWS.drop_columns("next_observations"), "{path} must have one column next_observations, what the step led to"),
+        (
+            ROWS.drop_columns("episode"),
+            "{path} must have one column episode, the episode of the step; its columns are ",
+        ),
+        (
+            ROWS.drop_columns("next_observations"),
+            "{path} must have one column next_observations, the observation after the step",
+        ),
         (
             ROWS.set_column(0, "episode", pa.array(np.ones(COUNT))),
             "{path}: episode must be whole numbers or strings, and is double",

@@ -15,6 +15,7 @@ from lare.latent.function import verified
 from lare.logs import relabel as module
 from lare.logs.relabel import held
 from logged import PHI, logged
+from tiers import long
 
 
 def read(path):
@@ -94,7 +95,7 @@ def test_what_was_relabelled_can_be_relabelled(folder, tmp_path):
     assert [one.name for one in tmp_path.iterdir()] == ["log"]
 
 
-@pytest.mark.parametrize("method", ["rd", "rrdu", "diaster", "rd-linear"])
+@pytest.mark.parametrize("method", ["rrdu", long("rd"), long("diaster"), long("rd-linear")])
 def test_other_methods_too(tmp_path, method):
     found = lare.relabel(list(logged(40)), tmp_path / "new", method=method, updates=16, hold_out=0.25)
     assert math.isfinite(found.return_r2)
@@ -208,7 +209,7 @@ def test_the_command(command, folder, tmp_path, task):
     assert command("relabel", path, "--out", "new") == (
         2,
         "",
-        "lare: new exists: choose another --out, or replace it with --overwrite (overwrite=True)\n",
+        "lare: new exists: choose another directory, or replace it with --overwrite (overwrite=True)\n",
     )
     status, said, _ = command("verify", "phi.py", "--task", "task.toml", "--data", path)
     assert (status, "FAILED" in said) == (0, False)
@@ -225,7 +226,7 @@ def test_a_directory_of_other_files_is_never_replaced(folder, tmp_path):
     with pytest.raises(LareError) as refused:
         lare.relabel(folder(logged(9)), tmp_path / "precious", method="rd-linear", overwrite=True)
     assert str(refused.value) == (
-        f"{tmp_path / 'precious'} holds thesis.txt, which is no log, and is not replaced: choose another --out"
+        f"{tmp_path / 'precious'} holds thesis.txt, which is not a log, and is not replaced: choose another directory"
     )
     assert (tmp_path / "precious" / "thesis.txt").read_text() == "years"
 

@@ -24,8 +24,8 @@ def test_steps_are_from_all_over_the_log(task, judges):
     [
         (
             (np.zeros((3, 4)), np.zeros((3, 1))),
-            "observations of steps must be rows of 2 numbers, as observation_size of Logs says, as many as the other array has "
-            "and one at least: the shape is (3, 4)",
+            "observations of steps must have the shape (n, 2), with the observation_size of Logs, and n >= 1 as for the other "
+            "array: the shape is (3, 4)",
         ),
         ((np.zeros((3, 2)), np.full((3, 1), np.inf)), "actions of steps hold a number that is not finite"),
     ],

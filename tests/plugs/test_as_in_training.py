@@ -10,6 +10,7 @@ from lare.credit.methods import METHODS
 from lare.plugs.assigner import CreditAssigner
 from lare.training import learner as common
 from recipes import ALONE, LENGTHS, TOGETHER, config_of, every_step, paid_by, steps_of, untrained, with_steps
+from tiers import long
 from toys import toy_spec
 
 TWO = replace(ALONE, observation_size=2, action_size=1, low=ALONE.low[:, :1], high=ALONE.high[:, :1])
@@ -52,13 +53,13 @@ def both(method, env, phi=None):
 
 CASES = [
     ("lare-bayes", TWO),
-    ("lare-linear", TWO),
-    ("lare-signs", TWO),
-    ("bayes", TWO),
+    long("lare-linear", TWO),
+    long("lare-signs", TWO),
+    long("bayes", TWO),
     ("rd-linear", ALONE),
     ("rd-linear", TOGETHER),
-    ("lare-rd", TWO),
-    ("rd", TOGETHER),
+    long("lare-rd", TWO),
+    long("rd", TOGETHER),
     ("ircr", ALONE),
 ]
 

@@ -45,7 +45,8 @@ def test_every_method_pays_every_step(method, function):
         with pytest.raises(LareError) as refused:
             credit.rewards(*shown[0][:3])
         assert (
-            str(refused.value) == "ircr pays by the return of a step's episode: ask rewards_at, by the numbers of steps"
+            str(refused.value)
+            == "ircr pays by the return of a step's episode: call rewards_at, with the numbers of steps"
         )
     else:
         for one, paid in zip(shown, r_hat, strict=True):
@@ -172,7 +173,7 @@ def test_scores_may_come_late():
 @pytest.mark.parametrize(
     ("lane", "score", "message"),
     [
-        ("x", None, "no episode goes on in lane 'x': it has ended, or is older than 1000 steps (capacity)"),
+        ("x", None, "no episode is running in lane 'x': it has ended, or is older than 1000 steps (capacity)"),
         (0, float("nan"), "score = nan of lane 0 is not finite"),
         (0, float("inf"), "score = inf of lane 0 is not finite"),
     ],
@@ -291,7 +292,7 @@ def test_an_episode_without_a_step_is_refused():
         (
             "arel",
             {"agents": 2, "max_steps": 5},
-            "arel looks at whole episodes at once, not at steps that are sampled: `lare.train` has it",
+            "arel looks at whole episodes at once, not at sampled steps: use it with `lare.train`",
         ),
         ("lare-rd", {}, "lare-rd needs a phi; bayes, rd and rrdu need none"),
         ("diaster", {"agents": 2, "max_steps": 5}, "diaster assigns credit to a single agent, and agents = 2"),
@@ -304,7 +305,7 @@ def test_an_episode_without_a_step_is_refused():
         (
             "rd-linear",
             {"observation_space": 10_000},
-            "rd-linear fits a weight to each of at most 1024 entries, and there are 10001: rrdu trains a network",
+            "rd-linear fits a weight to each of at most 1024 entries, and there are 10001: use rrdu, a network",
         ),
         (
             "rrdu",

@@ -112,14 +112,14 @@ REFUSED = [
     (spaces.Box(-1, 1, (3,)), None, "before must be numbers, and is None"),
     (spaces.Box(-1, 1, (2,)), [[1, 2], [3]], "before must be numbers, and is [[1, 2], [3]]"),
     (spaces.Box(-1, 1, (2,)), {"place": 1}, "before must be numbers, and is {'place': 1}"),
-    (spaces.Discrete(3), [3], "before holds a choice that there is not: array([3])"),
-    (spaces.Discrete(3, start=1), [0], "before holds a choice that there is not: array([0])"),
-    (spaces.Discrete(3), [0.5], "before holds a choice that there is not: array([0.5])"),
-    (spaces.Discrete(3), [np.nan], "before holds a choice that there is not: array([nan])"),
-    (spaces.MultiDiscrete([2, 3]), [[0, 3]], "before holds a choice that there is not: array([[0, 3]])"),
+    (spaces.Discrete(3), [3], "before holds a choice that does not exist: array([3])"),
+    (spaces.Discrete(3, start=1), [0], "before holds a choice that does not exist: array([0])"),
+    (spaces.Discrete(3), [0.5], "before holds a choice that does not exist: array([0.5])"),
+    (spaces.Discrete(3), [np.nan], "before holds a choice that does not exist: array([nan])"),
+    (spaces.MultiDiscrete([2, 3]), [[0, 3]], "before holds a choice that does not exist: array([[0, 3]])"),
     (spaces.MultiDiscrete([2, 3]), [[0, 1, 1]], "before must be rows of 5 numbers, and has the shape (1, 3)"),
     (NAMED, {"place": [[0, 0]]}, "before has no 'mode': it needs 'place', 'mode'"),
-    (NAMED, {"place": [[0, 0]], "mode": [7]}, "before['mode'] holds a choice that there is not: array([7])"),
+    (NAMED, {"place": [[0, 0]], "mode": [7]}, "before['mode'] holds a choice that does not exist: array([7])"),
     (NAMED, np.zeros((1, 4)), "before must be rows of 5 numbers, and has the shape (1, 4)"),
     (
         spaces.Tuple([spaces.Discrete(2), spaces.Discrete(2)]),
@@ -154,4 +154,4 @@ def test_a_space_without_rows_is_refused(space, message):
     with pytest.raises(LareError) as refused:
         layout_of(space, "observation_space")
     assert str(refused.value).startswith(message)
-    assert str(refused.value).endswith("whose elements are no rows of numbers of one size")
+    assert str(refused.value).endswith("whose elements cannot be written as rows of numbers of one size")

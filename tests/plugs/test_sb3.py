@@ -514,9 +514,9 @@ def test_a_buffer_without_an_assigner():
 
 
 def test_an_assigner_that_is_too_small():
-    with refused("the assigner keeps 99 steps and the buffer 300: capacity=300"):
+    with refused("the assigner keeps 99 steps and the buffer 300: give the assigner capacity=300"):
         td3(toy(), assigner(capacity=99))
-    with refused("the assigner keeps 31 steps and a rollout has 32: capacity=32"):
+    with refused("the assigner keeps 31 steps and a rollout has 32: give the assigner capacity=32"):
         ppo(toy()).learn(32, callback=CreditCallback(assigner(capacity=31)))
 
 

@@ -30,15 +30,15 @@ def decided(settings, task):
         (
             "Reacher-v4",
             {"algorithm": "vdn"},
-            "vdn chooses among actions, and those of Reacher-v4 are numbers within bounds",
+            "vdn needs discrete actions, and those of Reacher-v4 are continuous",
         ),
         ("Reacher-v4", {"method": "arel"}, "arel assigns credit among agents, and Reacher-v4 is a task of one"),
         ("CN-6", {"method": "diaster"}, "diaster assigns credit to a single agent, and CN-6 is a task of many"),
         (
             "CN-6",
             {"method": "stas", "rollout_steps": 10},
-            "stas looks at whole episodes of one length: those of CN-6 must have a fixed one, and rollout_steps be a multiple "
-            "of it",
+            "stas looks at whole episodes of one length: episodes of CN-6 must have a fixed length, and rollout_steps must be a "
+            "multiple of it",
         ),
         (
             "Reacher-v4",
@@ -101,7 +101,7 @@ def test_credit_among_agents_is_not_judged_from_the_state(method, echo):
 @pytest.mark.parametrize("method", ["stas", "arel"])
 def test_who_looks_at_whole_episodes_wants_them_of_one_length(method, echo):
     with pytest.raises(
-        LareError, match=f"^{method} looks at whole episodes of one length: those of Echo must have a fixed one"
+        LareError, match=f"^{method} looks at whole episodes of one length: episodes of Echo must have a fixed length"
     ):
         decide(Settings(method=method, rollout_steps=6), echo)
 
@@ -112,9 +112,7 @@ def test_one_team_of_several_is_not_trained_alone():
 
 
 def test_who_acts_within_bounds_cannot_choose():
-    with pytest.raises(
-        LareError, match=r"^sac acts by numbers within bounds, and Pick offers a choice: ppo can choose$"
-    ):
+    with pytest.raises(LareError, match=r"^sac needs continuous actions, and those of Pick are discrete: use ppo$"):
         decide(Settings(algorithm="sac"), pick_spec())
 
 

@@ -67,7 +67,7 @@ def run(tmp_path):
         (b'{"format": ' + b"9" * 5000 + b"}", "a number of 5000 digits"),
         (b'{"format": 3}', "the key 'lare' is missing (and 8 more)"),
         (b'{"format": 1, "lare": "0.1"}', "the run is of another version of LaRe (0.1), whose files this one does not read: "
-                                         "use that version, or train it anew"),
+                                         "use that version, or train it again"),
     ],
 )  # fmt: skip
 def test_config(tmp_path, content, message):
@@ -185,15 +185,15 @@ def segments(**values) -> np.ndarray:
         ({"host": np.array(DEEP)}, TOO_DEEP),
         ({"host": np.array("[]")}, "host is no object"),
         ({"host": np.zeros(3)}, "Expecting ',' delimiter: line 1 column 3 (char 2)"),
-        ({"host": host(step="3")}, "'3' counts nothing"),
-        ({"host": host(step=-1)}, "-1 counts nothing"),
-        ({"host": host(metrics_length=2**60)}, "1152921504606846976 counts nothing"),
-        ({"host": host(functions_since="../../other")}, "'../../other' counts nothing"),
+        ({"host": host(step="3")}, "'3' is not a count"),
+        ({"host": host(step=-1)}, "-1 is not a count"),
+        ({"host": host(metrics_length=2**60)}, "1152921504606846976 is not a count"),
+        ({"host": host(functions_since="../../other")}, "'../../other' is not a count"),
         ({"host": host(function_sha256=[1])}, "function_sha256 is no list of texts"),
         ({"segments": np.array("3")}, "'int' object is not iterable"),
         ({"segments": np.array("[{}]")}, "'number'"),
-        ({"segments": segments(number="../../../etc/passwd")}, "'../../../etc/passwd' counts nothing"),
-        ({"segments": segments(start=[[-5]])}, "-5 counts nothing"),
+        ({"segments": segments(number="../../../etc/passwd")}, "'../../../etc/passwd' is not a count"),
+        ({"segments": segments(start=[[-5]])}, "-5 is not a count"),
         ({"segments": segments(count=[[10**15]])}, None),
         ({"segments": segments(count=[[[[4]]]])}, None),
         ({"segments": segments(number=7)}, None),
@@ -309,7 +309,7 @@ def neighbour(tmp_path, monkeypatch):
 def test_a_run_directory_imports_no_file_that_nobody_named(run, neighbour, monkeypatch, environment):
     place = run({"environment": environment})
     assert said(open_run, place) == (
-        f"{place}: its environment {environment!r} would run {neighbour.resolve()}, which is of no installed package; "
+        f"{place}: its environment {environment!r} would run {neighbour.resolve()}, which belongs to no installed package; "
         "if you trust that file, set LARE_TRUST=a_neighbours_file"
     )
     monkeypatch.setenv("LARE_TRUST", "other, a_neighbours_file")

@@ -40,6 +40,12 @@ def test_options_of_the_decoder_are_checked(credit, message):
         Settings(credit=credit)
 
 
+def test_a_key_of_a_table_within_is_hinted_at():
+    with pytest.raises(LareError) as error:
+        Settings(gamma=0.9)
+    assert str(error.value) == "there is no key 'gamma' (did you mean 'td3.gamma'?)"
+
+
 def test_tables_within_tables():
     found = Settings(credit={"steps": 800}, ippo={"gae_lambda": 1.0}, method="dense")
     assert found.credit.steps == 800

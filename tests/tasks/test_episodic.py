@@ -125,7 +125,7 @@ def test_a_score_may_be_paid_instead():
     ("key", "value", "message"),
     [
         ("goals", 1, "the info of the last step has no 'goals': it has 'mine', 'score'"),
-        ("score", "high", "info['score'] of the last step is 'high', which is no score"),
+        ("score", "high", "info['score'] of the last step is 'high', which is not a number"),
         ("score", math.nan, "info['score'] of the last step is nan: a score must be finite"),
     ],
 )

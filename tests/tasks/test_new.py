@@ -119,8 +119,8 @@ def test_what_is_not_documented_must_be_filled_in(tmp_path):
     [
         (
             "Nowhere-v0",
-            "environment 'Nowhere-v0' cannot be made: Environment `Nowhere` doesn't exist. (one of your own is "
-            "MODULE:Nowhere-v0, where MODULE registers it)",
+            "environment 'Nowhere-v0' cannot be made: Environment `Nowhere` doesn't exist. (for an environment "
+            "of your own, write MODULE:Nowhere-v0, where MODULE registers it)",
         ),
         ("a b", "environment 'a b' cannot be made: "),
         ("toys/Told-v0:x", "environment 'toys/Told-v0:x' cannot be made: "),

@@ -57,6 +57,8 @@ def test_it_has_no_window():
     env = OnHost(Echo())
     with pytest.raises(LareError) as error:
         env.render()
-    assert str(error.value) == "an environment of pure functions has no window of its own"
+    assert (
+        str(error.value) == "an environment in JAX cannot be rendered step by step: its frames() draws whole episodes"
+    )
     env.close()
     assert env.reset(0).alive.all()

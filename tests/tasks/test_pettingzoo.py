@@ -245,7 +245,7 @@ def test_a_state_that_cannot_be_said_for_a_moment(caplog):
     steps = episode(host(Falls()), 0)
     assert [step.state.tolist() for step in steps] == [[0, 0], [1, 1], [1, 1], [1, 1], [4, 4], [5, 5]]
     said = f"environment '{TOY}' failed in state at step 2 of the episode of seed 0: no hull"
-    assert [record.getMessage() for record in caplog.records] == [f"{said}; the state before it stands for it"]
+    assert [record.getMessage() for record in caplog.records] == [f"{said}; the previous state is used instead"]
     with pytest.raises(LareError) as error:
         episode(host(Falls(), judged_from="state"), 0)
     assert str(error.value) == said
@@ -325,7 +325,7 @@ def test_masks_are_told(kind, masks):
         ([1, 0], "has the shape (2,), and there are 3 choices"),
         ([1, 0.5, 0], "has 0.5 in it; entries must be 0 or 1"),
         ([1, 2, 0], "has 2 in it; entries must be 0 or 1"),
-        ("no", "is 'no', which are no numbers"),
+        ("no", "is 'no', which is not an array of numbers"),
     ],
 )
 def test_masks_that_are_none(kind, mask, message):
@@ -433,7 +433,7 @@ BOX = Box(-1, 1, (2,), np.float32)
         (
             {"actions": {"a_0": Discrete(3), "a_1": BOX}},
             "the actions of a_0 are Discrete(3) and those of a_1 Box(-1.0, 1.0, (2,), float32): "
-            "all agents must choose (Discrete), or none (Box)",
+            "all agents must have a Discrete space, or all a Box",
         ),
         (
             {"actions": {"a_0": Discrete(3), "a_1": MultiDiscrete([2, 2])}},
@@ -454,7 +454,7 @@ BOX = Box(-1, 1, (2,), np.float32)
                 ),
                 "actions": dict.fromkeys(("a_0", "a_1"), BOX),
             },
-            "a_0 has an action mask, but its actions are no choices: Box(-1.0, 1.0, (2,), float32)",
+            "a_0 has an action mask, but its actions are not discrete: Box(-1.0, 1.0, (2,), float32)",
         ),
     ],
 )
@@ -479,7 +479,7 @@ def test_spaces_that_cannot_be_trained_on(keys, message):
             "parallel_toys:xx",
             "cannot be made: parallel_toys has no 'xx'; it has Box, Discrete, AECEnv, ParallelEnv, Toy, ",
         ),
-        ("parallel_toys:NUMBER", "cannot be made: NUMBER of parallel_toys is 5, which makes nothing"),
+        ("parallel_toys:NUMBER", "cannot be made: NUMBER of parallel_toys is 5, which cannot be called"),
         ("parallel_toys:raises", "cannot be made: no asset"),
         ("parallel_toys:leaves", "cannot be made: no window"),
         ("parallel_toys:nothing", "cannot be made: 3 is no ParallelEnv: it has no possible_agents"),
@@ -581,10 +581,10 @@ def back(toy, *answer):
 
 PLACE = "at step 3 of the episode of seed 0"
 BROKEN = [
-    (step_with(observations=without("a_1")), f"gave no observations for a_1 {PLACE}, which is among its agents"),
-    (step_with(rewards=without("a_1")), f"gave no rewards for a_1 {PLACE}, which is among its agents"),
-    (step_with(terminations=without("a_1")), f"gave no terminations for a_1 {PLACE}, which is among its agents"),
-    (step_with(truncations=without("a_1")), f"gave no truncations for a_1 {PLACE}, which is among its agents"),
+    (step_with(observations=without("a_1")), f"gave no observations for a_1 {PLACE}, although it is among its agents"),
+    (step_with(rewards=without("a_1")), f"gave no rewards for a_1 {PLACE}, although it is among its agents"),
+    (step_with(terminations=without("a_1")), f"gave no terminations for a_1 {PLACE}, although it is among its agents"),
+    (step_with(truncations=without("a_1")), f"gave no truncations for a_1 {PLACE}, although it is among its agents"),
     (
         step_with(observations=lambda values: values | {"z": 0}),
         f"has 'z' among its observations {PLACE}, but its possible agents are a_0, a_1",
@@ -598,7 +598,7 @@ BROKEN = [
     (step_with(rewards=gives(None)), "gave a_1 the reward None, which is no number"),
     (
         step_with(terminations=gives(np.zeros(2))),
-        f"gave array([0., 0.]) for the termination of a_1 {PLACE}, no truth value",
+        f"gave array([0., 0.]) for the termination of a_1 {PLACE}, which is not a truth value",
     ),
     (lambda *_: (1, 2, 3), f"returned (1, 2, 3) {PLACE}, not observations, rewards, terminations, truncations, infos"),
     (leave, "failed in step: 0"),
@@ -607,7 +607,10 @@ BROKEN = [
     (step_with(observations=gives([0, 1e300])), f": the observation of a_1 {PLACE} has inf in it"),
     (step_with(observations=gives([0, 1, 2])), f": the observation of a_1 {PLACE} has the shape (3,), not (2,)"),
     (step_with(observations=gives(None)), f": the observation of a_1 {PLACE} has the shape (), not (2,)"),
-    (step_with(observations=gives("left")), f": the observation of a_1 {PLACE} is 'left', which are no numbers"),
+    (
+        step_with(observations=gives("left")),
+        f": the observation of a_1 {PLACE} is 'left', which is not an array of numbers",
+    ),
     (
         step_with(infos=gives({"action_mask": [1, 1, 1]})),
         f"gave a_1 an action mask {PLACE}, and had none at its first reset",
@@ -627,7 +630,7 @@ def test_nobody_comes_back():
     made = host(Toy(leaves={"a_0": 2}, spoil=back))
     with pytest.raises(LareError) as error:
         episode(made, 0)
-    assert str(error.value) == f"environment '{TOY}' has a_0 back, which had left, {PLACE}"
+    assert str(error.value) == f"environment '{TOY}' brought back a_0, which had left, {PLACE}"
 
 
 def test_who_has_left_may_still_be_listed():
@@ -680,7 +683,7 @@ START = "at the start of the episode of seed 7"
             f"returned {{'a_0': array([7., 0.], dtype=float32), 'a_1': array([7., 0.], dtype=float32)}} {START}, "
             "not observations, infos",
         ),
-        (lambda toy, o, i: ({}, i), f"gave no observations for a_0 {START}, which is among its agents"),
+        (lambda toy, o, i: ({}, i), f"gave no observations for a_0 {START}, although it is among its agents"),
         (lambda *_: 1 / 0, "failed in reset: division by zero"),
     ],
 )
@@ -715,7 +718,7 @@ def test_what_training_was_set_up_for_may_not_change():
     [
         ([0, np.inf], "has inf in it"),
         ([0, 1, 2], "has the shape (3,), not (2,)"),
-        ("somewhere", "is 'somewhere', which are no numbers"),
+        ("somewhere", "is 'somewhere', which is not an array of numbers"),
     ],
 )
 def test_a_state_that_is_none(state, message):

@@ -95,11 +95,11 @@ def test_like_over_two_generations(spec_file, tmp_path):
         ({"name": "a/b"}, "task '{file}': name = 'a/b': string should match pattern '^[\\w.\\-]+$'"),
         ({"action_size": 0}, "task '{file}': action_size = 0: input should be greater than or equal to 1"),
         ({"max_episode_steps": 0}, "task '{file}': max_episode_steps = 0: input should be greater than or equal to 1"),
-        ({"like": 3}, "task '{file}': like = 3 must be another task, without a circle"),
-        ({"like": []}, "task '{file}': like = [] must be another task, without a circle"),
-        ({"like": ["PP-6"]}, "task '{file}': like = ['PP-6'] must be another task, without a circle"),
-        ({"teams": "PP-6"}, "task '{file}': teams = 'PP-6' must be a list of other tasks, without a circle"),
-        ({"teams": [3]}, "task '{file}': teams = [3] must be a list of other tasks, without a circle"),
+        ({"like": 3}, "task '{file}': like = 3 must be another task, without a cycle"),
+        ({"like": []}, "task '{file}': like = [] must be another task, without a cycle"),
+        ({"like": ["PP-6"]}, "task '{file}': like = ['PP-6'] must be another task, without a cycle"),
+        ({"teams": "PP-6"}, "task '{file}': teams = 'PP-6' must be a list of other tasks, without a cycle"),
+        ({"teams": [3]}, "task '{file}': teams = [3] must be a list of other tasks, without a cycle"),
         (
             {"like": "Reacher"},
             f"no task 'Reacher' (did you mean 'Reacher-v4'?): neither a file nor one of the shipped tasks, {NAMES}",
@@ -125,7 +125,7 @@ def test_like_over_two_generations(spec_file, tmp_path):
         ),
         (
             {"teams": ["Reacher-v4"]},
-            "task '{file}': Reacher-v4 is no team of toys/Chase-v0: it needs the same environment, and a team",
+            "task '{file}': Reacher-v4 is not a team of toys/Chase-v0: its spec needs the same environment, and the key team",
         ),
         (
             {"environment": "particles/CompetitivePP-6"},
@@ -242,7 +242,7 @@ def test_like_in_a_circle_is_refused(tmp_path, circle):
         file.write_text(f'like = "{files[(place + 1) % len(files)]}"')
     with pytest.raises(LareError) as error:
         read_task(files[0])
-    assert str(error.value) == f"task '{files[-1]}': like = '{files[0]}' must be another task, without a circle"
+    assert str(error.value) == f"task '{files[-1]}': like = '{files[0]}' must be another task, without a cycle"
 
 
 @pytest.mark.parametrize("key", ["name", "description", "observation", "action", "environment"])
@@ -275,7 +275,7 @@ def test_arguments_that_a_run_cannot_keep(tmp_path, value):
     path.write_text(f'like = "CN-6"\narguments = {{ n = {value} }}\n')
     with pytest.raises(LareError) as error:
         read_task(path)
-    said = "a run cannot keep dates, inf or nan: numbers, strings, lists and tables only"
+    said = "a run cannot store dates, inf or nan: use numbers, strings, lists and tables"
     assert str(error.value).startswith(f"task '{path}': arguments = {{'n': ")
     assert str(error.value).endswith(f": {said}")
 

@@ -99,8 +99,11 @@ def test_a_team_says_no_such_key_either():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"agents": ("a_*",)}, "task 'Hunt': agents makes no difference to a task with teams: say it of one of them"),
-        ({"team": "cat"}, "task 'Hunt': team makes no difference to a task with teams: say it of one of them"),
+        (
+            {"agents": ("a_*",)},
+            "task 'Hunt': agents makes no difference to a task with teams: set it in the spec of a team",
+        ),
+        ({"team": "cat"}, "task 'Hunt': team makes no difference to a task with teams: set it in the spec of a team"),
         (
             {"teams": teams(teams=(two(team="mouse"),))},
             "task 'Mouse' is a team of 'Hunt' and cannot have teams: leave them out",

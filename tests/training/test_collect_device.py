@@ -13,7 +13,7 @@ from lare.tasks.particles.env import ParticleJaxEnv
 from lare.tasks.particles.task import STEPS
 from lare.training import sequences
 from lare.training.collect_device import DeviceCollector, play
-from lare.training.compiled import compiled, new_learners
+from lare.training.compiled import compiled
 from lare.training.streams import Stream, stream_keys
 from recipes import QUICK, config_of
 
@@ -26,7 +26,7 @@ CONFIG = config_of(
 
 
 def actor_for(seeds=SEEDS, config=CONFIG):
-    learners = jax.jit(partial(new_learners, config=config))(jax.vmap(jax.random.key)(jnp.asarray(seeds)))
+    learners = compiled(config).init(jax.vmap(jax.random.key)(jnp.asarray(seeds)))
     return learners, compiled(config).actor(learners, 0)
 
 

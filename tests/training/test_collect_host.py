@@ -21,6 +21,7 @@ from lare.tasks.workers import LocalEnvs, WorkerEnvs
 from lare.training.collect_host import Diverged, HostEpisodes, evaluate
 from lare.training.streams import Stream, episode_seed
 from lare.training.train import Interrupted
+from tiers import long
 from toys import At, figures, toy_spec
 
 
@@ -187,8 +188,7 @@ def test_an_episode_that_cannot_be_had_again_is_dropped_and_the_others_are_not()
     saved = first.saved()
     saved["observation3"] = saved["observation3"] + 1
     assert second.restore(saved) == [
-        "episode 1 of seed 4 was dropped after 7 steps: the environment did not come back to the same observation by the same "
-        "actions"
+        "episode 1 of seed 4 was dropped after 7 steps: the same actions did not lead to the same observation again"
     ]
     assert second.dropped.tolist() == [False, False, False, True]
     assert second.episode.tolist() == [1, 1, 1, 2]
@@ -239,7 +239,7 @@ def test_an_environment_that_writes_into_one_array_is_stored_as_it_was_then(givi
     assert (saved["observation0"] == 3).all()
 
 
-@pytest.mark.parametrize(("kind", "algorithm"), [(LocalEnvs, "td3"), (WorkerEnvs, "ppo")])
+@pytest.mark.parametrize(("kind", "algorithm"), [long(LocalEnvs, "td3"), (WorkerEnvs, "ppo")])
 def test_a_run_of_two_environments_a_seed_resumes_bit_for_bit(kind, algorithm, small, tmp_path, monkeypatch):
     """In this process, and in processes of their own."""
     monkeypatch.setattr("lare.training.collect_host.WorkerEnvs", kind)
@@ -253,7 +253,7 @@ def test_a_run_of_two_environments_a_seed_resumes_bit_for_bit(kind, algorithm, s
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
-@pytest.mark.parametrize("algorithm", ["qmix", "ippo"])
+@pytest.mark.parametrize("algorithm", ["qmix", long("ippo")])
 def test_many_agents_on_the_host_resume_bit_for_bit(algorithm, small_many, tmp_path, monkeypatch):
     """In the middle of episodes of which the agents remember something, and after somebody has left."""
 

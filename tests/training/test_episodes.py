@@ -28,6 +28,7 @@ from recipes import (
     untrained,
     with_steps,
 )
+from tiers import long
 
 LONG = LENGTHS * 8
 """Lengths of many episodes."""
@@ -73,7 +74,7 @@ def add_all(credit, buffer, config):
 
 
 @pytest.mark.parametrize("env", [None, TOGETHER], ids=["one", "many"])
-@pytest.mark.parametrize("method", ["lare-bayes", "rd-linear"])
+@pytest.mark.parametrize("method", ["lare-bayes", long("rd-linear")])
 def test_sums_are_those_from_scratch_whatever_the_scales_have_been(method, env):
     """Observations grow a hundredfold while they come in."""
     config = config_of(method, capacity=1000) if env is None else config_of(method, "ippo", env, capacity=1000)
@@ -120,7 +121,7 @@ def features_from(buffer, begin, config):
     return common.features(replay.read(buffer, replay.Index(jnp.zeros_like(number), number)), config, 0)
 
 
-@pytest.mark.parametrize("method", ["lare-linear", "lare-rd", "bayes", "lare-signs"])
+@pytest.mark.parametrize("method", [long("lare-linear"), "lare-rd", "bayes", "lare-signs"])
 def test_returns_are_predicted_before_they_are_learned_from(method):
     """The first episodes are not: nothing has been fitted yet. A decoder that descends learns nothing here at all."""
     config, lengths = config_of(method, capacity=1000), (5, 12) * 3
@@ -160,7 +161,7 @@ def scored(learner_config, score, count=60, seed=0):
     return steps._replace(after=steps.after._replace(reward=reward)), factors, of_step, np.array(lengths)
 
 
-@pytest.mark.parametrize("method", ["lare-linear", "lare-bayes", "lare-rd"])
+@pytest.mark.parametrize("method", [long("lare-linear"), "lare-bayes", "lare-rd"])
 @pytest.mark.parametrize("score", ["sum", "average"])
 def test_the_form_of_the_score_is_found_out(method, score):
     config = config_of(method, capacity=2000)
@@ -194,7 +195,7 @@ def test_one_form_is_fitted_where_it_makes_no_difference():
     assert config_of("lare-signs").forms == config_of("dense").forms == (0,)
 
 
-@pytest.mark.parametrize("method", ["lare-bayes", "lare-rd"])
+@pytest.mark.parametrize("method", ["lare-bayes", long("lare-rd")])
 def test_seeds_in_lockstep_are_seeds_alone(method):
     """Whose episodes end at other times, so that their turns come at other times."""
     config = config_of(method, "ippo", RIVALS, environments=2, capacity=400)

@@ -10,6 +10,7 @@ from lare.credit.words import entry_names, words
 from lare.latent.function import verified
 from lare.tasks.spec import read_task
 from lare.training.explain import explanation_of
+from tiers import long
 from toys import Ear, toy_spec
 
 
@@ -105,7 +106,7 @@ def test_entries_have_the_names_that_the_tasks_text_gives_them():
     ]
 
 
-@pytest.mark.parametrize("method", ["lare-bayes", "lare-rd", "rrdu"])
+@pytest.mark.parametrize("method", ["lare-bayes", long("lare-rd"), long("rrdu")])
 def test_a_run_is_explained(method, small, tmp_path):
     source = "def evaluation_func(o, a):\n    return [o[:, 0:1] * a[:, 0:1], o[:, 1:2]]\n"
     function = verified(source, toy_spec()) if method != "rrdu" else None

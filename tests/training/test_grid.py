@@ -11,16 +11,16 @@ from lare.errors import LareError
 from lare.latent.function import verified
 from lare.tasks.spec import read_task
 from lare.training import session as sessions
+from tiers import long
 from toys import pick_spec, toy_spec
 
 GRID = [("td3", method) for method in METHODS]
-GRID += [
-    ("ippo", method) for method in ("dense", "episodic", "rrdu", "diaster", "lare-bayes", "lare-rd-shared", "arel")
-]
-GRID += [
-    ("qmix", method) for method in ("dense", "ircr", "rrdu", "diaster", "lare-rd", "lare-bayes", "llm-reward", "stas")
-]
-GRID += [("ppo", method) for method in ("dense", "rrdu", "diaster", "arel", "lare-linear")]
+GRID += [("ippo", method) for method in ("diaster", "lare-bayes", "arel")]
+GRID += [long("ippo", method) for method in ("dense", "episodic", "rrdu", "lare-rd-shared")]
+GRID += [("qmix", method) for method in ("ircr", "rrdu", "lare-rd")]
+GRID += [long("qmix", method) for method in ("dense", "diaster", "lare-bayes", "llm-reward", "stas")]
+GRID += [("ppo", method) for method in ("arel", "lare-linear")]
+GRID += [long("ppo", method) for method in ("dense", "rrdu", "diaster")]
 """Every method runs with one algorithm, the cheapest. The other rows are pairs: each kind of reward (as paid, by a decoder, by the
 function itself), each way to fit, raw features and factors meet each way to consume steps. The methods of one kind differ only
 in decoder and features, and these do not depend on the algorithm; `test_learner.py` tests them with many agents. ppo is ippo with
@@ -83,15 +83,15 @@ def test_every_method_trains_and_reports_or_is_refused(method, kind, small, smal
 
 
 @pytest.mark.parametrize(
-    ("kind", "method"), [("ddpg", "rrdu"), ("sac", "lare-rrdu"), ("sac", "diaster"), ("vdn", "lare-rd")]
+    ("kind", "method"), [long("ddpg", "rrdu"), long("sac", "lare-rrdu"), ("sac", "diaster"), ("vdn", "lare-rd")]
 )
 def test_the_other_algorithms(kind, method, small, small_many, tmp_path):
     line = trained(kind, method, small, small_many, tmp_path / "run").metrics()[-1]
     assert np.isfinite(line["critic/loss"])
 
 
-OF_STATE = [("observation", method) for method in ("lare-rrdu", "arel")]
-OF_STATE += [("state", method) for method in ("rrdu", "lare-linear", "stas", "lare-rd-shared")]
+OF_STATE = [long("observation", "lare-rrdu"), ("observation", "arel")]
+OF_STATE += [("state", "lare-linear"), long("state", "rrdu"), ("state", "stas"), ("state", "lare-rd-shared")]
 
 
 @pytest.mark.parametrize(("judged_from", "method"), OF_STATE)

@@ -34,6 +34,7 @@ from recipes import (
     untrained,
     with_steps,
 )
+from tiers import long
 
 ENDS = np.cumsum(LENGTHS)[:-1]
 MANY = partial(config_of, algorithm="ippo", env=TOGETHER)
@@ -118,7 +119,7 @@ def test_the_unbiased_loss_has_the_expectation_of_the_full_one_for_episodes_of_a
     assert losses["rrd"] > 1.025 * want
 
 
-@pytest.mark.parametrize("method", ["rd", "rrd", "rrdu", "vib-rd", "vib-rrdu"])
+@pytest.mark.parametrize("method", ["rd", long("rrd"), "rrdu", long("vib-rd"), long("vib-rrdu")])
 def test_padding_counts_for_nothing(method):
     config = config_of(method)
     learner = stored(config)
@@ -236,7 +237,7 @@ def says_its_factor(learner, signs):
 # Several environments.
 
 
-@pytest.mark.parametrize("method", ["rd", "rrdu", "lare-linear", "lare-rd", "ircr"])
+@pytest.mark.parametrize("method", [long("rd"), "rrdu", "lare-linear", long("lare-rd"), "ircr"])
 def test_two_environments_are_one_twice_as_long(method):
     """The same episodes, collected side by side or one after the other: the same statistics, the same rewards, the same fit."""
     wide, long = config_of(method, environments=2), config_of(method)
@@ -374,7 +375,7 @@ def test_a_closed_form_takes_the_mean_over_steps_and_over_agents_who_are_there()
         check_closed_form(credit, np.split(np.array(rows), ENDS), np.split(earnings(steps, team), ENDS))
 
 
-@pytest.mark.parametrize("method", ["lare-rd", "lare-rrdu"])
+@pytest.mark.parametrize("method", ["lare-rd", long("lare-rrdu")])
 @pytest.mark.parametrize("fixed_length", [False, True])
 def test_must_learn_who_earned_what(method, fixed_length):
     """Of two factors one is the true reward of the agent; the decoder is told the mean over agents and steps."""
@@ -523,7 +524,7 @@ def test_credit_of_the_state_is_measured_against_what_the_team_earned():
     assert float(found["credit/correlation"]) == pytest.approx(1, rel=1e-4)
 
 
-@pytest.mark.parametrize(("env", "score"), [(ALONE, "sum"), (TOGETHER, "average")])
+@pytest.mark.parametrize(("env", "score"), [long(ALONE, "sum"), (TOGETHER, "average")])
 def test_optimism_adds_deviations_to_what_is_paid_and_to_nothing_else(env, score):
     algorithm = "td3" if env is ALONE else "ippo"
     plain, hopeful = (

@@ -13,6 +13,7 @@ from lare.tasks.particles.table import TASKS
 from lare.tasks.particles.task import STEPS
 from lare.training import session as sessions
 from lare.training.train import Interrupted
+from tiers import long
 from toys import At, figures
 
 OF_CHOICE = "TriangleArea"
@@ -41,7 +42,7 @@ def test_decoders_are_fitted_before_the_first_update_and_then_every_so_often(sma
     assert (fits, done) == ([0, 100], [0, 50, 100, 150])
 
 
-@pytest.mark.parametrize("task", ["CN-15", "PP-30", "TriangleArea", "CompetitivePP-6"])  # of each kind, and of many
+@pytest.mark.parametrize("task", ["CN-15", "CompetitivePP-6", long("PP-30"), long("TriangleArea")])
 def test_every_particle_task_trains_with_its_recorded_functions(task, small_many, tmp_path):
     run = lare.train(task, small_many(steps=100), out=tmp_path / "run", listeners=[])
     teams, lines = [team.name for team in TASKS[task].teams], run.metrics()
@@ -69,8 +70,8 @@ def test_the_return_is_the_mean_over_the_agents_and_the_sum_is_reported_beside_i
     ("task", "algorithm", "method"),
     [
         ("CompetitivePP-6", "ippo", "lare-linear"),
-        ("echo", "qmix", "lare-rrdu"),
-        ("echo", "ippo", "lare-rd"),
+        long("echo", "qmix", "lare-rrdu"),
+        long("echo", "ippo", "lare-rd"),
     ],
 )
 def test_a_stopped_run_resumes_bit_for_bit(task, algorithm, method, small_many, echo, tmp_path):
@@ -158,7 +159,7 @@ def test_factors_of_the_state(small_many, echo, tmp_path):
     assert run.metrics()[-1]["credit/error"] is not None
 
 
-@pytest.mark.parametrize(("algorithm", "method"), [("qmix", "dense"), ("qmix", "lare-rd"), ("ippo", "lare-bayes")])
+@pytest.mark.parametrize(("algorithm", "method"), [long("qmix", "dense"), ("qmix", "lare-rd"), ("ippo", "lare-bayes")])
 def test_must_learn_to_do_as_it_is_told(algorithm, method, echo, tmp_path):
     """Somebody who guesses is right at less than half of the steps; an episode has 3 to 6 of them, 4.5 on average."""
     quick = {"hidden": 16, "embed": 8, "hypernet": 8, "learning_rate": 5e-3, "batch_size": 32, "epsilon_steps": 2000}

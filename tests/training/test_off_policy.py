@@ -12,7 +12,7 @@ from lare.credit.settings import CreditSettings
 from lare.data import replay
 from lare.training import learner as common
 from lare.training import off_policy
-from lare.training.compiled import compiled, new_learners
+from lare.training.compiled import compiled
 from recipes import ALONE, config_of, factors_for, paid_by, steps_of, stored, untrained, with_steps
 
 
@@ -75,7 +75,7 @@ def test_seeds_in_lockstep_are_seeds_alone():
     config = config_of("lare-rrdu")
     functions = compiled(config)
     keys = jax.vmap(jax.random.key)(jnp.arange(3))
-    start, steps = jax.jit(partial(new_learners, config=config))(keys), steps_of()
+    start, steps = functions.init(keys), steps_of()
     many, factors = (
         jax.tree.map(lambda leaf: np.stack([leaf] * 3), part) for part in (steps, factors_for(config, steps))
     )

@@ -11,7 +11,7 @@ import pytest
 from lare.normalise import standardise
 from lare.training import learner as common
 from lare.training import on_policy
-from lare.training.compiled import compiled, new_learners
+from lare.training.compiled import compiled
 from recipes import (
     ALONE,
     LENGTHS,
@@ -27,6 +27,7 @@ from recipes import (
     untrained,
     with_steps,
 )
+from tiers import long
 
 ppo = partial(config_of, algorithm="ppo", rollout_steps=20)
 ippo = partial(config_of, algorithm="ippo", rollout_steps=20)
@@ -201,12 +202,12 @@ def test_agents_that_have_left_change_nothing():
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize(("algorithm", "env"), [("ppo", ALONE), ("ippo", RIVALS)])
+@pytest.mark.parametrize(("algorithm", "env"), [long("ppo", ALONE), ("ippo", RIVALS)])
 def test_seeds_in_lockstep_are_seeds_alone(algorithm, env):
     config = config_of("lare-rd", algorithm, env, rollout_steps=TOTAL, environments=2)
     functions = compiled(config)
     keys = jax.vmap(jax.random.key)(jnp.arange(3))
-    start, steps = jax.jit(partial(new_learners, config=config))(keys), steps_of(env, 2)
+    start, steps = functions.init(keys), steps_of(env, 2)
     many, factors = (
         jax.tree.map(lambda leaf: np.stack([leaf] * 3), part) for part in (steps, factors_for(config, steps))
     )

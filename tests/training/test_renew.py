@@ -130,7 +130,7 @@ def test_many_agents(small_many, tmp_path):
         (
             {"method": "lare-linear"},
             Says(),
-            "reflect_every is for lare-bayes, whose decoder is right at once when phi changes; the ",
+            "reflect_every is for lare-bayes, whose decoder is fitted at once when phi changes; the ",
         ),
         ({"reflect_every": 100}, Says(), "reflect_every = 100 is not a multiple of rollout_steps = 12: take 96"),
         ({}, None, "reflect_every asks a language model: say which one with --model NAME (model=... in Python)"),

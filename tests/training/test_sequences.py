@@ -13,8 +13,9 @@ from lare.data.sampling import episodes_at, sample_distinct_episodes
 from lare.normalise import standardise
 from lare.training import learner as common
 from lare.training import sequences
-from lare.training.compiled import compiled, new_learners
+from lare.training.compiled import compiled
 from recipes import LENGTHS, TOGETHER, TOTAL, config_of, factors_for, paid_by, steps_of, stored, untrained, with_steps
+from tiers import long
 
 qmix = partial(config_of, algorithm="qmix", env=TOGETHER, environments=2)
 
@@ -33,7 +34,7 @@ def episodes_of(steps):
     return [[np.arange(a, b) for a, b in zip([0, *of_env], of_env, strict=False)] for of_env in ends]
 
 
-@pytest.mark.parametrize("method", ["episodic", "lare-rd"])
+@pytest.mark.parametrize("method", ["lare-rd", long("episodic")])
 def test_episodes_against_the_steps_that_were_stored(method):
     config, steps = qmix(method), steps_of(TOGETHER, 2)
     learner = stored(config)
@@ -103,7 +104,7 @@ def improved(config, learner, steps, key=0):
     return improve(one_seed(learner), one_seed(steps), jax.random.key(key)[None], jnp.array(0))
 
 
-@pytest.mark.parametrize("method", ["dense", "lare-rrdu", "lare-rd"])
+@pytest.mark.parametrize("method", [long("dense"), long("lare-rrdu"), "lare-rd"])
 def test_as_many_updates_as_episodes_are_worth(method):
     config, steps = qmix(method), steps_of(TOGETHER, 2)
     learner = stored(config)
@@ -149,7 +150,7 @@ def test_seeds_in_lockstep_are_seeds_alone():
     """Also where they have had a different number of updates, and batches of different length."""
     config = qmix("lare-rrdu", rollout_steps=TOTAL)
     functions, keys = compiled(config), jax.vmap(jax.random.key)(jnp.arange(2))
-    start = jax.jit(partial(new_learners, config=config))(keys)
+    start = functions.init(keys)
     of_each = [steps_of(TOGETHER, 2, seed) for seed in (0, 1)]
     goes_on = of_each[1].after.truncated.copy()
     goes_on[np.cumsum(LENGTHS)[0] - 1, 0] = goes_on[TOTAL - 1] = False

@@ -1,1 +1,1 @@
-"""Reinforcement learning: knows rewards, never where they come from."""
+"""Reinforcement learning algorithms. They receive rewards, and do not know which method computed them."""

@@ -1,7 +1,6 @@
-"""What the algorithms that learn from a replay share: hyperparameters, the transitions they read, and critics Q(s, a).
+"""Shared by the algorithms that learn from a replay: the transitions that they read, and critics Q(s, a).
 
-The algorithms know rewards, never where they come from. Actions lie in [-1, 1] in every dimension; whoever talks to the
-environment rescales them.
+Actions lie in [-1, 1] in every dimension; the code that steps the environment rescales them.
 """
 
 from typing import NamedTuple
@@ -22,7 +21,7 @@ class Transitions(NamedTuple):
     reward: Float[Array, " batch"]
     next_observation: Float[Array, "batch observation"]
     continues: Float[Array, " batch"]
-    """0 where the episode terminated, else 1: the end of the time is not a termination, the bootstrap goes on."""
+    """0 where the episode terminated, else 1. A time limit is not a termination: the target still bootstraps there."""
 
 
 def critics(key: PRNGKeyArray, observation_size: int, action_size: int, hidden: tuple[int, ...], count: int) -> MLP:

@@ -1,10 +1,10 @@
-"""What the agents' values are worth together: QMIX's mixer (Rashid et al., 2018) and VDN's sum (Sunehag et al., 2018).
+"""From the agents' values to the team's value: QMIX's mixer (Rashid et al., 2018) and VDN's sum (Sunehag et al., 2018).
 
     Q_tot = elu(q |W_1(s)| + b_1(s)) . |w_2(s)| + b_2(s)        QMIX
     Q_tot = sum_i q_i                                           VDN
 
-Either grows with the value of every agent, so that each agent's best action is its part of the best joint action. QMIX's
-weights may depend on the state as they like, since networks of the state, the hypernetworks, write them.
+Both increase with the value of every agent, so that each agent's best action is its part of the best joint action. QMIX's
+weights are the outputs of networks of the state, the hypernetworks, and may depend on the state in any way.
 """
 
 import equinox as eqx
@@ -16,13 +16,13 @@ from lare.networks import MLP, Linear
 
 
 class Mixer(eqx.Module):
-    """The hypernetworks. All but b_1's have a hidden layer: b_2's is as wide as the mixer, the others' as `hypernet` says."""
+    """The hypernetworks. That of b_1 is linear. The others have one hidden layer, of width `embed` for b_2, else `hypernet`."""
 
     first: MLP
-    """W_1, before its sign is taken away."""
+    """W_1, before the absolute value is taken."""
     first_bias: Linear
     second: MLP
-    """w_2, likewise."""
+    """w_2, before the absolute value is taken."""
     second_bias: MLP
 
     def __init__(self, agents: int, state_size: int, embed: int, hypernet: int, *, key: PRNGKeyArray):
@@ -45,5 +45,5 @@ class Mixer(eqx.Module):
 def mixed(
     mixer: Mixer | None, value: Float[Array, "*batch agents"], state: Float[Array, "*batch state"]
 ) -> Float[Array, "*batch"]:
-    """Q_tot; without a mixer the sum."""
+    """Q_tot; without a mixer, the sum of the values."""
     return jnp.sum(value, axis=-1) if mixer is None else mixer(value, state)

@@ -1,4 +1,4 @@
-"""Policies that draw their actions: from a Gaussian, or from the choices that are available."""
+"""Stochastic policies: Gaussian for continuous actions, categorical over the available choices for discrete ones."""
 
 import equinox as eqx
 import jax
@@ -8,16 +8,16 @@ from jaxtyping import Array, Bool, Float
 from lare.networks import MLP
 
 Available = Bool[Array, "*batch action"] | None
-"""Which choices there are; all of them, and all continuous actions, where None."""
+"""Which choices are available. None: all of them, or the actions are continuous."""
 
 UNAVAILABLE = -1e9
-"""The logit of a choice that there is not."""
+"""The logit of an unavailable choice."""
 
 
 class StochasticPolicy(eqx.Module):
-    """A Gaussian of constant deviation, or, without one, a choice among the entries of the action.
+    """A Gaussian whose standard deviation does not depend on the state, or, without one, a choice among the action's entries.
 
-    A choice is a row with a single 1, so that every action is a row of numbers. Observations are as the network is given them.
+    A choice is a one-hot row, so that every action is a row of numbers. Observations are already normalised, if they are at all.
     """
 
     network: MLP
@@ -26,7 +26,7 @@ class StochasticPolicy(eqx.Module):
     def logits(
         self, observation: Float[Array, "*batch observation"], available: Available
     ) -> Float[Array, "*batch action"]:
-        """Of each choice; so low where it is not available that its probability is 0."""
+        """The logit of each choice. That of an unavailable choice is so low that its probability is 0."""
         out = self.network(observation)
         return out if available is None else jnp.where(available, out, UNAVAILABLE)
 
@@ -36,7 +36,7 @@ class StochasticPolicy(eqx.Module):
         action: Float[Array, "*batch action"],
         available: Available = None,
     ) -> Float[Array, "*batch"]:
-        """Of the action: log pi(a | s)."""
+        """The log probability of the action, log pi(a | s)."""
         if self.log_deviation is None:
             return jnp.sum(action * jax.nn.log_softmax(self.logits(observation, available)), axis=-1)
         scaled = (action - self.network(observation)) * jnp.exp(-self.log_deviation)
@@ -45,7 +45,7 @@ class StochasticPolicy(eqx.Module):
     def entropy(
         self, observation: Float[Array, "*batch observation"], available: Available = None
     ) -> Float[Array, "*batch"]:
-        """-E log pi(a | s)."""
+        """The entropy, -E log pi(a | s)."""
         if self.log_deviation is None:
             log = jax.nn.log_softmax(self.logits(observation, available))
             return -jnp.sum(jnp.exp(log) * log, axis=-1)
@@ -58,7 +58,7 @@ class StochasticPolicy(eqx.Module):
         noise: Float[Array, "*batch action"],
         available: Available = None,
     ) -> Float[Array, "*batch action"]:
-        """The action that noise decides on: standard normal noise, or Gumbel's, whose largest sum is a choice."""
+        """The action for the given noise: standard normal, or, for choices, Gumbel (the largest logit plus noise is chosen)."""
         if self.log_deviation is None:
             logits = self.logits(observation, available)
             return jax.nn.one_hot(jnp.argmax(logits + noise, axis=-1), logits.shape[-1])

@@ -5,12 +5,12 @@
     rho     = pi(a | s) / pi_old(a | s)
     theta  <- ascend  mean min(rho A, clip(rho, 1 - c, 1 + c) A)  -  v * value loss  +  e * entropy
 
-Independent PPO (de Witt et al., 2020) lets all agents share one actor and one critic, each judging by what it observes
-itself: to this file an agent is one more lane of the rollout. The algorithm knows rewards, never where they come from.
-Where an agent has left, its `mask` is 0 and its steps count nowhere.
+In independent PPO (de Witt et al., 2020) all agents share one actor and one critic, which see one agent's own observation
+at a time. In this file an agent is therefore one more lane of the rollout. After an agent has left, its `mask` is 0 and its
+steps are ignored.
 
-The critic predicts returns in units of their running mean and deviation (Yu et al., 2022), and advantages are normalised
-over the rollout, so rewards of any scale train alike.
+The critic predicts returns standardised by their running mean and deviation (Yu et al., 2022), and advantages are
+normalised over the rollout, so that the scale of the rewards does not matter.
 """
 
 from typing import NamedTuple
@@ -37,10 +37,10 @@ class PPO(NamedTuple):
     params: Networks
     optimizer: optax.OptState
     returns: RunningMeanStd
-    """Of the returns that the critic was fitted to."""
+    """Running statistics of the returns that the critic was fitted to."""
     observations: RunningMeanStd | None
-    """What the networks' observations are normalised by; None where they are not. A rollout is added to it after it has been
-    learned from, so that the policy that is updated is the policy that acted."""
+    """Running statistics that normalise the networks' observations; None if these are not normalised. A rollout is added only
+    after the update on it, so that the policy that is updated is the policy that acted."""
 
 
 class Actor(NamedTuple):
@@ -51,40 +51,40 @@ class Actor(NamedTuple):
 
 
 class Rollout(NamedTuple):
-    """What the newest policy met. A lane is one agent in one environment."""
+    """The steps that the newest policy took. A lane is one agent in one environment."""
 
     observation: Float[Array, "time lanes observation"]
     action: Float[Array, "time lanes action"]
     reward: Float[Array, "time lanes"]
     next_observation: Float[Array, "time lanes observation"]
     continues: Float[Array, "time lanes"]
-    """0 where the episode terminated, else 1: the bootstrap goes on."""
+    """0 where the episode terminated, else 1, where the target bootstraps."""
     ended: Float[Array, "time lanes"]
-    """1 at the last step of an episode, terminated or out of time, and at an agent's own last step."""
+    """1 at the last step of an episode, terminated or truncated, and at an agent's own last step."""
     available: Bool[Array, "time lanes action"] | None = None
-    """Which choices there were; all of them where None."""
+    """Which choices were available. None: all of them."""
     mask: Float[Array, "time lanes"] | None = None
-    """1 where the agent acted, 0 where it had left; all 1 where None."""
+    """1 where the agent acted, 0 where it had left. None: all 1."""
 
 
 class Minibatch(NamedTuple):
-    """Steps of agents, and what is to be learned from them."""
+    """Steps of agents, with the advantages and the targets that an update fits."""
 
     observation: Float[Array, "batch observation"]
     action: Float[Array, "batch action"]
     log_probability: Float[Array, " batch"]
-    """Of the action, by the policy that took it."""
+    """The log probability of the action under the policy that took it."""
     advantage: Float[Array, " batch"]
     value: Float[Array, " batch"]
-    """What the critic said before the update, as it said it: that is what may move by no more than `value_clip`."""
+    """The critic's output before the update, in the critic's units. The update clips changes of it to `value_clip`."""
     target: Float[Array, " batch"]
-    """In deviations of the return, the newest included."""
+    """The returns, standardised by statistics that include them."""
     available: Bool[Array, "batch action"] | None
     mask: Float[Array, " batch"] | None
 
 
 def init(key: PRNGKeyArray, observation_size: int, action_size: int, discrete: bool, settings: PPOSettings) -> PPO:
-    """Orthogonal weights, a policy that hardly prefers anything yet, values near 0."""
+    """Orthogonal weights. The first policy hardly prefers any action, and the first values are near 0."""
     actor_key, critic_key, *keys = jax.random.split(key, 4)
     actor = MLP(observation_size, settings.hidden, action_size, key=actor_key, activation=jnp.tanh)
     critic = MLP(observation_size, settings.hidden, 1, key=critic_key, activation=jnp.tanh)
@@ -95,14 +95,14 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, discrete: b
 
 
 def actor_of(state: PPO) -> Actor:
-    """What acts."""
+    """The parts of the state that are needed to act."""
     return Actor(state.params.actor, state.observations)
 
 
 def shown(
     observation: Float[Array, "*batch observation"], observations: RunningMeanStd | None
 ) -> Float[Array, "*batch observation"]:
-    """Observations as the networks are given them."""
+    """Observations as the networks receive them: normalised, if there are statistics."""
     return observation if observations is None else standardise_if_known(observations, observation)
 
 
@@ -119,7 +119,7 @@ def explore(
     available: Available,
     noise: Float[Array, "*batch action"],
 ) -> Float[Array, "*batch action"]:
-    """An action of the policy, drawn by given noise."""
+    """An action sampled from the policy with the given noise."""
     return actor.policy.sample(shown(observation, actor.observations), noise, available)
 
 
@@ -129,7 +129,7 @@ def values(state: PPO, observation: Float[Array, "*batch observation"]) -> Float
 
 
 def unit(returns: RunningMeanStd) -> Float[Array, " 1"]:
-    """What values are measured in: the deviation of the returns, or 1 as long as they have none."""
+    """The scale of the critic's values: the standard deviation of the returns, or 1 while that is 0."""
     spread = deviation(returns)
     return jnp.where(spread > 0, spread, 1)
 
@@ -140,7 +140,7 @@ def advantages(
     next_value: Float[Array, "time lanes"],
     settings: PPOSettings,
 ) -> Float[Array, "time lanes"]:
-    """Generalised advantage estimates (Schulman et al., 2016, Eq. 16), each lane backwards through time."""
+    """Generalised advantage estimates (Schulman et al., 2016, Eq. 16), computed backwards through time in each lane."""
     delta = rollout.reward + settings.gamma * rollout.continues * next_value - value
     carried = settings.gamma * settings.gae_lambda * (1 - rollout.ended)
 
@@ -173,7 +173,7 @@ def value_loss(
     settings: PPOSettings,
     mask: Float[Array, " batch"] | None = None,
 ) -> Float[Array, ""]:
-    """Mean of the worse of two Huber losses: that of the value, and that of the value kept near the old one."""
+    """Mean of the larger of two Huber losses: that of the value, and that of the value clipped to `value_clip` of the old one."""
     near = old + jnp.clip(value - old, -settings.value_clip, settings.value_clip)
     losses = (optax.huber_loss(guess, target, delta=settings.huber_delta) for guess in (value, near))
     return masked_mean(jnp.maximum(*losses), mask)
@@ -219,7 +219,7 @@ def update(
 
 
 def after_rollout(observations: RunningMeanStd | None, rollout: Rollout) -> RunningMeanStd | None:
-    """What observations are normalised by from now on."""
+    """The statistics of the observations, with the rollout added."""
     if observations is None:
         return None
     rows = rollout.observation.reshape(-1, rollout.observation.shape[-1])
@@ -227,8 +227,8 @@ def after_rollout(observations: RunningMeanStd | None, rollout: Rollout) -> Runn
 
 
 def prepare(state: PPO, rollout: Rollout, settings: PPOSettings) -> tuple[Minibatch, RunningMeanStd, Float[Array, ""]]:
-    """All steps of all agents as one batch; the statistics of their returns, these added; the share of the returns' variance
-    that the critic knew.
+    """All steps of all agents as one batch; the statistics of the returns, with theirs added; the share of the returns'
+    variance that the critic explained.
     """
     before, after = (shown(rows, state.observations) for rows in (rollout.observation, rollout.next_observation))
     value, next_value = values(state, before), values(state, after)
@@ -255,7 +255,7 @@ def masked_variance(values: Float[Array, "*batch"], mask: Float[Array, "*batch"]
 
 
 def minibatches(key: PRNGKeyArray, steps: int, settings: PPOSettings) -> Int[Array, "updates batch"]:
-    """Which steps each gradient step reads: in every epoch all of them once, but for a remainder that fills no batch."""
+    """The steps that each gradient step reads. An epoch reads all steps once, except a remainder that does not fill a batch."""
     size = min(settings.minibatch_size, steps)
     count = steps // size
     orders = jax.vmap(lambda key: jax.random.permutation(key, steps))(jax.random.split(key, settings.epochs))

@@ -1,8 +1,8 @@
-"""The agent network of QMIX: what one agent's actions are worth, by all that it has observed (Rashid et al., 2018).
+"""The agent network of QMIX: the values of one agent's actions, given all that it has observed (Rashid et al., 2018).
 
     u_t = relu(x_t A + a)        h_t = GRU(u_t, h_{t-1}), h_{-1} = 0        Q_t = h_t B + b
 
-All agents share it; x_t says which of them is asked.
+All agents share it; x_t includes the agent's index.
 """
 
 import equinox as eqx
@@ -16,7 +16,7 @@ from lare.networks import GRU, Linear
 class Recurrent(eqx.Module):
     """Linear, ReLU, GRU, Linear.
 
-    The GRU's input is as wide as its memory, so that all of its parameters start uniform in ±1/sqrt(width), as PyTorch's do.
+    The GRU's input is as wide as its memory, so that all its parameters start uniform in ±1/sqrt(width), as in PyTorch.
     """
 
     encoder: Linear
@@ -30,18 +30,18 @@ class Recurrent(eqx.Module):
         self.decoder = Linear(hidden, out_size, key=decoder_key)
 
     def given(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch three"]:
-        """What the GRU takes from the input, whatever it remembers."""
+        """The part of the GRU's step that depends on the input alone."""
         return self.memory.given(jax.nn.relu(self.encoder(x)))
 
     def __call__(
         self, x: Float[Array, "*batch in"], h: Float[Array, "*batch hidden"]
     ) -> tuple[Float[Array, "*batch out"], Float[Array, "*batch hidden"]]:
-        """One step: the output, and what is remembered."""
+        """One step: the output, and the new memory."""
         h = self.memory(self.given(x), h)
         return self.decoder(h), h
 
     def unroll(self, x: Float[Array, "time *batch in"]) -> Float[Array, "time *batch out"]:
-        """All steps from nothing remembered. Only the products with the memory have to wait for each other."""
+        """All steps, from an empty memory. Only the products with the memory are computed one step after the other."""
 
         def one(h: Float[Array, "*batch hidden"], given: Float[Array, "*batch three"]):
             h = self.memory(given, h)

@@ -7,7 +7,7 @@
     alpha <- descend -alpha mean (log pi(a | s) + H),  H = -dim(A)      Eq. 18
     Q'   <- (1 - tau) Q' + tau Q                                        every target_every-th update
 
-The policy is a normal distribution through a tanh, pi = tanh(N(mu(s), sigma(s))), in [-1, 1].
+The policy is a normal distribution squashed by a tanh, pi = tanh(N(mu(s), sigma(s))), in [-1, 1].
 """
 
 from typing import NamedTuple
@@ -27,7 +27,7 @@ SMALLEST_LOG, LARGEST_LOG = -20.0, 2.0
 
 class Networks(NamedTuple):
     actor: MLP
-    """To mu and log sigma of each dimension of the action."""
+    """From observations to mu and log sigma of each dimension of the action."""
     critics: MLP
     """All critics in one pytree, stacked on a leading axis."""
     log_temperature: Float[Array, ""]
@@ -38,7 +38,7 @@ class SAC(NamedTuple):
 
     online: Networks
     target: MLP
-    """Of the critics."""
+    """The target critics."""
     actor_optimizer: optax.OptState
     critic_optimizer: optax.OptState
     temperature_optimizer: optax.OptState
@@ -49,7 +49,7 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, settings: S
     actor = MLP(observation_size, settings.hidden, 2 * action_size, key=actor_key)
     made = critics(critic_key, observation_size, action_size, settings.hidden, settings.critics)
     online = Networks(actor, made, jnp.log(jnp.asarray(settings.temperature)))
-    # The targets are copies: two names for one buffer could not be donated to the compiled update.
+    # The targets are copies, because one buffer cannot be donated twice to the compiled update.
     target = jax.tree.map(jnp.copy, made)
     return SAC(online, target, *(start_adam(part, settings.learning_rate) for part in online))
 
@@ -73,7 +73,7 @@ def explore(
     noise: Float[Array, "*batch action"],
     settings: SACSettings,
 ) -> Float[Array, "*batch action"]:
-    """An action of the policy, drawn by standard normal noise."""
+    """An action sampled from the policy with standard normal noise."""
     mean, log_sigma = normal(actor, observation)
     return jnp.tanh(mean + jnp.exp(log_sigma) * noise)
 
@@ -81,9 +81,9 @@ def explore(
 def sample(
     actor: MLP, observation: Float[Array, "batch observation"], key: PRNGKeyArray
 ) -> tuple[Float[Array, "batch action"], Float[Array, " batch"]]:
-    """Actions, and log pi of them: the normal density less the log slope of the tanh (appendix C, Eq. 21).
+    """Actions and their log pi: the log of the normal density minus the log slope of the tanh (appendix C, Eq. 21).
 
-    log(1 - tanh(u)^2) is written as 2 (log 2 - u - softplus(-2u)), which does not lose its digits for large u.
+    log(1 - tanh(u)^2) is written as 2 (log 2 - u - softplus(-2u)), which keeps its precision for large u.
     """
     mean, log_sigma = normal(actor, observation)
     noise = jax.random.normal(key, mean.shape)
@@ -94,7 +94,7 @@ def sample(
 
 
 def target_values(state: SAC, batch: Transitions, key: PRNGKeyArray, settings: SACSettings) -> Float[Array, " batch"]:
-    """y: the smallest of the target critics' values and the entropy, at an action of the policy."""
+    """y: the reward, plus the discounted smallest target value with its entropy term, at an action sampled from the policy."""
     action, log_pi = sample(state.online.actor, batch.next_observation, key)
     future = jnp.min(values(state.target, batch.next_observation, action), axis=0)
     soft = future - jnp.exp(state.online.log_temperature) * log_pi
@@ -104,9 +104,9 @@ def target_values(state: SAC, batch: Transitions, key: PRNGKeyArray, settings: S
 def update(
     state: SAC, batch: Transitions, key: PRNGKeyArray, number: Int[Scalar, ""], settings: SACSettings
 ) -> tuple[SAC, dict[str, Float[Array, ""]]]:
-    """One update of critics, actor and temperature, and at every `target_every`-th of the target critics.
+    """One update of critics, actor and temperature. Every `target_every`-th update also moves the target critics.
 
-    `number`, from 0, is an argument, not a counter in the state, so that under `vmap` over seeds it stays one value.
+    `number` counts updates from 0. It is an argument, not part of the state, so that `vmap` over seeds keeps it a single value.
     """
     rate = settings.learning_rate
     target_key, key = jax.random.split(key)

@@ -1,6 +1,6 @@
 """The hyperparameters of the algorithms; their published values for each row are in `table.py`.
 
-They are apart from the equations, which need JAX: the command line reads these classes to write its help.
+They are kept apart from the equations, which need JAX, because the command line reads these classes to write its help.
 """
 
 from typing import Annotated
@@ -16,15 +16,15 @@ class OffPolicySettings(Checked):
     hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of actor and critics."""
     critics: Annotated[int, Field(ge=1)] = 2
-    """How many there are; the smallest of their values counts."""
+    """Number of critics. The target uses the smallest of their values."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
-    """Adam's step size, for all that is learned."""
+    """Learning rate of Adam, for all networks."""
     batch_size: Annotated[int, Field(ge=1)] = 256
     """Transitions in one update."""
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
-    """Discount of a step."""
+    """Discount factor."""
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
-    """How far the targets move towards the networks at a time."""
+    """Fraction of the way that the target networks move towards the online networks at a time."""
     warmup: Annotated[int, Field(ge=0)] = 10_000
     """Environment steps with uniformly random actions before the first update."""
 
@@ -46,9 +46,9 @@ class SACSettings(OffPolicySettings):
     """Hyperparameters, as the LaRe paper sets them."""
 
     target_every: Annotated[int, Field(ge=1)] = 2
-    """Updates from one move of the target critics to the next."""
+    """Number of updates between two moves of the target critics."""
     temperature: Annotated[float, Field(gt=0)] = 1.0
-    """alpha at the start."""
+    """Temperature alpha at the start."""
 
 
 class PPOSettings(Checked):
@@ -57,31 +57,31 @@ class PPOSettings(Checked):
     hidden: tuple[Annotated[int, Field(ge=1)], ...] = (64, 64)
     """Widths of the hidden layers of actor and critic."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
-    """Adam's step size, for actor and critic."""
+    """Learning rate of Adam, for actor and critic."""
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
-    """Discount of a step."""
+    """Discount factor."""
     gae_lambda: Annotated[float, Field(ge=0, le=1)] = 0.95
-    """Of the generalised advantage estimates: 0 trusts the critic, 1 the rewards."""
+    """Lambda of the generalised advantage estimates: 0 relies on the critic, 1 on the rewards."""
     epochs: Annotated[int, Field(ge=1)] = 10
-    """How often an update goes over its rollout."""
+    """Number of passes over the rollout in one update."""
     minibatch_size: Annotated[int, Field(ge=1)] = 64
-    """Steps of one agent in one gradient step."""
+    """Steps in one gradient step; a step of each agent counts by itself."""
     clip: Annotated[float, Field(gt=0)] = 0.2
-    """How far the probability ratio may move."""
+    """How far the probability ratio may move from 1."""
     value_clip: Annotated[float, Field(gt=0)] = 0.5
-    """How far the value may move in one update, in deviations of the return."""
+    """How far the value may move in one update, in standard deviations of the return."""
     value_coef: Annotated[float, Field(ge=0)] = 0.5
-    """Of the value loss beside the policy's."""
+    """Coefficient of the value loss."""
     entropy_coef: Annotated[float, Field(ge=0)] = 0.0
-    """Of the policy's entropy beside its objective."""
+    """Coefficient of the entropy bonus."""
     huber_delta: Annotated[float, Field(gt=0)] = 10.0
-    """Where the value loss turns from square to linear, in deviations of the return."""
+    """Error at which the value loss turns from quadratic to linear, in standard deviations of the return."""
     max_grad_norm: Annotated[float, Field(gt=0)] = 0.5
-    """What the gradient of actor and critic together is cut down to."""
+    """Largest norm of the gradient of actor and critic together; a larger gradient is scaled down to it."""
     anneal: bool = False
     """Let learning rate and clip fall linearly to 0 over the run."""
     normalise_observations: bool = False
-    """Let the networks see observations by their running mean and deviation."""
+    """Normalise the networks' observations by their running mean and standard deviation."""
 
 
 class QMIXSettings(Checked):
@@ -94,24 +94,24 @@ class QMIXSettings(Checked):
     embed: Annotated[int, Field(ge=1)] = 32
     """Width of the mixer."""
     hypernet: Annotated[int, Field(ge=1)] = 64
-    """Width of the hidden layers of the networks that write the mixer's weights."""
+    """Width of the hidden layers of the hypernetworks, which compute the mixer's weights."""
     learning_rate: Annotated[float, Field(gt=0)] = 1e-3
-    """Adam's step size, for all that is learned."""
+    """Learning rate of Adam, for all networks."""
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
-    """Discount of a step."""
+    """Discount factor."""
     td_lambda: Annotated[float, Field(ge=0, le=1)] = 0.6
-    """Of the targets: 0 trusts the target networks, 1 the rewards."""
+    """Lambda of the TD(lambda) targets: 0 relies on the target networks, 1 on the rewards."""
     max_grad_norm: Annotated[float, Field(gt=0)] = 10.0
-    """What the gradient of agents and mixer together is cut down to."""
+    """Largest norm of the gradient of agents and mixer together; a larger gradient is scaled down to it."""
     batch_size: Annotated[int, Field(ge=1)] = 128
     """Episodes in one update."""
     update_every: Annotated[int, Field(ge=1)] = 8
-    """Episodes that are played for one update."""
+    """Number of new episodes for each update."""
     target_every: Annotated[int, Field(ge=1)] = 200
-    """Episodes after which the targets are copied from the networks."""
+    """Number of episodes between two copies of the online networks to the target networks."""
     epsilon_start: Annotated[float, Field(ge=0, le=1)] = 1.0
-    """How often an agent explores at first."""
+    """Probability that an agent explores, at the start."""
     epsilon_end: Annotated[float, Field(ge=0, le=1)] = 0.05
-    """How often it explores at last."""
+    """Probability that an agent explores, at the end."""
     epsilon_steps: Annotated[int, Field(ge=1)] = 100_000
-    """Environment steps over which that falls, linearly."""
+    """Environment steps over which this probability falls linearly."""

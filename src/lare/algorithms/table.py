@@ -1,6 +1,6 @@
-"""The table of algorithms: who learns from the rewards that a method gives.
+"""The table of the reinforcement learning algorithms.
 
-A row is a name with hyperparameters of its own. Two that differ in these alone share their equations: `ddpg` is `td3.py` with one
+A row is a name with its own hyperparameters. Rows that differ only in these share their equations: `ddpg` is `td3.py` with one
 critic, no noise on the target action and no delay; `ippo` is `ppo.py` for all agents at once.
 """
 
@@ -17,21 +17,21 @@ class Consumes(StrEnum):
     """What an update of an algorithm reads."""
 
     TRANSITIONS = "transitions"
-    """Single steps out of a replay of all that was met."""
+    """Single steps from a replay of past steps."""
     ROLLOUTS = "rollouts"
-    """The newest steps, which the newest policy met."""
+    """The newest steps, taken by the newest policy."""
     SEQUENCES = "sequences"
-    """Whole episodes out of a replay."""
+    """Whole episodes from a replay."""
 
 
 class Noise(StrEnum):
-    """What the policy that collects is disturbed by: independent numbers, for each entry of an action."""
+    """The exploration noise: independent random numbers, one for each entry of an action."""
 
     NORMAL = "normal"
     GUMBEL = "gumbel"
-    """By which the largest of the disturbed logits is a choice of the softmax."""
+    """The choice with the largest logit plus noise is a sample from the softmax."""
     UNIFORM = "uniform"
-    """And one more for each agent, which decides whether it explores."""
+    """With one more number for each agent, which decides whether it explores."""
 
 
 @dataclass(frozen=True)
@@ -45,20 +45,20 @@ class Algorithm:
     summary: str
     source: str
     continuous: bool = True
-    """Whether it can act by numbers within bounds."""
+    """Whether it supports continuous actions."""
     discrete: bool = True
-    """Whether it can choose."""
+    """Whether it supports discrete actions."""
     one_agent: bool = True
     """Whether it trains a single agent."""
     many_agents: bool = False
     """Whether it trains many agents."""
     many_teams: bool = False
-    """Whether it trains several teams, each for itself."""
+    """Whether it trains several teams, each on its own rewards."""
     greedy: bool = True
     """Whether it is evaluated without noise."""
 
     def noise(self, discrete: bool) -> Noise:
-        """What its exploration draws."""
+        """The kind of exploration noise for continuous or discrete actions."""
         if self.consumes is Consumes.SEQUENCES:
             return Noise.UNIFORM
         return Noise.GUMBEL if discrete else Noise.NORMAL
@@ -126,7 +126,7 @@ TABLE = (
         "vdn",
         Consumes.SEQUENCES,
         VDN,
-        "the same, as their sum",
+        "as qmix, with the sum of the agents' values",
         "Sunehag et al., AAMAS 2018; hyperparameters of PyMARL2",
         continuous=False,
         many_agents=True,

@@ -6,9 +6,8 @@
     pi  <- ascend  mean Q_1(s, pi(s))                       every policy_delay-th update, and then
     Q', pi' <- (1 - tau) (Q', pi') + tau (Q, pi)
 
-With one critic, no noise on the target action and no delay this is DDPG (Lillicrap et al., 2016, algorithm 1), but for its
-noise on the actions that are taken, which is white here. Actions lie in [-1, 1], so that the paper's noise "times the action
-bound" is plain noise.
+With one critic, no noise on the target action and no delay, this is DDPG (Lillicrap et al., 2016, algorithm 1), except that
+the exploration noise is white here. Actions lie in [-1, 1], so that the paper's noise "times the action bound" is plain noise.
 """
 
 from typing import NamedTuple
@@ -43,7 +42,7 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, settings: T
     actor = MLP(observation_size, settings.hidden, action_size, key=actor_key)
 
     online = Networks(actor, critics(critic_key, observation_size, action_size, settings.hidden, settings.critics))
-    # The targets are copies: two names for one buffer could not be donated to the compiled update.
+    # The targets are copies, because one buffer cannot be donated twice to the compiled update.
     target = jax.tree.map(jnp.copy, online)
     rate = settings.learning_rate
     return TD3(online, target, start_adam(online.actor, rate), start_adam(online.critics, rate))
@@ -60,14 +59,14 @@ def explore(
     noise: Float[Array, "*batch action"],
     settings: TD3Settings,
 ) -> Float[Array, "*batch action"]:
-    """The policy, disturbed by standard normal noise."""
+    """The policy's action plus exploration noise, which is scaled from standard normal noise."""
     return jnp.clip(act(actor, observation) + settings.exploration_noise * noise, -1, 1)
 
 
 def target_values(
     target: Networks, batch: Transitions, key: PRNGKeyArray, settings: TD3Settings
 ) -> Float[Array, " batch"]:
-    """y: the smallest of the target critics' values, at the target policy's smoothed action."""
+    """y: the reward, plus the discounted smallest target value at the target policy's action with clipped noise."""
     noise = settings.policy_noise * jax.random.normal(key, batch.action.shape)
     noise = jnp.clip(noise, -settings.noise_clip, settings.noise_clip)
     action = jnp.clip(act(target.actor, batch.next_observation) + noise, -1, 1)
@@ -78,10 +77,10 @@ def target_values(
 def update(
     state: TD3, batch: Transitions, key: PRNGKeyArray, number: Int[Scalar, ""], settings: TD3Settings
 ) -> tuple[TD3, dict[str, Float[Array, ""]]]:
-    """One critic update, and at every `policy_delay`-th one of actor and targets.
+    """One update of the critics. Every `policy_delay`-th update also updates the actor and moves the targets.
 
-    `number`, from 0, is an argument, not a counter in the state, so that under `vmap` over seeds it stays one value for
-    all of them and the delayed half is skipped rather than computed and thrown away.
+    `number` counts updates from 0. It is an argument, not part of the state, so that `vmap` over seeds keeps it a single value
+    and skips the delayed half instead of computing it and throwing it away.
     """
     rate = settings.learning_rate
     target = target_values(state.target, batch, key, settings)

@@ -1,6 +1,6 @@
 """The command line. Each command is one function; its arguments are its options, and tyro writes the help.
 
-What is slow to import is imported by the command that needs it.
+Modules that are slow to import are imported inside the command that needs them.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ from lare.source import source
 
 DESCRIPTION = (
     "Train reinforcement learning on episodic rewards, through latent rewards that a language model wrote. "
-    "lare --version names the code; --debug, with any command, shows where an error came from."
+    "lare --version prints the version of the code; --debug, with any command, prints the traceback of an error."
 )
 COMMANDS = {
     "tasks": tasks,
@@ -47,8 +47,8 @@ COMMANDS = {
 
 
 def main() -> None:
-    """`lare`: a mistake of the user's is one line on stderr and exit status 2 (--debug shows where it came from)."""
-    for stream in (sys.stdout, sys.stderr):  # a terminal that cannot show a letter is no reason to lose a text
+    """`lare`: a user's mistake is one line on stderr and exit status 2 (--debug prints its traceback too)."""
+    for stream in (sys.stdout, sys.stderr):  # so that a character that the terminal cannot show raises no error
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
@@ -69,12 +69,12 @@ def main() -> None:
         sys.exit(130)
     except OSError as error:
         if isinstance(error, BrokenPipeError):
-            # Whoever read the output has read enough. Python would complain again when it flushes at the end.
+            # The reader has closed the pipe. Without this, Python would raise again when it flushes at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(1)
         if debug:
             traceback.print_exc()
         progress(f"lare: {in_a_line(error)}")
-        with contextlib.suppress(OSError):  # what is still to be printed can not be
+        with contextlib.suppress(OSError):  # the output that is still buffered cannot be written either
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(2)

@@ -1,4 +1,4 @@
-"""The design of a latent function, by recorded replies or by a live model."""
+"""The command `design`: a latent function from recorded replies or from a live model."""
 
 import sys
 from collections.abc import Callable
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lare.tasks.spec import TaskSpec
 
 BUDGET, REQUESTS, MINUTES = 400_000, 60, 15.0
-"""Tokens, requests and minutes of waiting of one design, at most."""
+"""The default limits of one design: tokens, requests, and minutes of waiting for the model."""
 
 
 def design(
@@ -48,24 +48,26 @@ def design(
 
     Args:
         task: a shipped name (see `lare tasks`), or the path of a task file.
-        kind: what is asked for: several factors, or one reward.
-        model: whom to ask: "recorded" (the shipped recordings, and the default), the path of a recording (.json), or
-            the name of a model behind an OpenAI-compatible endpoint.
-        base_url: the endpoint (OpenAI's, or that of OPENAI_BASE_URL, unless given); http://localhost:11434/v1 is Ollama's.
+        kind: what the function returns: several factors, or one reward.
+        model: "recorded" (the shipped recordings, and the default), the path of a recording (.json), or the name of a model
+            behind an OpenAI-compatible endpoint.
+        base_url: the endpoint; the default is OPENAI_BASE_URL, or else OpenAI's. Ollama's is http://localhost:11434/v1.
         draw: which of the shipped recordings answers (0 to 4).
-        candidates: first attempts that are combined; with 1, the attempt itself is the function (the paper's ablation
-            without self-prompting).
-        reflect: further rounds, in which the model sees what returns of whole episodes say of its factors, and may mend them.
-        policy: a run whose policy plays the episodes for --reflect; random actions do, unless given.
-        pre_verification: without it (the paper's ablation), the first reply is tried once, in its jail, and kept as it is.
-        budget: tokens, in and out together: no request is begun that might pass them.
-        requests: at most so many requests.
-        minutes: to wait for the model, at most, all requests and tries together.
-        price: of a million tokens in and out, to have the cost reckoned.
-        temperature: of the model; the server's own unless given.
-        record: a file that takes every exchange, for --model FILE; it must not exist, and not be the .json of --out.
-        data: logged episodes whose steps functions are tried on, instead of random ones of the environment: a directory, a Parquet
-            file, or the id of a local data set of Minari's.
+        candidates: number of first attempts, which are combined; with 1, the attempt itself is the function (the paper's
+            ablation without self-prompting).
+        reflect: number of further rounds, in which the model sees how well its factors explain the returns of whole episodes,
+            and may improve them.
+        policy: a run whose policy plays the episodes for --reflect; without it, actions are random.
+        pre_verification: verify and correct the function; without (the paper's ablation), the first reply is run once, in the
+            jail, and kept as it is.
+        budget: largest number of tokens, in and out together; a request that might exceed it is not sent.
+        requests: largest number of requests.
+        minutes: longest time to wait for the model, over all requests and retries.
+        price: of a million tokens in and of a million out; the cost is then reported.
+        temperature: sampling temperature of the model; the default is the server's.
+        record: a file to record every exchange in, for --model FILE; it must not exist, and not be the .json of --out.
+        data: logged episodes; functions are checked on their steps instead of random steps of the environment. A directory, a
+            Parquet file, or the id of a local Minari data set.
         out: a .py file to write, with the replies and checks in a .json beside it; it must not exist.
     """
     from lare.latent.design import DesignFailed
@@ -79,12 +81,12 @@ def design(
     live = not shipped and not str(model).endswith(".json")
     check_design(live, base_url, draw, budget, requests, minutes, price, temperature)
     if policy is not None and not reflect:
-        raise LareError("--policy plays episodes for --reflect: say how many rounds")
+        raise LareError("--policy plays the episodes for --reflect: give --reflect too, with a number of rounds")
     if reflect < 0:
-        raise LareError(f"reflect = {reflect}: there can be no fewer rounds than none")
+        raise LareError(f"reflect = {reflect}: the number of rounds cannot be negative")
     if data is not None and reflect:
         raise LareError(
-            "--reflect plays episodes in the environment, and --data is for where there is none: leave one out"
+            "--reflect plays episodes in the environment, and --data is for tasks without one: leave one of the two out"
         )
     check_files(out, record)
     spec, cost = load_task(task) if data is None else read_task(task), Budget(requests, budget, 60 * minutes)
@@ -122,7 +124,7 @@ def design(
 
 
 def keep_attempts(failed: "DesignFailed", instead: Path) -> None:
-    """Keep what was said, in its own file or `instead`; where no file can be written, print it: it was paid for."""
+    """Save the replies, which were paid for, in the recorder's own file or `instead`; print them if no file can be written."""
     recorder, model = failed.recorder, failed.model
     own = [recorder.path] if recorder.path and recorder.begun else []
     for path in (*own, instead):
@@ -137,7 +139,7 @@ def keep_attempts(failed: "DesignFailed", instead: Path) -> None:
 
 
 def print_function(function: "LatentFunction", instead: Path) -> None:
-    """Print a function; where nothing can be printed it was paid for all the same, and is saved `instead`."""
+    """Print a function. If that fails, save it as `instead`, because the model's replies were paid for."""
     try:
         say(function.source)
     except BrokenPipeError:
@@ -148,7 +150,7 @@ def print_function(function: "LatentFunction", instead: Path) -> None:
 
 
 def save_function(function: "LatentFunction", out: Path) -> None:
-    """Save a function; where it cannot be, it is printed: it was paid for."""
+    """Save a function. If that fails, print it, because the model's replies were paid for."""
     try:
         function.save(out)
     except LareError:
@@ -158,7 +160,7 @@ def save_function(function: "LatentFunction", out: Path) -> None:
 
 
 def policy_that_plays(run: Path | None, spec: "TaskSpec") -> "Callable[[np.ndarray], np.ndarray] | None":
-    """The policy of a run, if there is one."""
+    """The policy of a run, if a run is given."""
     if run is None:
         return None
     from lare.experiments.policy import Policy
@@ -180,11 +182,11 @@ def check_design(
     price: tuple[float, float] | None,
     temperature: float | None,
 ) -> None:
-    """Raise `LareError` where options do not go together, or make no sense."""
+    """Raise `LareError` if options do not go together, or have no valid value."""
     if base_url is not None and not live:
         raise LareError("--base-url is for a live model: say which one with --model NAME")
     if draw and live:
-        raise LareError("--draw chooses among recordings, and a live model says something new each time: leave it out")
+        raise LareError("--draw chooses a recording, and a live model uses none: leave --draw out")
     asked = (budget, requests, minutes, price, temperature) != (BUDGET, REQUESTS, MINUTES, None, None)
     if asked and not live:
         raise LareError(
@@ -194,15 +196,15 @@ def check_design(
         if value < 1:
             raise LareError(f"{name} = {value}: at least one is needed")
     if not 0 < minutes < float("inf"):
-        raise LareError(f"minutes = {minutes}: a number above 0")
+        raise LareError(f"minutes = {minutes}: a number above 0 is needed")
     if price is not None and not all(0 <= one < float("inf") for one in price):
-        raise LareError(f"price = {price[0]} {price[1]}: two numbers from 0 on")
+        raise LareError(f"price = {price[0]} {price[1]}: two numbers, 0 or more, are needed")
     if temperature is not None and not 0 <= temperature < float("inf"):
-        raise LareError(f"temperature = {temperature}: a number from 0 on")
+        raise LareError(f"temperature = {temperature}: a number, 0 or more, is needed")
 
 
 def check_files(out: Path | None, record: Path | None) -> None:
-    """Raise `LareError` where what is to be written could not be, before a model is asked and paid."""
+    """Raise `LareError` if a file could not be written, before a model is asked and paid."""
     written = [] if record is None else [(record, "--record")]
     if out is not None:
         if not out.name:

@@ -1,4 +1,4 @@
-"""Latent functions: the request, a task of one's own, verification."""
+"""The commands `prompt`, `new-task` and `verify`: the request to a model, your own task, and the checks of a function."""
 
 import math
 import sys
@@ -26,7 +26,7 @@ def prompt(task: Task, kind: Kind = "factors") -> None:
 
     Args:
         task: a shipped name (see `lare tasks`), or the path of a task file.
-        kind: what is asked for: several factors, or one reward.
+        kind: what the function returns: several factors, or one reward.
     """
     from lare.llm.prompts import candidate
     from lare.tasks.spec import load_task, the_role
@@ -39,16 +39,16 @@ def new_task(
     environment: Annotated[Positional[str], tyro.conf.arg(metavar="ENV_ID")],
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
 ) -> None:
-    """Write a first task file of an environment, from its spaces and its documentation; or of a log, from its arrays.
+    """Write the first draft of a task file: of an environment, from its spaces and documentation; or of a log, from its arrays.
 
-    Whatever speaks of rewards is left out, and what could not be found is marked for you to fill in. Where the agents are
-    of several kinds, a file for each kind is written beside it.
+    Sentences that speak of rewards are left out. Texts that could not be found are marked for you to fill in. If the agents
+    are of several kinds, one more file is written for each kind.
 
     Args:
-        environment: a Gymnasium id, as Pendulum-v1; module:id imports the module that registers it first; or
-            pettingzoo/MODULE:NAME, where NAME makes a PettingZoo ParallelEnv. Or a directory of logged episodes, a Parquet
-            file, or the id of a local data set of Minari's.
-        out: the file to write, which must not exist; the task's name with .toml unless given.
+        environment: a Gymnasium id, such as Pendulum-v1 (module:id first imports the module, which registers it); or
+            pettingzoo/MODULE:NAME, where NAME makes a PettingZoo ParallelEnv; or logged episodes, which are a directory, a
+            Parquet file, or the id of a local Minari data set.
+        out: the file to write, which must not exist; the default is the task's name with .toml.
     """
     drafted = draft_of(environment)
     path = out or Path(f"{drafted.name}.toml")
@@ -62,11 +62,11 @@ def new_task(
     data = f" --data {environment}" if drafted.of_logs else ""
     say(f"read it, then: lare design {path}{data} --model NAME --out phi.py")
     none = "lare relabel without --function" if drafted.of_logs else "--method bayes"
-    say(f"or, without a model: write phi.py by what lare prompt {path} says; {none} needs none")
+    say(f"or, without a model: write phi.py yourself, as lare prompt {path} describes it; {none} needs no phi.py")
 
 
 def draft_of(named: str) -> "Draft":
-    """A first spec of an environment, or of a log."""
+    """The first draft of a task: of an environment, or of a log."""
     from lare.tasks.new import draft
 
     if Path(named).exists():
@@ -94,36 +94,38 @@ def verify(
     fit: int = 0,
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
 ) -> None:
-    """Verify a function: what it may contain, and what it must do. It runs in a process without rights.
+    """Verify a function: what it contains, and what it does. It runs in a sandboxed process.
 
-    With --fit it also says how much of the returns of some episodes its factors explain, and what each of them counts.
+    With --fit, also print how much of the returns of some episodes its factors explain, and how much each factor contributes.
 
-    Exit status 0: it passes. 1: it does not, and every reason is printed. 2: it could not be tried.
+    Exit status 0: it passes. 1: it does not, and every reason is printed. 2: it could not be checked.
 
     Args:
         file: Python source, or a function that `lare design` saved.
         task: a shipped name (see `lare tasks`), or the path of a task file.
-        kind: what it is to return: several factors, or one reward.
-        data: logged episodes whose steps it is tried on, instead of random ones of the environment: a directory, a Parquet file,
-            or the id of a local data set of Minari's.
-        fit: so many episodes, 20 or more, are played by random actions, or are the first of --data.
+        kind: what the function returns: several factors, or one reward.
+        data: logged episodes; the function is checked on their steps instead of random steps of the environment. A directory, a
+            Parquet file, or the id of a local Minari data set.
+        fit: number of episodes, 20 or more, whose returns the factors are fitted to: the first of --data, or episodes that are
+            played with random actions.
         policy: a run whose policy plays the episodes for --fit, instead of random actions.
     """
     from lare.cli.design import policy_that_plays
     from lare.credit.words import FEWEST
-    from lare.latent.function import of_verdict, read_source
+    from lare.latent.function import of_verdict
+    from lare.latent.saved import read_source
     from lare.latent.verification.verify import verify as verify_source
     from lare.tasks.spec import load_task, read_task, the_role
 
     source, changed, written_for = read_source(file)
     if fit and fit < FEWEST:
-        raise LareError(f"fit = {fit}: fewer than {FEWEST} episodes say too little of a function")
+        raise LareError(f"fit = {fit}: at least {FEWEST} episodes are needed")
     if policy is not None and (not fit or data is not None):
-        raise LareError("--policy plays the episodes for --fit, where there is no --data: say how many")
+        raise LareError("--policy plays the episodes for --fit: give --fit a number of episodes, and no --data")
     spec = load_task(task) if data is None else read_task(task)
     plays = policy_that_plays(policy, spec)
     if changed:
-        say("note    the source is not the one that was saved: its hash is another")
+        say("note    the source was changed after it was saved: its hash differs")
     role = the_role(spec)
     if written_for not in (None, role.name):
         say(f"note    it was written for the task {written_for!r}")
@@ -157,17 +159,17 @@ def episodes_for(role: "TaskSpec", data: str | None, count: int, policy: "Policy
 
 
 def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes: "Sequence[Episode]") -> None:
-    """How well the factors tell the returns of some episodes."""
+    """Print how well the factors explain the returns of some episodes."""
     from lare.training.reflect import told_by_returns
 
     found = told_by_returns(function, role, episodes)
     if not found.sentences:
-        say(f"All {len(episodes)} episodes returned the same: they say nothing of the factors.")
+        say(f"All {len(episodes)} episodes have the same return, which says nothing about the factors.")
     elif math.isfinite(found.r2):
         say(
             f"Returns of episodes not seen yet, predicted by the factors: R² = {found.r2:.2f} (1: exactly; 0: no better than their "
             "mean)."
         )
-        say(f"And fitted to all {len(episodes)} episodes:")
+        say(f"Fitted to all {len(episodes)} episodes:")
     for line in found.sentences:
         say(line)

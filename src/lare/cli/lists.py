@@ -1,4 +1,4 @@
-"""What there is: tasks, methods, algorithms."""
+"""The commands that list tasks, methods and algorithms."""
 
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def tasks() -> None:
-    """List the tasks that come with the package. `lare prompt TASK` says what one is about."""
+    """List the tasks that come with the package. `lare prompt TASK` describes one of them."""
     from lare.tasks.spec import read_task, shipped_tasks
     from lare.tasks.table import FAMILIES
 
@@ -41,7 +41,7 @@ def methods() -> None:
 
 
 def for_whom(method: "Method") -> str:
-    """Who a method is for, where it is not for all."""
+    """A note on methods that are only for one agent or only for many."""
     return " (many agents)" if method.for_many_only else " (one agent)" if method.for_one_only else ""
 
 

@@ -1,4 +1,4 @@
-"""Logs of the past: rewards for steps that somebody recorded."""
+"""The command `relabel`: rewards for the steps of logged episodes."""
 
 import signal
 import sys
@@ -25,23 +25,24 @@ def relabel(
     seed: int = 0,
     overwrite: bool = False,
 ) -> None:
-    """Give the steps of logged episodes rewards that add up to what the episodes returned, and say how good they are.
+    """Give the steps of logged episodes rewards that add up to the episodes' returns, and report how well they predict returns.
 
-    Writes the same data with the new rewards; what was paid is kept beside them, as `paid`. No simulator is needed (docs/logs.md).
+    Writes the same data with the new rewards; the old rewards are kept beside them, as `paid`. No simulator is needed
+    (docs/logs.md).
 
     Args:
         dataset: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, or the id of a local
-            data set of Minari's.
-        out: the path or, for a data set of Minari's, the id to write. It is written whole or not at all.
-        task: a shipped name (see `lare tasks`), or the path of a task file: what --function was designed for, the time limit, and
-            of how many choices actions are. Its environment is not made.
+            Minari data set.
+        out: the path to write, or the id of the new Minari data set. It is written whole or not at all.
+        task: a shipped name (see `lare tasks`), or the path of a task file: the task that --function was designed for. The time
+            limit and the number of discrete actions are taken from it. Its environment is not created.
         function: a latent function (.py), verified on steps of the data before it is run.
-        method: how credit is assigned (see `lare methods`); lare-bayes with --function, bayes without.
-        hold_out: share of the episodes that nothing is fitted to, so that they can tell how well returns are predicted.
-        updates: of a decoder that descends a gradient. In closed form there are none.
-        memory: GiB, about, for what the decoder sees of steps. A fit in closed form goes by all episodes, whatever fits into it.
-        seed: of what is held out, and of a decoder's weights.
-        overwrite: replace what is at --out.
+        method: how credit is assigned (see `lare methods`); the default is lare-bayes with --function, bayes without.
+        hold_out: share of the episodes that are kept out of the fit, to measure how well returns are predicted.
+        updates: number of gradient updates of the decoder. A closed-form decoder has none.
+        memory: about how many GiB the decoder's inputs may take. A closed-form fit uses all episodes, whatever this limit is.
+        seed: seed of the choice of held-out episodes and of the decoder's initial weights.
+        overwrite: replace --out if it exists.
     """
     import lare
     from lare.errors import LareError
@@ -53,7 +54,7 @@ def relabel(
         if spec is None:
             raise LareError("--function needs the --task that it was designed for")
         phi = lare.load_function(function, spec, steps=lare.logged_steps(dataset, spec))
-    # So that what is half written is removed where the process is asked to end.
+    # So that a half-written output is removed when the process is told to stop.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     with shown() as told:
         found = lare.relabel(
@@ -76,7 +77,7 @@ def relabel(
 
 @contextmanager
 def shown() -> Iterator:
-    """A progress bar on stderr for each pass; a line, where that is no terminal."""
+    """A progress bar on stderr for each pass over the data; only a line if stderr is not a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 

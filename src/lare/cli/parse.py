@@ -1,4 +1,4 @@
-"""Reading the command line by tyro, and saying in one line what tyro says of a mistake in a box."""
+"""Read the command line with tyro, and turn the boxes in which tyro reports errors into one line."""
 
 import contextlib
 import functools
@@ -12,16 +12,18 @@ import tyro
 from lare.errors import LareError, did_you_mean
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-NUMBERS = {"INT": "not a whole number, as 10000", "FLOAT": "not a number, as 0.5"}
-"""What is said of tyro's names of kinds."""
+NUMBERS = {"INT": "not a whole number, such as 10000", "FLOAT": "not a number, such as 0.5"}
+"""The error text for each of tyro's names of numeric types."""
+ARGUMENT = re.compile(r" *((?:--[\w.-]+ )?[A-Z][A-Z|]*) (.*)")
+"""A missing argument as tyro describes it: its name, and its help."""
 CONTINUED = re.compile(r"\n {8,}")
-"""Where the text of an argument goes on; tyro would break the line there."""
+"""A line break inside the text of an argument. The help joins the lines; tyro would break them there."""
 
 
 def parse(
     commands: Mapping[str, Callable[..., None]], description: str, arguments: Sequence[str]
 ) -> Callable[[], None]:
-    """The command that is asked for, with its options, to be called. Where help is asked for, it is printed, and that is all.
+    """The requested command with its options, ready to be called. A request for help prints the help and exits.
 
     Raises:
         LareError: the arguments cannot be read.
@@ -38,7 +40,10 @@ def parse(
 
 
 def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-    """A function that looks like a command, and only keeps what it was given: a mistake in it must not be taken for tyro's."""
+    """A function with the signature of a command that only stores its arguments.
+
+    So tyro does not call the command, and an error inside the command is not taken for an error of the command line.
+    """
 
     @functools.wraps(command)
     def keep(*values: object, **named: object) -> Callable[[], None]:
@@ -51,7 +56,7 @@ def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
 
 
 def in_one_line(box: str, commands: Mapping[str, object]) -> str:
-    """What a box of tyro's is about."""
+    """The error that a box of tyro's reports."""
     said, *more = sections(box)
     said = said.split(" Got errors:")[0].rstrip(".")
     if found := re.fullmatch(r"Unrecognized options: (\S+?)(,.*)?", said):
@@ -60,11 +65,23 @@ def in_one_line(box: str, commands: Mapping[str, object]) -> str:
     if found := re.fullmatch(r"Error parsing (\S+): no type matching (.+) could be instantiated from \['(.*)'\]", said):
         kind = found[2].replace("{None}|", "")
         return f"{found[1]} {found[3]}: {NUMBERS.get(kind, f'not of the kind {kind}')}"
-    return re.sub(r"'None', |, 'None'", "", said)
+    if found := re.fullmatch(r"Missing value for argument '(\S+)'\..*", said):
+        return f"{found[1]} needs a value"
+    if found := re.fullmatch(r"Missing from (lare [\w-]+): (.*)", said):
+        return f"{found[1]} needs {' and '.join(ARGUMENT.sub(described, one) for one in found[2].split('(required)') if one)}"
+    if found := re.fullmatch(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*)\)", said):
+        known = sorted(set(re.findall(r"'([^']*)'", found[3])) - {"None"})
+        return f"{found[2]} {found[1]}: not one of {', '.join(known)}"
+    return said
+
+
+def described(argument: re.Match[str]) -> str:
+    """A missing argument, with its help in brackets."""
+    return f"{argument[1]} ({argument[2].rstrip('. ')})"
 
 
 def sections(box: str) -> list[str]:
-    """The texts between the rules of a box, below its title. Where the terminal knows no box characters, it is drawn in ASCII."""
+    """The texts between the horizontal lines of a box, without its title. Some terminals get the box drawn in ASCII."""
     lines = [line.strip("╭╮╰╯│ ") for line in COLOUR.sub("", box).splitlines()[1:]]
     ruled = "\n".join("\0" if re.fullmatch(r"[─-]{3,}", line) else line for line in lines)
     return [" ".join(part.split()) for part in ruled.split("\0") if part.strip()] or [box.strip()]

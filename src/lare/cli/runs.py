@@ -1,4 +1,4 @@
-"""Runs: train, evaluate, report, and let two of them meet."""
+"""The commands for runs: `train`, `evaluate`, `report`, `export` and `cross-play`."""
 
 import os
 import sys
@@ -33,25 +33,26 @@ def train(
     mlflow: Annotated[str | None, tyro.conf.arg(metavar="EXPERIMENT")] = None,
     watch: bool = False,
 ) -> None:
-    """Train on a task's episodic rewards. Ctrl-C saves and leaves; --resume goes on.
+    """Train on a task's episodic rewards. Ctrl-C saves and stops; --resume continues.
 
     Args:
         task: a shipped name (see `lare tasks`), or the path of a task file. Not given with --resume.
         function: a latent function (.py) to use instead of a recorded one, verified before it is run. Where several teams learn,
             one --function for each, in the order of the task.
-        model: with --reflect-every, whom to ask: the path of a recording (.json), or the name of a model behind an
+        model: with --reflect-every, the model to ask: the path of a recording (.json), or the name of a model behind an
             OpenAI-compatible endpoint.
-        base_url: the endpoint (OpenAI's, or that of OPENAI_BASE_URL, unless given).
-        out: the run directory, which must not exist; runs/TASK-METHOD-ALGORITHM-sSEED unless given.
-        resume: a run directory to go on with, from its last checkpoint and with its own settings. With --steps, a finished run
-            goes on for longer.
+        base_url: the endpoint; the default is OPENAI_BASE_URL, or else OpenAI's.
+        out: the run directory, which must not exist; the default is runs/TASK-METHOD-ALGORITHM-sSEED.
+        resume: a run directory to continue, from its last checkpoint and with its own settings. With --steps, a finished run is
+            extended.
         tensorboard: write TensorBoard events into the run directory too (needs the extra lare-rl[tensorboard]).
         wandb: send the metrics of each seed to a project of Weights & Biases too (needs the extra lare-rl[wandb]).
         mlflow: send the metrics of each seed to an experiment of MLflow too (needs the extra lare-rl[mlflow]).
         watch: write verdict and curves to watch.html in the run directory after every evaluation, and open it in the browser.
     """
     import lare
-    from lare.latent.function import CHANGED, load, per_role
+    from lare.latent.function import CHANGED, per_role
+    from lare.latent.saved import load
     from lare.run.decide import decide
     from lare.run.directory import default_directory, open_run
     from lare.training.train import check_given
@@ -78,7 +79,7 @@ def train(
         for one in functions or ():
             if one.changed:
                 progress(
-                    f"the function by {one.model.removesuffix(CHANGED)} is not the one that was saved: its hash is another"
+                    f"the function by {one.model.removesuffix(CHANGED)} was changed after it was saved: its hash differs"
                 )
         asked = model_of(model, base_url, spec.name)
         out = out or default_directory(spec, resolved)
@@ -97,7 +98,7 @@ def train(
 def listeners_of(
     wandb: str | None, mlflow: str | None, settings: ResolvedSettings, watched: Path | None
 ) -> "list[Listener]":
-    """The terminal, and the tracking services and the page that are asked for."""
+    """The terminal, and the tracking services and the page that the user asked for."""
     from lare.training.progress import Terminal
     from lare.training.trackers import MLflow, WeightsAndBiases
 
@@ -116,7 +117,7 @@ def listeners_of(
 
 
 def model_of(model: str | None, base_url: str | None, task: str) -> "Model | None":
-    """Whom a run asks for better functions, if anybody."""
+    """The model that a run asks for better functions; None if the user named none."""
     from lare.llm.budget import Budget
     from lare.llm.live import LiveModel
     from lare.llm.model import recorded_model
@@ -131,12 +132,12 @@ def model_of(model: str | None, base_url: str | None, task: str) -> "Model | Non
 
 
 def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: Path | None = None) -> None:
-    """Evaluate the policy of a run by its true return, from starts that no evaluation of the run has used.
+    """Evaluate the policy of a run by its true return, from initial states that no evaluation of the run has used.
 
     Args:
         run: a run directory.
-        episodes: episodes for each seed. A single agent acts without noise, many as their algorithm is evaluated.
-        best: play the policy of each seed's best evaluation, instead of the last one.
+        episodes: number of episodes for each seed. A single agent acts without noise, many agents act as in training's evaluations.
+        best: play the policy of each seed's best evaluation, instead of the last policy.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
     from lare.experiments.evaluation import evaluation_of
@@ -173,17 +174,17 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
 
 
 def draw_without_a_screen() -> None:
-    """Let MuJoCo draw where there is no screen."""
+    """Let MuJoCo render without a screen."""
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
         os.environ.setdefault("MUJOCO_GL", "egl")
 
 
 def report(runs: RunDirectories, out: Path | None = None, film: bool = False) -> None:
-    """Draw a report of one or more runs: one HTML file that needs nothing else.
+    """Draw a report of one or more runs: one self-contained HTML file.
 
     Args:
-        runs: run directories; their learning curves are laid over each other, named by method.
-        out: the file to write; report.html in the (first) run's directory unless given.
+        runs: run directories; their learning curves are drawn in one chart, named by method.
+        out: the file to write; the default is report.html in the (first) run's directory.
         film: film an episode of each run too, and show it in the page. Without a graphics card that may take minutes.
     """
     from lare.experiments.report import write_report
@@ -206,8 +207,8 @@ def export(
     Args:
         run: a run directory.
         out: the directory to write, which must not exist.
-        seed: whose policy and decoder; the first seed's unless given.
-        best: the policy of the seed's best evaluation, instead of the last one.
+        seed: the seed whose policy and decoder are written; the default is the first.
+        best: write the policy of the seed's best evaluation, instead of the last policy.
     """
     import lare
     from lare.run.directory import open_run
@@ -215,7 +216,7 @@ def export(
     found = lare.export(open_run(run), out, seed, best)
     say(f"wrote {', '.join(found.functions)} to {found.directory}; exported.py there says how to call them")
     for name, why in found.apart.items():
-        progress(f"{name} takes the factors of phi as an input, for phi has no translation: it has {why}")
+        progress(f"{name} takes the factors of phi as an input, because phi cannot be translated: it has {why}")
     if found.left_out:
         progress(f"there is no reward function: {found.left_out}")
     if not found.onnx:
@@ -227,14 +228,14 @@ def cross_play(
     second: RunDirectory,
     episodes: int = 200,
 ) -> None:
-    """Let the first team of each of two runs meet the other team of each, every seed against every seed.
+    """Let the first team of each of two runs play against the second team of each, every seed against every seed.
 
     Prints the first team's return, mean and standard deviation over the pairs of seeds.
 
     Args:
-        first: a run of a task in which two teams learn, as CompetitivePP-6.
+        first: a run of a task in which two teams learn, such as CompetitivePP-6.
         second: another run of the same task.
-        episodes: episodes of each pair.
+        episodes: number of episodes for each pair of seeds.
     """
     from lare.experiments.agents import Match
     from lare.experiments.agents import cross_play as play

@@ -1,4 +1,4 @@
-"""Studies of many runs."""
+"""The commands for many runs: `sweep`, `compare` and `reproduce`."""
 
 import importlib
 import sys
@@ -14,7 +14,7 @@ from lare.cli.terminal import RunDirectories, progress, say, show
 from lare.errors import LareError
 
 BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
-"""In a checkout; there is no such directory where LaRe was installed from an index."""
+"""A directory of the checkout. It does not exist if LaRe was installed from a package index."""
 
 Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")]
 
@@ -23,11 +23,12 @@ def sweep(
     file: Annotated[Positional[Path], tyro.conf.arg(metavar="FILE")],
     ray: Ray = None,
 ) -> None:
-    """Train many runs: what a TOML file asks for and is not done yet. All metrics go to results.csv and .parquet.
+    """Train the runs that a TOML file lists and that are not finished yet. All metrics go to results.csv and .parquet.
 
     Args:
-        file: tasks, methods, algorithms, draws, settings; processes at a time, and cores of each (docs/sweeps.md).
-        ray: a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
+        file: lists tasks, methods, algorithms, draws and settings, and how many processes run at a time, on how many cores each
+            (docs/sweeps.md).
+        ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
     """
     from lare.cli.watch import watching
     from lare.experiments.sweep import read_sweep, run_sweep
@@ -44,7 +45,7 @@ def sweep(
         with watching(jobs) as said:
             failed = run_sweep(wanted, jobs, said, ray)
     except BaseException:
-        with suppress(LareError):  # what stopped the sweep is what is to be said
+        with suppress(LareError):  # the error to report is the one that stopped the sweep
             tabulate()
         raise
     tabulate()
@@ -56,8 +57,8 @@ def compare(runs: RunDirectories, out: Path = Path("compare.html")) -> None:
     """Compare methods by their runs: interquartile means with bootstrap intervals, profiles, probability of improvement.
 
     Args:
-        runs: run directories, or directories that hold some, as that of a sweep; the first run's method is what the others are
-            compared with.
+        runs: run directories, or directories that contain some, such as that of a sweep. The method of the first run is the one
+            that the others are compared with.
         out: the page to write.
     """
     from lare.experiments.compare import HEAD, cells, find_runs, what_scores_are, write_comparison
@@ -78,16 +79,17 @@ def reproduce(
     cores: int = 1,
     ray: Ray = None,
 ) -> None:
-    """Train a figure or a table of the LaRe paper anew, in a checkout, and write a page that compares it with the paper's.
+    """Reproduce a figure or table of the LaRe paper: train its runs, and write a page that compares the results. Needs a checkout.
 
     Args:
-        exhibit: its name, or all; without it, they are listed.
-        budget: smoke, to see that it runs; laptop, 3 seeds and a twentieth of a single agent's steps, some tasks; paper, all.
+        exhibit: the name of a figure or a table, or all; without it, the names are listed.
+        budget: smoke only tests that it runs; laptop has 3 seeds, a twentieth of a single agent's steps, and some of the tasks;
+            paper has everything.
         runs: the directory of the runs; finished ones are not trained again.
         out: the directory of the pages: OUT/BUDGET/NAME.md, with its pictures and all metrics.
-        processes: runs at a time.
-        cores: of each run.
-        ray: a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
+        processes: number of runs at a time.
+        cores: number of cores for each run.
+        ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
     """
     from lare.cli.watch import watching
     from lare.experiments.sweep import Share
@@ -112,7 +114,7 @@ def reproduce(
             make(name)
         except Interrupted:
             raise
-        except LareError as error:  # one that fails is no reason to leave the others out
+        except LareError as error:  # the other exhibits are still made
             failed += 1
             progress(f"{name}: {error}")
     if failed:
@@ -120,7 +122,7 @@ def reproduce(
 
 
 def from_the_checkout(module: str) -> ModuleType:
-    """A module of `benchmarks/paper`, which only a checkout has. Raises `LareError` where LaRe was installed without one."""
+    """A module of `benchmarks/paper`, which only a checkout has. Raises `LareError` if LaRe was installed without one."""
     if not (BENCHMARKS / "paper" / f"{module}.py").is_file():
         raise LareError(
             "lare reproduce needs a checkout, whose directory benchmarks/paper describes the exhibits: clone the repository, and "

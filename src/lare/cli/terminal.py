@@ -1,4 +1,4 @@
-"""What the commands share: types of their arguments, and ways to say something."""
+"""Shared by the commands: types of their arguments, and functions that print."""
 
 import sys
 from collections.abc import Iterable, Sequence
@@ -22,7 +22,7 @@ Kind = Literal["factors", "reward"]
 Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET")]
 
 WIDTH = 200
-"""Characters in a line of a file."""
+"""Characters in a line, where the output is not a terminal."""
 
 
 def say(text: str) -> None:
@@ -30,7 +30,7 @@ def say(text: str) -> None:
 
 
 def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table; its first column is never broken, and none where no terminal says how wide it is."""
+    """Print a table, as wide as the terminal, or `WIDTH` without one. Its first column is never wrapped."""
     from rich.console import Console
     from rich.table import Table
 
@@ -42,12 +42,12 @@ def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 
 
 def progress(text: str) -> None:
-    """What is worth knowing on the way, apart from the result."""
+    """Print a message to stderr, so that stdout holds only the result."""
     sys.stderr.write(legible(text) + "\n")
 
 
 def steps_of(data: str | None, task: "TaskSpec") -> "Steps | None":
-    """Steps of a log, where one was given."""
+    """Steps of a log, if one is given."""
     if data is None:
         return None
     from lare.logs.steps import logged_steps
@@ -56,7 +56,7 @@ def steps_of(data: str | None, task: "TaskSpec") -> "Steps | None":
 
 
 def free_name(path: Path) -> Path:
-    """The path itself, or one with a number behind it as long as that is taken."""
+    """The path itself, or, if it exists, the first free one with a number appended."""
     number, free = 1, path
     while free.exists():
         number += 1
@@ -65,7 +65,7 @@ def free_name(path: Path) -> Path:
 
 
 def write_new(path: Path, text: str, option: str) -> None:
-    """Write a file that must not be there."""
+    """Write a file that must not exist."""
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)

@@ -1,4 +1,4 @@
-"""A sweep on the terminal: a bar for each run that is under way, and one for all of them; lines where nobody is looking."""
+"""The progress of a sweep: a bar for each active run and one for all runs; without a terminal, only lines."""
 
 import contextlib
 import sys
@@ -14,12 +14,12 @@ from lare.experiments.jobs import Job
 from lare.legible import legible
 
 EVERY = 2.0
-"""Seconds between two looks."""
+"""Seconds between two updates of the bars."""
 
 
 @contextlib.contextmanager
 def watching(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
-    """Gives what a sweep is to tell its lines to."""
+    """Show the progress of a sweep; yields the function that prints its messages."""
     if not sys.stderr.isatty():
         yield progress
         return
@@ -42,7 +42,7 @@ def watching(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
 
 
 def look(jobs: Sequence[Job], bars: Progress, ended: threading.Event) -> None:
-    """Move the bars until the end."""
+    """Update the bars until the sweep has ended."""
     whole = bars.add_task("all runs", total=sum(job.resolved.steps for job in jobs))
     own: dict[str, TaskID] = {}
     while not ended.is_set():
@@ -58,7 +58,7 @@ def look(jobs: Sequence[Job], bars: Progress, ended: threading.Event) -> None:
 
 
 def step_of(job: Job) -> int:
-    """How far it is; what is damaged is the matter of whoever trains it."""
+    """The number of steps that a run has done. A damaged run counts as 0; the process that trains it reports the damage."""
     try:
         return job.step() if job.begun else 0
     except LareError:

@@ -1,4 +1,4 @@
-"""How near proxy rewards come to the true ones. Only measured, never trained on."""
+"""Accuracy of proxy rewards against the true rewards. Only for measurement: nothing is trained on it."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -11,9 +11,10 @@ def metrics(
     mask: Bool[Array, " steps"],
     in_units: bool,
 ) -> dict[str, Float[Array, ""]]:
-    """By the keys of metrics.jsonl; the error only of proxy rewards that are in the unit of the true ones.
+    """The accuracy, under the keys of metrics.jsonl.
 
-    NaN where nothing but the last step of an episode has paid: what each step is truly worth is not known there.
+    The error is included only if proxy rewards are in the unit of the true rewards (`in_units`). All values are NaN if only
+    the last steps of episodes have paid a reward: the true rewards of single steps are then unknown.
     """
     known = jnp.any((reward != 0) & mask & ~last)
     found = {"credit/correlation": correlation(r_hat, reward, mask)}
@@ -38,4 +39,4 @@ def correlation(
         return (x - jnp.sum(x * mask) / total) * mask
 
     a, b = centred(r_hat), centred(reward)
-    return jnp.clip(jnp.sum(a * b) / jnp.sqrt(jnp.sum(a**2) * jnp.sum(b**2)), -1, 1)  # rounding goes beyond
+    return jnp.clip(jnp.sum(a * b) / jnp.sqrt(jnp.sum(a**2) * jnp.sum(b**2)), -1, 1)  # rounding can exceed 1

@@ -1,15 +1,16 @@
 """AREL: agent-temporal attention for reward redistribution (Xiao, Ramasubramanian and Poovendran, AAMAS 2022).
 
-Attention over the steps of each agent and over the agents of each step, in turns; the sum over the agents then gives one
-reward a step, which every agent gets:
+Attention over the steps of each agent alternates with attention over the agents of each step. The sum over the agents then
+gives one reward for each step, which every agent receives:
 
     r_hat_{i,t} = y_t = w . sum_i h_{i,t},    penalty = 20 / T^2 E Var_t(y)
 
-(Published: 20 E Var_t(y) beside the squared error of the sum of T rewards; here, beside that of their mean. y has a factor
-of sqrt(T), as other decoders have one of sqrt(nT): see `decomposition.py`.)
+The published penalty is 20 E Var_t(y), added to the squared error of the sum of T rewards. Here it is added to the squared
+error of their mean, hence 1 / T^2. y is multiplied by sqrt(T), as the outputs of other decoders are by sqrt(nT): see
+`decomposition.py`.
 
-The published adapter of LaRe's authors reads y_t, repeated over the agents, in another order than it was written, and so
-scatters it over agents and time. Here all agents get y_t at t.
+The adapter that LaRe's authors published repeats y_t over the agents, but then reads the array in another axis order. It
+thus gives rewards to the wrong agents and steps. Here all agents receive y_t at step t.
 """
 
 import math
@@ -24,7 +25,8 @@ from lare.credit.decoders import Decoded
 from lare.networks import MLP, Linear
 
 WIDEST, DEPTH, HEADS, READ_OUT = 100, 3, 3, 50
-"""Largest width of a token, pairs of blocks, heads in each (every one as wide as a token), width before the sum."""
+"""The largest token width, the number of pairs of blocks, the heads in each block (each head is as wide as a token), and the
+width of the layers before the sum over the agents."""
 
 VARIANCE_PENALTY = 20.0
 
@@ -33,7 +35,7 @@ class Block(eqx.Module):
     """y = LN(x + attention(x)), then LN(y + FF(y)), over the tokens."""
 
     projections: Float[Array, "size projected"]
-    """To queries, keys and values of all heads; without biases."""
+    """Projects tokens to the queries, keys and values of all heads, without biases."""
     merge: Linear
     feed_forward: MLP
     norms: tuple[LayerNorm, LayerNorm]

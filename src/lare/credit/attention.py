@@ -1,4 +1,4 @@
-"""What AREL and STAS are made of: attention over an axis, and layer normalisation."""
+"""Attention over an axis and layer normalisation, which AREL and STAS share."""
 
 from collections.abc import Callable
 
@@ -31,14 +31,14 @@ def attend(
     mask: Bool[Array, "queries tokens"] | None = None,
     drop: Callable[[Array], Array] = lambda weights: weights,
 ) -> Float[Array, "*batch queries joined"]:
-    """softmax(Q K^T / sqrt(size)) V of each head, heads side by side (Vaswani et al., 2017, Eq. 1).
+    """softmax(Q K^T / sqrt(size)) V of each head; the heads are concatenated (Vaswani et al., 2017, Eq. 1).
 
-    Where `mask` is false a query does not look at a token. `drop` is done to the attention, for dropout.
+    A query ignores the tokens where `mask` is false. `drop` is applied to the attention weights, for dropout.
     """
     *batch, queries, heads, size = query.shape
 
     def by_head(x: Float[Array, "*batch tokens heads size"]) -> Float[Array, "rows tokens size"]:
-        """All that attend on their own, in one axis: products of three axes are what XLA multiplies fastest."""
+        """Merge batch axes and heads into one axis, because XLA is fastest at products of arrays with three axes."""
         return jnp.swapaxes(x, -2, -3).reshape(-1, x.shape[-3], size)
 
     scores = jax.lax.batch_matmul(by_head(query), jnp.swapaxes(by_head(key), 1, 2)) / jnp.sqrt(size)
@@ -49,5 +49,5 @@ def attend(
 
 
 def causal(length: int) -> Bool[Array, "length length"]:
-    """A step sees itself and what came before."""
+    """A mask that lets each step attend to itself and to earlier steps."""
     return jnp.tril(jnp.ones((length, length), bool))

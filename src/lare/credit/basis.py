@@ -1,6 +1,6 @@
-"""What the score of a step may be made of: features that a closed-form decoder is linear in, in groups.
+"""The features of a step, in groups. A closed-form decoder is linear in these features.
 
-With u = (x - mean) / deviation over all steps, for the factors z of a step and for its raw entries [s', a]:
+With u = (x - mean) / deviation over all steps, where x is one of the factors z or of the raw entries [s', a] of a step:
 
     factors             u_i
     shapes of factors   cos(k pi u_i / 4) / k,  sin(k pi u_i / 4) / k,   k = 1, 2, 3
@@ -8,12 +8,12 @@ With u = (x - mean) / deviation over all steps, for the factors z of a step and 
     entries             u_i
     shapes of entries   as those of the factors
 
-Shapes are the first terms of the Fourier series of a function of one number, within four deviations of its mean: they say
-"more is better up to here", "near this value", "beyond this value". Pairs say "this while that". Which groups are needed is
-decided by the returns (`evidence.py`).
+Shapes are the first terms of the Fourier series of a function of one number, within four standard deviations of its mean.
+They can express "more is better up to this value", "near this value" or "beyond this value". Pairs express interactions of
+two factors. The returns decide which groups are needed (`evidence.py`).
 
-The entries [s', a] are the state that a step led to and the action: the mean of the published s - s' over an episode is
-next to nothing, because the differences cancel.
+The entries [s', a] are the state that a step led to and the action. The published s - s' would carry almost no information:
+its mean over an episode is close to zero, because the differences cancel.
 """
 
 from dataclasses import dataclass
@@ -24,30 +24,31 @@ from jaxtyping import Array, Bool, Float, Int
 
 FREQUENCIES = 3
 HALF_PERIOD = 4.0
-"""Deviations from the mean within which shapes tell values apart."""
+"""In standard deviations. Shapes are constant beyond this distance from the mean."""
 LARGEST = 512
-"""Features. Where entries are so many that their shapes would exceed it, they get fewer frequencies, or none."""
+"""Limit on the number of features. If the shapes of the entries would exceed it, entries get fewer frequencies, or none."""
 MOST_ENTRIES = 1024
-"""More raw entries (of pictures, say) are left out beside factors: a fit takes the cube of the number of features."""
+"""Limit on the number of raw entries. If there are more (images, for example), none is used: the time of a fit grows with the
+cube of the number of features."""
 
 
 @dataclass(frozen=True)
 class Basis:
-    """Which features there are. Inputs are rows [z, s', a], or the part of it that there is."""
+    """The set of features. An input row is [z, s', a], or only the parts that the method uses."""
 
     factors: int
     entries: int
     extended: bool
-    """With shapes and pairs, not only what is given."""
+    """Whether shapes and pairs are added to the inputs."""
 
     @property
     def inputs(self) -> int:
-        """Size of a row that is given."""
+        """The size of an input row."""
         return self.factors + self.entries
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Features in each group that there is, in order."""
+        """The number of features in each group that is not empty, in order."""
         pairs = self.factors * (self.factors - 1) // 2
         sizes = {"factors": self.factors}
         if self.extended:
@@ -64,19 +65,19 @@ class Basis:
 
     @property
     def frequencies_of_entries(self) -> int:
-        """Terms of the series of each entry."""
+        """The number of frequencies for each entry."""
         factors = self.factors * (1 + 2 * FREQUENCIES) + self.factors * (self.factors - 1) // 2
         left = max(0, LARGEST - factors - self.entries)
         return min(FREQUENCIES, left // max(1, 2 * self.entries))
 
     @property
     def size(self) -> int:
-        """Features in all."""
+        """The total number of features."""
         return sum(self.sizes.values())
 
     @property
     def group(self) -> Int[np.ndarray, " features"]:
-        """The number of each feature's group."""
+        """The index of each feature's group."""
         return np.repeat(np.arange(len(self.sizes)), list(self.sizes.values()))
 
     @property
@@ -86,9 +87,9 @@ class Basis:
 
 
 def shapes(u: Float[Array, "*batch inputs"], frequencies: int) -> Float[Array, "*batch features"]:
-    """The terms of the series, one frequency after the other, the cosine of all inputs before their sines.
+    """The terms of the Fourier series by frequency. Within a frequency, the cosines of all inputs precede their sines.
 
-    All of them from the first two: cos (k + 1) a = 2 cos a cos k a - cos (k - 1) a, and the same for sines.
+    Only the first frequency is computed directly: cos (k + 1) a = 2 cos a cos k a - cos (k - 1) a, and likewise for sines.
     """
     waves = cosine_and_sine(jnp.pi / HALF_PERIOD * jnp.clip(u, -HALF_PERIOD, HALF_PERIOD))
     before, twice, terms = (jnp.ones_like(u), jnp.zeros_like(u)), 2 * waves[0], [u[..., :0]]
@@ -99,9 +100,9 @@ def shapes(u: Float[Array, "*batch inputs"], frequencies: int) -> Float[Array, "
 
 
 def cosine_and_sine(angle: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Of angles between -pi and pi, to the precision of float32: the Taylor series of half of each angle.
+    """Cosine and sine of angles between -pi and pi, to the precision of float32, by the Taylor series at half of each angle.
 
-    XLA's own functions take any angle, and fifteen times as long as this: most of the time of a fit.
+    XLA's own functions accept any angle but take fifteen times as long, which would be most of the time of a fit.
     """
     half = angle / 2
     square, cosine, sine = half**2, 1.0, 1.0

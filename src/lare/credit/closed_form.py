@@ -1,19 +1,18 @@
-"""A decoder that is fitted in closed form to all episodes so far, and takes each new one as it comes.
+"""A decoder that is fitted in closed form to all episodes so far. New episodes only add to its sums.
 
     r_hat = b + w . f(u),    u = (x - mean) / deviation
 
-f are the features of `basis.py`, w and b come from running sums over episodes (`evidence.py`), and nothing descends a gradient.
-LaRe without the reward model has signs for w instead:
+f are the features of `basis.py`. w and b are computed from running sums over episodes (`evidence.py`), without gradient descent.
+In LaRe without the reward model, w are signs instead:
 
     w = argmin sum_k T_k (R_k/T_k - w . m_k)^2  over  w in {-1, 1}^d,    b = 0,    f(u) = x
 
-By which mean and deviation u is standardised decides what the features are. Both move while steps come in, and sums of features
-that were standardised by old ones would be stale. So they stay as they are for a while, and each time that the steps have
-grown by a half, all stored episodes are summed again with new ones: a step is summed three times on average, however many
-there are.
+The features depend on the mean and deviation that standardise u. If these changed with every step, the sums over earlier steps
+would be wrong. So they are kept fixed for a while. Whenever the number of steps has grown by a half, they are updated and all
+stored episodes are summed again. Each step is summed three times on average, however many steps there are.
 
-The sums need float64: features that nearly repeat each other leave nothing of float32. Where they are kept, each number is the
-sum of two of float32; functions that take or return `Sums` are to be called within `jax.enable_x64(True)`.
+The sums need float64: if features are nearly collinear, float32 loses all precision. The stored state holds each number as the
+sum of two float32 numbers. Call functions that take or return `Sums` within `jax.enable_x64(True)`.
 """
 
 import itertools
@@ -33,13 +32,13 @@ from lare.credit.evidence import Posterior, Spread, Sums
 from lare.normalise import RunningMeanStd, deviation
 
 LARGEST_CHOICE = 16
-"""Factors whose signs are searched through, all 2^d of them."""
+"""The largest number of factors for which all 2^d combinations of signs are tried."""
 GROWTH_OF_SUMS = 1.5
-"""Of the steps, until all episodes are summed again."""
+"""All episodes are summed again when the number of steps has grown by this factor."""
 GROWTH_OF_FIT = 1.05
-"""Of the episodes, until the decoder is fitted again."""
+"""The decoder is fitted again when the number of episodes has grown by this factor."""
 ROUNDS = 20
-"""Of the evidence's fixed point, in each fit, at most. It begins where the last one ended."""
+"""Maximum number of rounds of the evidence's fixed point in each fit. A fit starts from the result of the last one."""
 
 
 class LinearDecoder(eqx.Module):
@@ -48,7 +47,7 @@ class LinearDecoder(eqx.Module):
     basis: Basis = eqx.field(static=True)
     mean: Float[Array, " inputs"]
     deviation: Float[Array, " inputs"]
-    """0 for an input that never varied: it says nothing."""
+    """0 for an input that has never varied: it is ignored."""
     weight: Float[Array, "*forms features"]
     bias: Float[Array, "*forms"]
 
@@ -63,24 +62,24 @@ class LinearDecoder(eqx.Module):
 
 
 class ClosedForm(NamedTuple):
-    """What a fit in closed form goes by."""
+    """The state of a fit in closed form."""
 
     decoder: LinearDecoder
-    """With a leading axis: one for each form that the score may have."""
+    """With a leading axis over the forms that the score may have."""
     summed: Sums
-    """Each number as the sum of two."""
+    """Each number is held as two float32 numbers (`kept`)."""
     steps: Float[Array, ""]
-    """Steps that mean and deviation are of."""
+    """The number of steps from which mean and deviation were computed."""
     fitted: Float[Array, ""]
-    """Episodes that the decoder is fitted to."""
+    """The number of episodes that the decoder is fitted to."""
     posterior: Posterior
-    """Of each form."""
+    """With a leading axis over the forms."""
     spread: Spread | None
-    """Of each form, where optimism asks for it at every step."""
+    """With a leading axis over the forms; None unless rewards are optimistic."""
 
 
 def init(basis: Basis, forms: int, *, with_spread: bool = False) -> ClosedForm:
-    """Of no episodes."""
+    """The state before the first episode."""
     zeros, ones = jnp.zeros(basis.inputs), jnp.ones(basis.inputs)
     decoder = LinearDecoder(basis, zeros, ones, jnp.zeros((forms, basis.size)), jnp.zeros(forms))
     posterior = evidence.unknown(basis.size, len(basis.sizes))
@@ -92,7 +91,7 @@ def init(basis: Basis, forms: int, *, with_spread: bool = False) -> ClosedForm:
 
 
 def kept(sums: Sums) -> Sums:
-    """Each number as two of float32, behind each other, whose sum it is."""
+    """Split each number into two float32 numbers that add up to it, along a new leading axis."""
 
     def two(number: Array) -> Float[Array, "2 *shape"]:
         first = number.astype(jnp.float32)
@@ -102,19 +101,19 @@ def kept(sums: Sums) -> Sums:
 
 
 def whole(sums: Sums) -> Sums:
-    """The opposite of `kept`: in float64, where that is enabled."""
+    """The inverse of `kept`, in float64 if that is enabled."""
     return jax.tree.map(lambda number: jnp.sum(number.astype(float), axis=0), sums)
 
 
 def is_stale(state: ClosedForm, statistics: RunningMeanStd) -> Bool[Array, ""]:
-    """Whether all episodes are to be summed again."""
+    """Whether all episodes must be summed again."""
     return statistics.rows >= GROWTH_OF_SUMS * state.steps
 
 
 def begin_again(state: ClosedForm, statistics: RunningMeanStd) -> ClosedForm:
-    """Without a sum, and with the mean and deviation of all steps so far.
+    """Reset the sums, and standardise by the mean and deviation of all steps so far.
 
-    Precisions stay, as a place to begin. The weights do not fit the features any more, until the next fit.
+    The precisions are kept as the start of the next fit. Until then, the weights do not match the features.
     """
     known = statistics.mean, deviation(statistics)
     decoder = eqx.tree_at(lambda d: (d.mean, d.deviation), state.decoder, known)
@@ -128,7 +127,7 @@ def is_due(state: ClosedForm) -> Bool[Array, ""]:
 
 
 def fit(state: ClosedForm, forms: tuple[int, ...], rounds: int = ROUNDS) -> ClosedForm:
-    """With the decoder that follows from the sums, for each of some forms: 0 a sum over steps, 1 an average."""
+    """Fit the decoder to the sums, for each of `forms`: 0 is a sum over steps, 1 an average."""
     basis, sums = state.decoder.basis, whole(state.summed)
 
     def one(of_form: tuple[Int[Array, ""], Posterior]) -> Posterior:
@@ -148,17 +147,17 @@ def fit(state: ClosedForm, forms: tuple[int, ...], rounds: int = ROUNDS) -> Clos
 
 
 def fit_signs(state: ClosedForm) -> ClosedForm:
-    """With the signs for which the sum of the factors comes nearest to the returns; the first of them where some are equal."""
+    """Choose the signs for which the signed sum of the factors fits the returns best; of equally good ones, the first."""
     sums, size = whole(state.summed), state.decoder.basis.size
     signs = jnp.asarray(np.array(list(itertools.product((1.0, -1.0), repeat=size))))
-    # Of v = (m, R/T) times (w, -1): the sum of the squares is that about the mean, and that of the mean for each step.
+    # With v = (m, R/T): sum_k T_k (v_k . (w, -1))^2 is the same sum about the mean, plus steps * (mean . (w, -1))^2.
     v = jnp.concatenate([signs, -jnp.ones((len(signs), 1))], axis=1)
     error = jnp.sum((v @ sums.products[:-1, :-1]) * v, axis=1) + sums.steps * (v @ sums.mean[:-1]) ** 2
     return with_weights(state, signs[jnp.argmin(error)][None], jnp.zeros(1))
 
 
 def with_weights(state: ClosedForm, weight: Float[Array, "forms features"], bias: Float[Array, " forms"]) -> ClosedForm:
-    """With a decoder that is fitted to all episodes that are summed."""
+    """Set the weights of the decoder, which were fitted to all episodes in the sums."""
     found = weight.astype(jnp.float32), bias.astype(jnp.float32)
     decoder = eqx.tree_at(lambda d: (d.weight, d.bias), state.decoder, found)
     return state._replace(decoder=decoder, fitted=jnp.sum(state.summed.episodes))

@@ -1,12 +1,12 @@
-"""From what a method's encoder gives to proxy rewards, step by step.
+"""Decoders from the features of a method's encoder to proxy rewards, step by step.
 
-Every decoder is called with rows of features, in one shape:
+All decoders have the same signature:
 
     decoder(features [rows *agents features], key) -> Decoded(r_hat [rows *agents], penalty [rows *agents])
 
-The mean of `penalty` over those who are there is added to the loss of the return decomposition. `key` is for decoders that
-draw while they learn; without one they give what the algorithm is to be trained on. Those that look across steps and agents
-have files of their own, `arel.py` and `stas.py`; their rows must be whole episodes, one behind the other.
+The mean of `penalty` over the agents that are alive is added to the loss of the return decomposition. Some decoders draw random
+numbers by `key` during learning. Without a key, a decoder returns the proxy rewards that the algorithm is trained on. Decoders
+that attend across steps and agents are in `arel.py` and `stas.py`; their rows must be whole episodes, one after another.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from lare.networks import MLP
 
 
 class Decoded(NamedTuple):
-    """What a decoder says of some steps."""
+    """A decoder's output for some steps."""
 
     r_hat: Float[Array, "rows *agents"]
     penalty: Float[Array, "rows *agents"]
@@ -45,7 +45,7 @@ class Bottleneck(eqx.Module):
 
     z ~ N(mu(x), sigma(x)^2),    r_hat = f_psi(z),    penalty = beta E KL(N(mu, sigma^2) || N(0, 1))
 
-    At use z is mu(x).
+    Without a key, z is mu(x).
     """
 
     encoder: MLP

@@ -1,16 +1,17 @@
-"""Return decomposition as a pure learner: what is learned about credit, statistics in, proxy rewards out.
+"""Return decomposition as pure functions on one state: they update statistics and compute proxy rewards.
 
     r_hat = scale * f_psi(normalise(x)),    psi <- descend loss(r_hat / scale, R / (T * scale))
 
-How psi is fitted stands in `descent.py` and, in closed form, in `returns.py`.
+psi is fitted by gradient descent in `descent.py` and in closed form in `returns.py`.
 
-x is what the method's encoder gives (the factors z = phi(s, a), or raw features), `scale` the running root mean square of
-R/T. Where there are many agents, every one has proxy rewards of its own, R is the mean over the agents of their returns,
-and what is fitted to it is the mean over the agents of r_hat: the same equations, credit over time and among agents.
+x is the output of the method's encoder (the factors z = phi(s, a), or raw features). `scale` is the running root mean square
+of R/T. With n agents, each agent has its own proxy rewards, R is the mean of the agents' returns, and the mean of the agents'
+r_hat is fitted to it. The equations stay the same and assign credit over time and among agents.
 
-Many agents' r_hat has another factor of sqrt(nT): R/T is the mean of nT rewards, and a reward that few of them get now and then
-is that much larger than their mean. Adam moves an output by the same step whatever its unit is, and the decoder of many is
-seldom fitted: without the factor it would take dozens of updates of the policy to reach the size of a rare reward.
+With several agents, r_hat is also multiplied by sqrt(nT). R/T is then the mean of nT rewards, and a rare reward of a few agents
+is larger than this mean by about that factor. Adam changes an output by steps of the same size, whatever its unit, and the
+decoder of many agents is seldom fitted: without the factor, it would reach the size of a rare reward only after dozens of
+updates of the policy.
 
 Since features and targets are normalised by statistics in the state, scaling the return, or any factor, changes nothing
 but the scale of r_hat. `normalise = false` is the published form: raw features, raw targets.
@@ -57,64 +58,66 @@ SUM, AVERAGE = 0, 1
 
 
 class Episodes(NamedTuple):
-    """Steps of some episodes, and what those episodes returned.
+    """Steps of some episodes, and the returns of these episodes.
 
-    For K drawn steps, rows = episodes * K, in order, and padding where an episode has fewer; for Diaster, episodes * the
-    longest that there can be.
+    If K steps are drawn from each episode, rows = episodes * K, in order, with padding where an episode has fewer steps. For
+    Diaster, rows = episodes * (steps of the longest possible episode).
     """
 
     features: Float[Array, "rows *agents features"]
     episode: Int[Array, " rows"]
-    """Which of the episodes a row belongs to; `episodes` or more where the row is padding."""
+    """The index of each row's episode; for padding, the number of episodes or more."""
     length: Int[Array, " episodes"]
     mean_reward: Float[Array, " episodes"]
     """R/T."""
     mask: Float[Array, " episodes"]
-    """1 for an episode, 0 for a place that holds none."""
+    """1 for an episode, 0 for an empty place."""
     share: Float[Array, "rows *agents"] | None = None
-    """What part of the team's reward each agent's is: 1/n for each of n that are alive, else 0. All agents alike where None."""
+    """Each agent's share of the team's reward: 1/n for each of the n agents that are alive, else 0. None means equal shares."""
 
 
 class Decomposition(NamedTuple):
-    """Everything that is learned about credit."""
+    """The whole state of return decomposition."""
 
     decoder: Network
     optimizer: optax.OptState
     """Empty for a decoder that is fitted in closed form."""
     statistics: RunningMeanStd
-    """Of the features."""
+    """Running mean and deviation of the features."""
     scale: Scale
-    """Of R/T."""
+    """The scale of R/T."""
     return_scale: Scale
-    """Of R."""
+    """The scale of R."""
     average: Bool[Array, ""]
-    """Whether the score is taken for an average over the steps: r_hat is what the decoder says, divided by T."""
+    """Whether the score is treated as an average over the steps. r_hat is then the output of the decoder, divided by T."""
     predictions: Predictions
-    """By the decoder in force."""
+    """Predictions of returns by the current decoder."""
     closed: ClosedForm | None
-    """For a decoder that is fitted in closed form; and for one that is not where the form of the score is to be found out."""
+    """Present for a decoder in closed form, and for any decoder if the form of the score must be determined."""
     rivals: Predictions | None
-    """By both forms in closed form, where the form of the score is to be found out."""
+    """Predictions of returns by closed-form fits of both forms. Present if the form of the score must be determined."""
 
 
 def whole_episodes(
     features: Sequence[Float[np.ndarray, "_ features"]], returns: Sequence[float], rows: int
 ) -> Episodes:
-    """Whole episodes of a single agent, one behind the other, as `update` takes them for `Fit.ALL_STEPS`.
+    """Whole episodes of a single agent, one after another, as `update` expects them for `Fit.ALL_STEPS`.
 
     Args:
-        features: of each episode, what the decoder sees of its steps.
-        returns: of each episode, the sum of its rewards.
-        rows: as many come out, padding behind the last step included: where that and the number of episodes are always the
-            same, a jitted `update` is compiled once.
+        features: for each episode, the inputs of the decoder at its steps.
+        returns: for each episode, the sum of its rewards.
+        rows: the number of rows of the result, including padding after the last step. If it and the number of episodes are
+            always the same, a jitted `update` is compiled only once.
 
     Raises:
-        LareError: the episodes have more steps than that, or one has none.
+        LareError: the episodes have more than `rows` steps in total, or one of them has no steps.
     """
     length = np.array([len(steps) for steps in features])
     padding = rows - length.sum()
     if padding < 0 or not length.all():
-        raise LareError(f"{length.sum()} steps of {len(length)} episodes: each has one or more, and all at most {rows}")
+        raise LareError(
+            f"{length.sum()} steps of {len(length)} episodes: each needs at least one step, and all together at most {rows}"
+        )
     number = np.repeat(np.arange(len(length)), length)
     return Episodes(
         features=jnp.asarray(np.pad(np.concatenate(features), ((0, padding), (0, 0)))),
@@ -126,7 +129,7 @@ def whole_episodes(
 
 
 def forms_of(settings: CreditSettings, fixed_length: bool) -> tuple[int, ...]:
-    """The forms that are fitted: both where it is not known which the score has, and it makes a difference."""
+    """The forms to fit: both if the form of the score is unknown and makes a difference, else one."""
     if settings.score == "auto":
         return (SUM,) if fixed_length else (SUM, AVERAGE)
     return (SUM,) if settings.score == "sum" else (AVERAGE,)
@@ -144,13 +147,13 @@ def init(
     """An untrained decoder of the method's kind.
 
     Args:
-        key: what its weights are drawn by.
-        features: what it sees of a step and, in closed form, makes of that; or how many numbers it sees and takes as they are.
+        key: the random key for the weights.
+        features: the features that a decoder in closed form computes; or the number of inputs, which are used unchanged.
         method: a row of the table.
-        settings: of the decoder and its fit; the same ones go to every other function of this file.
-        steps: of the longest episode.
-        agents: 1, or how many a step has.
-        forms: that the score may have; the same ones go to every other function of this file that asks for them.
+        settings: the settings of the decoder and its fit. Pass the same settings to every other function of this file.
+        steps: the number of steps of the longest episode.
+        agents: the number of agents of a step.
+        forms: the forms that the score may have. Pass the same forms to every other function that takes them.
     """
     gain = 1.0 if agents == 1 else math.sqrt(steps * agents)
     basis = Basis(0, features, extended=False) if isinstance(features, int) else features
@@ -188,16 +191,16 @@ def init(
 
 
 def optimistic(method: Method, settings: CreditSettings) -> bool:
-    """Whether what little is known of is paid better."""
+    """Whether uncertain steps get higher rewards."""
     return settings.optimism > 0 and "optimism" in method.settings
 
 
 def observe_steps(
     state: Decomposition, features: Float[Array, "*batch features"], mask: Bool[Array, "*batch"] | None = None
 ) -> Decomposition:
-    """Add new steps to the statistics that `normalise` goes by: every step once, when it is met.
+    """Add new steps to the statistics that `normalise` uses. Each step must be added exactly once.
 
-    Places where `mask` is false are passed over.
+    Places where `mask` is false are ignored.
     """
     rows = features.reshape(-1, features.shape[-1])
     return state._replace(statistics=observe(state.statistics, rows, None if mask is None else mask.ravel()))
@@ -209,21 +212,21 @@ def observe_returns(
     length: Int[Array, " batch"],
     finished: Bool[Array, " batch"],
 ) -> Decomposition:
-    """Add newly finished episodes to the scales: every episode once, by R/T and T.
+    """Add newly finished episodes, as R/T and T, to the scales. Each episode must be added exactly once.
 
-    Places where `finished` is false are passed over.
+    Places where `finished` is false are ignored.
     """
     scale = observe_scale(state.scale, mean_reward, finished)
     return state._replace(scale=scale, return_scale=observe_scale(state.return_scale, mean_reward * length, finished))
 
 
 def normalised(state: Decomposition, settings: CreditSettings) -> bool:
-    """Whether the decoder works in units of its own. One that was fitted in closed form has no need to."""
+    """Whether the decoder's inputs and outputs are normalised. A decoder in closed form does not need this."""
     return settings.normalise and not isinstance(state.decoder, LinearDecoder)
 
 
 def unit(state: Decomposition, settings: CreditSettings) -> Float[Array, ""]:
-    """What the decoder's output is in units of: the size of R/T, or of R for an average."""
+    """The unit of the decoder's output: the magnitude of R/T, or of R if the score is an average."""
     if not normalised(state, settings):
         return jnp.ones(())
     return jnp.where(state.average, magnitude(state.return_scale), magnitude(state.scale))
@@ -232,7 +235,7 @@ def unit(state: Decomposition, settings: CreditSettings) -> Float[Array, ""]:
 def inputs(
     state: Decomposition, features: Float[Array, "*batch features"], settings: CreditSettings
 ) -> Float[Array, "*batch features"]:
-    """Features as the decoder is given them."""
+    """The features as the decoder receives them."""
     return standardise(state.statistics, features) if normalised(state, settings) else features
 
 
@@ -243,7 +246,7 @@ def decode(
     settings: CreditSettings,
     key: PRNGKeyArray | None = None,
 ) -> Decoded:
-    """f_psi in units of the scale."""
+    """The output f_psi of the decoder, in its `unit`."""
     return decoder(inputs(state, features, settings), key)
 
 
@@ -253,13 +256,13 @@ def proxy_rewards(
     settings: CreditSettings,
     length: Float[Array, " rows"] | Int[Array, " rows"] | None = None,
 ) -> Float[Array, "rows *agents"]:
-    """r_hat of some steps, in the unit of the true rewards, by the decoder as it stands (also before its first update).
+    """r_hat of some steps, in the unit of the true rewards, by the current decoder, which need not have been updated yet.
 
     Args:
-        state: with the decoder.
-        features: what it sees of the steps.
-        settings: as everywhere.
-        length: T, the steps of each row's episode. Without it, the score is taken for a sum.
+        state: the state, which holds the decoder.
+        features: the inputs of the decoder at the steps.
+        settings: the settings that `init` was called with.
+        length: T, the number of steps of each row's episode. Without it, the score is treated as a sum.
     """
     return of_a_step(unit(state, settings) * decode(state.decoder, state, features, settings).r_hat, state, length)
 
@@ -267,7 +270,7 @@ def proxy_rewards(
 def of_a_step(
     said: Float[Array, "rows *agents"], state: Decomposition, length: Float[Array, " rows"] | Int[Array, " rows"] | None
 ) -> Float[Array, "rows *agents"]:
-    """What a decoder says of steps, as a part of R: of an average, each of T steps has a T-th."""
+    """The decoder's output for some steps as a part of R: divided by T if the score is an average."""
     if length is None:
         return said
     parts = jnp.where(state.average, length, 1).astype(jnp.float32)
@@ -282,8 +285,8 @@ def optimistic_rewards(
 ) -> Float[Array, "rows *agents"]:
     """r_hat + c sigma: optimism in the face of uncertainty (OFUL: Abbasi-Yadkori, Pal and Szepesvari, NeurIPS 2011).
 
-    sigma is the posterior deviation of r_hat, c is `settings.optimism`. They do not add up to the return any more: where
-    little is known they are too high, on purpose. For a decoder in closed form whose `init` was told of the optimism.
+    sigma is the posterior deviation of r_hat, c is `settings.optimism`. These rewards no longer add up to the return: they are
+    too high for uncertain steps, on purpose. The decoder must be in closed form, and `init` must have had the same optimism.
     """
     r_hat = proxy_rewards(state, features, settings, length)
     assert state.closed is not None
@@ -298,7 +301,7 @@ def optimistic_rewards(
 def over_agents(
     values: Float[Array, "rows *agents"], share: Float[Array, "rows *agents"] | None
 ) -> Float[Array, " rows"]:
-    """The mean over those who are there."""
+    """The mean over the agents that are alive."""
     if share is None:
         return jnp.mean(values.reshape(len(values), -1), axis=1)
     return jnp.sum((values * share).reshape(len(values), -1), axis=1)

@@ -1,4 +1,4 @@
-"""Decoders that descend a gradient: the loss that a method's fit names, and one step of Adam by it."""
+"""Decoders that are fitted by gradient descent: the loss of a method's fit, and one step of Adam on it."""
 
 from functools import partial
 
@@ -17,7 +17,7 @@ from lare.networks import descend
 def loss_and_gradient(
     state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
 ) -> tuple[Float[Array, ""], Network]:
-    """The loss that `fit` names, and its gradient by the decoder's weights."""
+    """The loss of `fit`, and its gradient with respect to the decoder's weights."""
     loss = loss_of_pieces if fit is Fit.SUBTRAJECTORIES else partial(loss_of_means, fit=fit)
     return jax.value_and_grad(loss)(state.decoder, state, episodes, key, settings=settings)
 
@@ -25,7 +25,7 @@ def loss_and_gradient(
 def targets(
     state: Decomposition, episodes: Episodes, settings: CreditSettings
 ) -> tuple[Float[Array, " episodes"], Float[Array, " episodes"]]:
-    """R/T, or R where it is an average, in units of their size; and the weight of each episode."""
+    """The target of each episode (R/T, or R if the score is an average) in the decoder's `unit`, and its weight."""
     target = episodes.mean_reward * jnp.where(state.average, episodes.length, 1) / unit(state, settings)
     return target, losses.episode_weight(episodes.length, episodes.mask, settings.sum_form)
 
@@ -33,7 +33,7 @@ def targets(
 def loss_of_means(
     decoder: Network, state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
 ) -> Float[Array, ""]:
-    """RD, RRD and RRD-unbiased: mean r_hat of an episode's steps against R/T; and what the decoder adds of its own."""
+    """The loss of RD, RRD and RRD-unbiased: mean r_hat of an episode's steps against R/T, plus the decoder's penalty."""
     target, weight = targets(state, episodes, settings)
     decoded = decode(decoder, state, episodes.features, settings, key)
     r_hat, penalty = (over_agents(values, episodes.share) for values in decoded)
@@ -52,7 +52,7 @@ def loss_of_means(
 def loss_of_pieces(
     decoder: Network, state: Decomposition, episodes: Episodes, key: PRNGKeyArray, settings: CreditSettings
 ) -> Float[Array, ""]:
-    """Diaster."""
+    """The loss of Diaster."""
     assert isinstance(decoder, Diaster)
     target, _ = targets(state, episodes, settings)
     whole = episodes.features.reshape(len(target), -1, episodes.features.shape[-1])
@@ -64,7 +64,7 @@ def update(
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
     """One step of gradient descent on a batch of episodes; returns the new state, and `credit/loss`.
 
-    The loss is in squared units of `scale`, or of the reward where `normalise` is off.
+    The loss is in squared units of `scale`, or of the reward if `normalise` is off.
     """
     return step(state, *loss_and_gradient(state, episodes, key, fit, settings), settings)
 
@@ -72,10 +72,10 @@ def update(
 def update_in_parts(
     state: Decomposition, parts: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """One step by the mean of the gradients of several parts: equally many episodes each, all of which count.
+    """One step by the mean of the gradients of several parts. Each part has the same number of episodes, none of them masked.
 
-    `parts` has a leading axis. The gradient is that of all the episodes together, but no intermediate is larger than a
-    part of them, so that all stay in the processor's cache.
+    `parts` has a leading axis. The gradient equals that of all episodes together, but intermediate arrays are only as large
+    as for one part, so that they stay in the processor's cache.
     """
     keys = jax.random.split(key, len(parts.length))
 
@@ -91,7 +91,7 @@ def update_in_parts(
 def step(
     state: Decomposition, loss: Float[Array, ""], gradient: Network, settings: CreditSettings
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """Adam by a gradient, with the decay of the weights added to it."""
+    """One step of Adam, with the weight decay added to the gradient."""
     gradient = jax.tree.map(lambda slope, weight: slope + settings.weight_decay * weight, gradient, state.decoder)
     decoder, optimizer = descend(state.decoder, gradient, state.optimizer, settings.learning_rate)
     return state._replace(decoder=decoder, optimizer=optimizer), {"credit/loss": loss}

@@ -1,15 +1,17 @@
 """Diaster: episodic return decomposition by difference of implicitly assigned sub-trajectory reward (Lin et al., AAAI 2024).
 
-A sub-trajectory model F says what a piece of an episode pays. Cut an episode anywhere, and its two pieces pay the return:
+A sub-trajectory model F predicts the reward of a piece of an episode. The rewards of the two pieces of a cut episode add up to
+the return:
 
     (F(0..c) + F(c..T) - R)^2,    c uniform in 1..T-1
 
-What a step pays is the difference of two prefixes, which a step model learns, so that it need not be told what came before:
+The reward of a step is the difference of F for two prefixes. A step model learns this difference from the step alone:
 
     (r_hat(s_t, a_t) - (F(0..t+1) - F(0..t)))^2,    with R in the place of F(0..T)
 
-F is a GRU (Cho et al., 2014) over the steps of a piece, from nothing. The unit of F is the return of the longest episode at the
-mean reward: it predicts numbers around 1, and the step model, in units of the scale, L times its differences.
+F is a GRU (Cho et al., 2014) over the steps of a piece, with an initial state of zeros. With L the length of the longest
+episode, the unit of F is L times the scale of R/T, so that F is around 1. The step model is in units of the scale, and so
+learns L times the differences of F.
 """
 
 import equinox as eqx
@@ -35,13 +37,13 @@ class Diaster(eqx.Module):
         self.step = MLP(features, hidden, 1, key=step_key)
 
     def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
-        """What the step model says."""
+        """The output of the step model."""
         return Decoded(self.step(features)[..., 0], jnp.zeros(features.shape[:-1]))
 
     def pieces(
         self, features: Float[Array, "batch steps features"], begins: Bool[Array, "batch steps"]
     ) -> Float[Array, "batch steps"]:
-        """F of the piece that ends with each step; a piece begins wherever `begins` says so."""
+        """F of the piece that ends with each step. A piece begins wherever `begins` is true."""
 
         def one(h: Float[Array, "batch size"], turn: tuple[Array, Array]):
             given, first = turn
@@ -60,7 +62,7 @@ class Diaster(eqx.Module):
         weight: Float[Array, " batch"],
         key: PRNGKeyArray,
     ) -> Float[Array, ""]:
-        """Both losses of some episodes; `target` is R/T in units of the scale, steps behind an episode's length are none."""
+        """The sum of both losses. `target` is R/T in units of the scale. Steps beyond an episode's length are padding."""
         steps = features.shape[1]
         number, last = jnp.arange(steps), jnp.maximum(length - 1, 0)[:, None]
         total = target * length / steps

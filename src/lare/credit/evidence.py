@@ -1,30 +1,31 @@
-"""Linear regression of returns on what episodes were like, with the strength of every group of features set by the evidence.
+"""Linear regression of returns on mean features of episodes, with one prior precision for each group of features.
 
-A step pays something linear in its features f, and something that nothing tells:
+The reward of a step is linear in its features f, plus noise:
 
     r_t = b + w . f_t + e_t,      w_i ~ N(0, 1 / alpha_g)  for every i in group g,      e_t ~ N(0, 1 / beta)
 
-Of an episode k of T steps only the sum is known. With m_k the mean of its features, its mean reward y_k = R_k / T is
+Of an episode k of T steps only the sum of the rewards is known. With m_k the mean of its features, its mean reward
+y_k = R_k / T is
 
     y_k = b + w . m_k + N(0, 1 / (beta T_k))
 
-With the flat prior of b integrated out, everything follows from sums over episodes, each weighted by its steps, about their
-weighted means: S = sum T (m - m')(m - m')^T, p = sum T (m - m')(y - y'), q = sum T (y - y')^2. The posterior of w is
-N(mu, Sigma):
+b has a flat prior, which is integrated out. Everything else is computed from sums over episodes, each weighted by its number of
+steps: the weighted means m' and y', and S = sum T (m - m')(m - m')^T, p = sum T (m - m')(y - y'), q = sum T (y - y')^2. The
+posterior of w is N(mu, Sigma):
 
     Sigma^-1 = beta S + diag(alpha),     mu = beta Sigma p,     b = y' - mu . m'
 
-The precisions are those under which the returns are most likely. At the maximum of the evidence, with n_g features in a
-group and gamma_g of them determined by the data (MacKay, Neural Computation 4, 1992; Tipping, JMLR 1, 2001):
+The precisions alpha and beta maximise the evidence, which is the likelihood of the returns. At the maximum, with n_g features in
+a group and gamma_g of them determined by the data (MacKay, Neural Computation 4, 1992; Tipping, JMLR 1, 2001):
 
     gamma_g = n_g - alpha_g tr Sigma_gg,     alpha_g = gamma_g / |mu_g|^2,
     beta = (N - 1 - sum gamma) / (q - 2 mu . p + mu . S mu)
 
-A group that does not help is switched off by the data (alpha grows), one that is needed is switched on. That regression can be
-on sums over groups of cases is the setting of Law et al. (NeurIPS 2018); that it recovers rewards, of Efroni et al. (AAAI 2021).
+The data switch off a group that does not help (its alpha grows), and switch on a group that is needed. Law et al. (NeurIPS 2018)
+regress on sums over groups of cases. Efroni et al. (AAAI 2021) show that such a regression recovers rewards.
 
-A score may instead be an average over steps or a mark, R_k = b + w . m_k + N(0, 1 / (beta T_k)): the same with y_k = R_k, on
-the same S. A step then pays (b + w . f) / T.
+A score may instead be an average over steps, or a grade: R_k = b + w . m_k + N(0, 1 / (beta T_k)). The equations are the same,
+with y_k = R_k and the same S. The reward of a step is then (b + w . f) / T.
 """
 
 from typing import NamedTuple
@@ -36,15 +37,15 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 RANGE = 1e6
-"""A group may explain so many times more, or less, of the returns than its equal share. Beyond, it is off; but not so far off
-that it could not come back."""
+"""A group may explain at most this many times more, or less, of the returns than its equal share. The limit allows a group that
+was switched off to be switched on again."""
 ROUNDING = 1e-10
-"""So much of the diagonal of S is added to it: more than float64 has lost there. Where features repeat each other, S alone could
-not be factorised."""
+"""This fraction of the diagonal of S is added to S. It exceeds the rounding errors of float64. Without it, S could not be
+factorised if features are collinear."""
 GAIN = 1e-3
-"""In the log evidence: a round of the fixed point that changes it by less is the last one."""
+"""The iteration to the fixed point ends when a round changes the log evidence by less than this."""
 LEAST_NOISE = 1e-10
-"""Of the returns' variance. Features and returns in float32 tell no smaller one."""
+"""Smallest variance of the noise, relative to that of the returns. Float32 features and returns cannot resolve less."""
 
 
 class Sums(NamedTuple):
@@ -58,7 +59,7 @@ class Sums(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """What is known of the weights, but for their covariance, which `covariance` makes from the sums."""
+    """The posterior of the weights, without their covariance, which `covariance` computes from the sums."""
 
     weight: Float[Array, " features"]
     bias: Float[Array, ""]
@@ -67,9 +68,9 @@ class Posterior(NamedTuple):
     beta: Float[Array, ""]
     """Precision of a step's noise, in the same units."""
     determined: Float[Array, " groups"]
-    """gamma."""
+    """gamma: how many features of each group are determined by the data."""
     log_evidence: Float[Array, ""]
-    """Up to a constant that groups and precisions do not change."""
+    """Up to a constant that does not depend on groups and precisions."""
 
 
 def no_sums(features: int) -> Sums:
@@ -84,9 +85,9 @@ def add_episodes(
     returns: Float[Array, " episodes"],
     length: Int[Array, " episodes"],
 ) -> Sums:
-    """With more episodes. Places of length 0 hold none.
+    """Add episodes to the sums. Places of length 0 are empty.
 
-    Sums over parts are joined after Chan, Golub and LeVeque (1983): no catastrophic cancellation.
+    Both sums are combined as in Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
     """
     weight = length.astype(sums.mean.dtype)
     v = jnp.concatenate([means, (returns / jnp.maximum(weight, 1))[:, None], returns[:, None]], axis=1)
@@ -101,24 +102,24 @@ def add_episodes(
 
 
 def unknown(features: int, groups: int) -> Posterior:
-    """Before there was an episode: no precision has a value yet."""
+    """The posterior before the first episode. A precision of 0 means that it has no value yet."""
     zero = jnp.zeros(())
     return Posterior(jnp.zeros(features), zero, jnp.zeros(groups), zero, jnp.zeros(groups), zero)
 
 
 class Problem(NamedTuple):
-    """S, p and q, with y in units of its deviation, and how many episodes they are of."""
+    """S, p and q, with y in units of its standard deviation, and the number of episodes."""
 
     s: Float[Array, "features features"]
     p: Float[Array, " features"]
     q: Float[Array, ""]
     free: Float[Array, ""]
-    """N - 1."""
+    """N - 1, where N is the number of episodes."""
     unit: Float[Array, ""]
-    """Deviation of y."""
+    """The standard deviation of y."""
     group: Int[np.ndarray, " features"]
     equal: Float[Array, " groups"]
-    """The alpha of each group with which all explain equal parts of the returns, half of them in all."""
+    """The alpha of each group under which all groups explain equal parts of the returns, and together half of them."""
 
 
 def problem(sums: Sums, form: Int[Array, ""] | int, group: Int[np.ndarray, " features"]) -> Problem:
@@ -126,7 +127,7 @@ def problem(sums: Sums, form: Int[Array, ""] | int, group: Int[np.ndarray, " fea
     features = len(group)
     column = features + form
     unit = jnp.sqrt(sums.products[column, column] / jnp.maximum(sums.steps, 1))
-    unit = jnp.where(unit > 1e-6 * jnp.abs(sums.mean[column]), unit, 0)  # float32 makes so much of a constant
+    unit = jnp.where(unit > 1e-6 * jnp.abs(sums.mean[column]), unit, 0)  # a constant may vary by this much in float32
     safe = jnp.where(unit > 0, unit, 1)
     s = sums.products[:features, :features]
     s = s + ROUNDING * jnp.diag(jnp.diagonal(s))
@@ -140,14 +141,14 @@ def problem(sums: Sums, form: Int[Array, ""] | int, group: Int[np.ndarray, " fea
 def fit(
     sums: Sums, form: Int[Array, ""] | int, group: Int[np.ndarray, " features"], start: Posterior, rounds: int
 ) -> Posterior:
-    """The posterior under the precisions that the fixed point leads to.
+    """The posterior under the precisions that the iteration to the fixed point gives.
 
     Args:
-        sums: over the episodes.
-        form: 0 where the score is a sum over the steps, 1 where it is an average.
-        group: the number of each feature's group.
-        start: an earlier fit, with whose precisions the first round begins; or `unknown`.
-        rounds: at most; there are fewer where the evidence stops changing.
+        sums: the sums over episodes.
+        form: 0 if the score is a sum over the steps, 1 if it is an average.
+        group: the index of each feature's group.
+        start: an earlier fit, whose precisions start the iteration; or `unknown`.
+        rounds: the maximum number of rounds. The iteration ends earlier if the evidence stops changing.
     """
     given = problem(sums, form, group)
     alpha = jnp.where(start.alpha > 0, start.alpha, given.equal)
@@ -176,8 +177,8 @@ def fit(
 def within(
     given: Problem, alpha: Float[Array, " groups"], beta: Float[Array, ""]
 ) -> tuple[Float[Array, " groups"], Float[Array, ""]]:
-    """Precisions that float32 can calculate with."""
-    of_all = jnp.maximum(given.free, 1) / given.q  # where all is noise
+    """Clip precisions to a range that float32 can represent in calculations."""
+    of_all = jnp.maximum(given.free, 1) / given.q  # the precision if everything is noise
     alpha = jnp.clip(alpha, given.equal / RANGE, given.equal * RANGE)
     return alpha, jnp.clip(beta, of_all / 2, of_all / LEAST_NOISE)
 
@@ -217,7 +218,7 @@ def one_round(given: Problem, alpha: Float[Array, " groups"], beta: Float[Array,
 
 
 class Spread(NamedTuple):
-    """How far off b + w . f may be: its posterior variance is |root (f - centre)|^2 + of_mean, in squared units of y."""
+    """The uncertainty of b + w . f: its posterior variance is |root (f - centre)|^2 + of_mean, in squared units of y."""
 
     root: Float[Array, "*forms features features"]
     """root^T root = Sigma."""
@@ -228,7 +229,7 @@ class Spread(NamedTuple):
 
 
 def spread(sums: Sums, form: Int[Array, ""] | int, group: Int[np.ndarray, " features"], known: Posterior) -> Spread:
-    """Of a posterior. Prior deviations where nothing is known of a feature; 0 where no two returns differ yet."""
+    """The spread of a posterior. A feature without data has its prior deviation. All is 0 as long as all returns are equal."""
     given = problem(sums, form, group)
     alpha, beta = within(given, known.alpha, known.beta)
     factor, scale = precision(given, alpha, beta)

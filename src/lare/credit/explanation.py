@@ -1,13 +1,14 @@
-"""What returns say of the factors: how much of their variation the factors explain, which of them, and what they leave.
+"""How much of the variation of returns the factors explain, which factors do, and what correlates with the residual.
 
-From the sums that a fit in closed form goes by (`evidence.py`), with S, p and q as there. With N episodes, a fit under which a
-step's noise has precision beta explains the share
+Everything is computed from the sums of a closed-form fit; S, p and q are those of `evidence.py`. With N episodes, and precision
+beta of the noise of a step, a fit explains the share
 
     1 - (1 / beta) / (q / (N - 1))
 
-of the variation: as an R^2, but for the freedom that the fit has used up. A factor's share of that is in proportion to the
-covariance of its features with the prediction, the sum of their mu_i (S mu)_i, or 0 where that is negative: the shares of all
-factors add up to the whole. What a fit on the factors alone leaves correlates with the mean of raw entry j over an episode by
+of the variation. This is an R^2 that is corrected for the degrees of freedom of the fit. A factor's part of this share is
+proportional to the covariance of its features with the prediction, the sum of their mu_i (S mu)_i, or 0 if that is negative. The
+parts of all factors add up to the share. The correlation of the residual of a fit on the factors alone with the mean of raw
+entry j over an episode is
 
     (p - S mu)_j / sqrt(S_jj (q - 2 mu . p + mu . S mu))
 """
@@ -23,30 +24,30 @@ from lare.credit.basis import FREQUENCIES, Basis
 from lare.credit.evidence import Posterior, Sums
 
 ROUNDS = 100
-"""Of the evidence's fixed point: there is no earlier fit to begin with."""
+"""Maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
 
 
 class Explanation(NamedTuple):
-    """Of one team's score."""
+    """The explanation of one team's score."""
 
     episodes: Float[Array, ""]
     by_factors: Float[Array, ""]
-    """Share of the returns' variation that the factors explain, with their shapes and pairs; 0 where there are none."""
+    """Share of the returns' variation that the factors explain, with their shapes and pairs; 0 if there are no factors."""
     by_all: Float[Array, ""]
-    """The same, with raw entries too."""
+    """Share of the variation that factors and raw entries explain together."""
     weight: Float[Array, " factors"]
-    """What a step pays more, where a factor is larger by one of its deviations, by the linear part of the fit on factors. Where the
-    score is an average: what a step of an episode of average length adds to it."""
+    """How much a step's reward rises if a factor rises by one standard deviation, by the linear part of the fit on factors. If the
+    score is an average: the rise for a step of an episode of average length."""
     deviation: Float[Array, " factors"]
-    """Posterior deviation of that."""
+    """Posterior deviation of `weight`."""
     share: Float[Array, " factors"]
-    """Part of the returns' variation that goes with each factor, with its shapes and half of its pairs."""
+    """Share of the returns' variation that each factor explains, with its shapes and half of its pairs."""
     left: Float[Array, " entries"]
-    """Correlation of each raw entry with what the factors leave; 0 for an entry that never varied."""
+    """Correlation of each raw entry with the residual of the fit on factors; 0 for an entry that has never varied."""
 
 
 def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation:
-    """The explanation by sums over features of a basis. In float64."""
+    """Explain returns by sums over the features of a basis, in float64."""
     group, of_factors = basis.group, basis.of_factors
     whole = evidence.fit(sums, form, group, evidence.unknown(basis.size, len(basis.sizes)), ROUNDS)
     by_all = explained(sums, form, group, whole)
@@ -63,7 +64,7 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     by_factors = explained(alone, form, numbers, fitted)
     share = jnp.maximum(of_each(part, basis), 0)
     share = by_factors * share / jnp.where(jnp.any(share > 0), jnp.sum(share), 1)
-    steps = jnp.where(form == 1, sums.steps / jnp.maximum(sums.episodes, 1), 1)  # r_hat of an average is a T-th
+    steps = jnp.where(form == 1, sums.steps / jnp.maximum(sums.episodes, 1), 1)  # r_hat of an average is divided by T
     return Explanation(
         sums.episodes,
         by_factors,
@@ -85,14 +86,14 @@ def restricted(sums: Sums, features: Int[np.ndarray, " some"]) -> Sums:
 def explained(
     sums: Sums, form: Int[Array, ""] | int, group: Int[np.ndarray, " features"], known: Posterior
 ) -> Float[Array, ""]:
-    """The share of the variation that a fit explains; NaN where there is none."""
+    """The share of the variation that a fit explains; NaN if returns are too few or do not vary."""
     given = evidence.problem(sums, form, group)
     share = 1 - given.free / (given.q * jnp.where(known.beta > 0, known.beta, 1))
     return jnp.where((given.free > 1) & (given.unit > 0), jnp.clip(share, 0, 1), jnp.nan)
 
 
 def of_each(part: Float[Array, " features"], basis: Basis) -> Float[Array, " factors"]:
-    """The parts of features, by the factor that they are of; of a pair, half to each."""
+    """The sum of the features' parts for each factor. Each factor of a pair gets half of the pair's part."""
     total = part[: basis.factors]
     if not basis.extended:
         return total
@@ -105,7 +106,7 @@ def of_each(part: Float[Array, " features"], basis: Basis) -> Float[Array, " fac
 def residual(
     sums: Sums, form: Int[Array, ""] | int, basis: Basis, fitted: Posterior, of_factors: np.ndarray
 ) -> Float[Array, " entries"]:
-    """Correlation of the raw entries with what a fit on the factors leaves."""
+    """Correlation of the raw entries with the residual of a fit on the factors."""
     given = evidence.problem(sums, form, basis.group)
     unit = jnp.where(given.unit > 0, given.unit, 1)
     weight = jnp.zeros(basis.size).at[np.flatnonzero(of_factors)].set(fitted.weight / unit)

@@ -1,10 +1,11 @@
-"""How well factors would have told the returns of some episodes, each before it was seen; and what all of them say of the factors.
+"""How well factors predict returns that a fit has not seen, and the explanation of all returns by the factors.
 
     R^2 = 1 - sum_k (R_k - R_hat_k)^2 / sum_k (R_k - mean R)^2
 
-R_hat_k is by a fit in closed form, on the factors alone, to episodes before k (the prequential principle: Dawid, Journal of
-the Royal Statistical Society A 147, 1984), made anew whenever these have grown by a twentieth. No return is seen before it is
-predicted; the factors are standardised over all episodes. So two functions can be compared, however many factors each has.
+R_hat_k is predicted by a closed-form fit, on the factors alone, to episodes before k (the prequential principle: Dawid, Journal
+of the Royal Statistical Society A 147, 1984). The fit is repeated whenever the number of episodes has grown by a twentieth. No
+return is seen before it is predicted, but the factors are standardised over all episodes. R^2 thus allows comparing two functions
+with different numbers of factors.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,16 +27,16 @@ from lare.credit.explanation import Explanation, explain
 from lare.credit.returns import BETTER
 
 FIRST = 10
-"""Episodes before the first that is predicted."""
+"""Number of episodes before the first prediction."""
 
 
 class Judgement(NamedTuple):
-    """Of factors, by one team's score."""
+    """The judgement of factors by one team's returns."""
 
     r2: float
-    """NaN where all episodes returned the same, or are too few."""
+    """NaN if all returns are equal or there are too few."""
     average: bool | None
-    """Whether the score is taken for an average over steps; None where it makes no difference."""
+    """Whether the score is treated as an average over steps; None if it makes no difference."""
     explanation: Explanation
 
 
@@ -46,14 +47,14 @@ def judge(
     basis: Basis,
     score: str | None = None,
 ) -> Judgement:
-    """Judge the factors of some episodes, in the order in which these were played.
+    """Judge the factors of some episodes, which must be in the order of play.
 
     Args:
-        rows: [z, s', a] of each step and agent, by episode.
-        alive: which agents acted.
-        returns: R.
-        basis: what is made of the rows.
-        score: `sum` or `average`, where that is known.
+        rows: for each episode, [z, s', a] of each step and agent.
+        alive: for each episode, which agents acted at each step.
+        returns: R of each episode.
+        basis: the features that are computed from the rows.
+        score: `sum` or `average`, if the form of the score is known.
     """
     length = np.array([len(steps) for steps in rows])
     with jax.enable_x64(True):
@@ -74,16 +75,16 @@ def judge(
 def mean_features(
     rows: Sequence[Float[np.ndarray, "_ agents inputs"]], alive: Sequence[Bool[np.ndarray, "_ agents"]], basis: Basis
 ) -> Float[np.ndarray, "episodes features"]:
-    """M of each episode, with inputs standardised over all steps."""
+    """The mean features of each episode, with inputs standardised over all steps."""
     every = np.concatenate([steps[there] for steps, there in zip(rows, alive, strict=True)]).astype(np.float64)
     mean, spread = every.mean(axis=0), every.std(axis=0)
-    spread = np.where(spread > 1e-6 * np.abs(mean), spread, 0)  # float32 makes so much of a constant
+    spread = np.where(spread > 1e-6 * np.abs(mean), spread, 0)  # a constant may vary by this much in float32
     known = (jnp.asarray(one, jnp.float32) for one in (mean, spread, np.zeros(basis.size), 0))
     decoder, longest = LinearDecoder(basis, *known), max(map(len, rows))
     found = []
     for steps, there in zip(rows, alive, strict=True):
         share = there / np.maximum(there.sum(axis=1, keepdims=True), 1) / len(steps)
-        padding = (0, longest - len(steps)), (0, 0)  # to one length, so that it is compiled once
+        padding = (0, longest - len(steps)), (0, 0)  # to one length, so that `of_one` is compiled once
         found.append(of_one(decoder, np.pad(steps, (*padding, (0, 0))).astype(np.float32), np.pad(share, padding)))
     return np.stack(found)
 
@@ -139,7 +140,7 @@ explained = jax.jit(explain, static_argnames="basis")
 
 
 def growing(count: int) -> Iterator[tuple[int, int]]:
-    """Episodes that are learned from together: the first ones, then always a few more."""
+    """Start and end of each block of episodes that are added together: the first ones, then about a twentieth more each time."""
     start, end = 0, min(FIRST, count)
     while start < count:
         yield start, end

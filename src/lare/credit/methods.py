@@ -1,8 +1,8 @@
 """THE table: every published way to assign credit, as encoder + fit + decoder.
 
-A *method* says what the algorithm is trained on. `encoder` is what the decoder sees of a step, `fit` how it is fitted to
-returns, `decoder` what it is. The two ends of the table fit nothing: `dense` trains on the true rewards, `episodic` on the
-return, paid at the last step. The rows serve one agent and many; those that need several agents say so.
+A *method* determines the rewards that the algorithm is trained on. `encoder` names the inputs of the decoder, `fit` the way it is
+fitted to returns, and `decoder` its kind. `dense` and `episodic` fit nothing: `dense` trains on the true rewards, `episodic` on
+the return, paid at the last step. A method works for one agent and for many, unless its row says otherwise.
 """
 
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from lare.errors import LareError, did_you_mean
 
 
 class Encoder(StrEnum):
-    """What the decoder sees of a step."""
+    """The inputs of the decoder for a step."""
 
     RAW = "raw"
-    """As published for RD and RRD: [s, a, s - s'] of a single agent, the next observation of each of many."""
+    """As published for RD and RRD: [s, a, s - s'] of a single agent, or the next observation of each of many agents."""
     STATE_ACTION = "state and action"
     """[s, a]."""
     NEXT = "next state and action"
@@ -35,32 +35,32 @@ class Fit(StrEnum):
     DRAWN_STEPS = "drawn steps"
     """RRD: K steps drawn from each episode."""
     DRAWN_STEPS_UNBIASED = "drawn steps, unbiased"
-    """RRD-unbiased: the same, less the variance that the drawing adds."""
+    """RRD-unbiased: as RRD, minus the variance that the drawing adds."""
     SUBTRAJECTORIES = "two pieces of an episode"
-    """Diaster: the two pieces of an episode that was cut somewhere (equations in `diaster.py`)."""
+    """Diaster: the two pieces of an episode that is cut at a random step (equations in `diaster.py`)."""
     EVIDENCE = "evidence"
     """In closed form, on all episodes (equations in `evidence.py`)."""
     SIGNS = "best signs"
-    """The same, over the signs of a sum (equation in `closed_form.py`)."""
+    """In closed form: the best signs of a sum of the factors (equation in `closed_form.py`)."""
 
     @property
     def closed_form(self) -> bool:
-        """Whether nothing descends a gradient."""
+        """Whether the fit needs no gradient descent."""
         return self in (Fit.EVIDENCE, Fit.SIGNS)
 
     @property
     def apart(self) -> bool:
-        """Whether it is too expensive to go with every update of the algorithm, and goes between chunks of them."""
+        """Whether the fit is too expensive for every update of the algorithm, and so runs between chunks of updates."""
         return self is Fit.SUBTRAJECTORIES
 
 
 class Decoder(StrEnum):
-    """From what the encoder gives to proxy rewards."""
+    """The kinds of decoder, from the encoder's output to proxy rewards."""
 
     STEP = "step"
     """An MLP on each step of each agent."""
     BOTTLENECK = "bottleneck"
-    """The same behind a variational information bottleneck."""
+    """The same MLP after a variational information bottleneck."""
     AREL = "arel"
     """Attention over time and agents; one reward a step for all agents."""
     STAS = "stas"
@@ -68,9 +68,9 @@ class Decoder(StrEnum):
     DIASTER = "diaster"
     """A recurrent model of pieces of an episode, and an MLP on each step that learns its differences."""
     LINEAR = "linear"
-    """A weighted sum of what it is given."""
+    """A weighted sum of the inputs."""
     ADDITIVE = "additive"
-    """A weighted sum of that, of functions of each number in it, and of pairs of factors (`basis.py`)."""
+    """A weighted sum of the inputs, of functions of each input, and of pairs of factors (`basis.py`)."""
 
 
 class Reward(StrEnum):
@@ -79,11 +79,11 @@ class Reward(StrEnum):
     TRUE = "true"
     EPISODIC = "episodic"
     PROXY = "proxy"
-    """What the decoder says."""
+    """The output of the decoder."""
     UNIFORM = "uniform"
-    """The mean reward of the episode, between the lowest and the highest so far (of many agents: of those stored)."""
+    """The mean reward of the episode, scaled to [0, 1] by the lowest and highest so far."""
     DESIGNED = "designed"
-    """What a reward function of the language model says."""
+    """The output of a reward function that the language model wrote."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +98,11 @@ class Method:
     source: str
     decoder: Decoder = Decoder.STEP
     shared: bool = False
-    """Whether every agent gets the mean of all agents' proxy rewards: credit over time alone."""
+    """Whether every agent gets the mean of all agents' proxy rewards: credit over time, but not among agents."""
 
     @property
     def has_proxy(self) -> bool:
-        """Whether it gives every step a reward of its own making."""
+        """Whether it computes a proxy reward for every step."""
         return self.reward not in (Reward.TRUE, Reward.EPISODIC)
 
     @property
@@ -122,18 +122,18 @@ class Method:
 
     @property
     def settings(self) -> frozenset[str]:
-        """Which of the decoder's settings (`CreditSettings`) make a difference."""
+        """The settings of the decoder (`CreditSettings`) that the method reads."""
         of_descent = DESCENT | OF_DECODER[self.decoder] if self.descends else frozenset()
         return of_descent | (OF_FIT[self.fit] if self.fit is not None else frozenset())
 
     @property
     def kind(self) -> Literal["factors", "reward"]:
-        """What a language model is asked for, where the encoder is its function."""
+        """The kind of function that a language model is asked for, if the method needs one."""
         return "reward" if self.reward is Reward.DESIGNED else "factors"
 
     @property
     def for_many_only(self) -> bool:
-        """Whether it says nothing where there is a single agent."""
+        """Whether it needs several agents."""
         return self.shared or self.whole_episodes
 
     @property
@@ -143,7 +143,7 @@ class Method:
 
     @property
     def for_one_only(self) -> bool:
-        """Whether it says nothing where there are many."""
+        """Whether it works for a single agent only."""
         return self.decoder is Decoder.DIASTER
 
 
@@ -163,7 +163,7 @@ OF_DECODER: dict[Decoder, frozenset[str]] = {
     Decoder.STAS: frozenset(),
     Decoder.DIASTER: frozenset({"hidden"}),
 }
-"""Settings, by what reads them: whatever descends a gradient, each fit, each decoder."""
+"""The settings that are read by every fit by gradient descent, by each fit, and by each decoder."""
 
 LARE = "Qu et al., LaRe, AAAI 2025"
 RD = "Efroni et al., AAAI 2021; Arjona-Medina et al., RUDDER, 2019"
@@ -172,19 +172,19 @@ BAYES = "this package, docs/closed-form.md; Efroni et al., AAAI 2021; MacKay, 19
 VIB = "Alemi et al., ICLR 2017; LaRe, appendix F.2"
 
 TABLE = (
-    Method("dense", Reward.TRUE, None, None, "the true reward of every step: the upper end", "-"),
-    Method("episodic", Reward.EPISODIC, None, None, "the return, paid at the last step: the lower end", "-"),
+    Method("dense", Reward.TRUE, None, None, "the true reward of every step: the upper reference", "-"),
+    Method("episodic", Reward.EPISODIC, None, None, "the return, paid at the last step: the lower reference", "-"),
     Method(
         "ircr",
         Reward.UNIFORM,
         None,
         None,
-        "every step of an episode alike, between the worst and the best episode",
+        "the same reward for all steps of an episode, from 0 (the worst episode) to 1 (the best)",
         "Gangwani et al., IRCR, NeurIPS 2020",
     ),
     Method("rd", Reward.PROXY, Encoder.RAW, Fit.ALL_STEPS, "return decomposition on raw features", RD),
     Method("rrd", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS, "randomized return decomposition", RRD),
-    Method("rrdu", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS_UNBIASED, "RRD without the bias of the drawing", RRD),
+    Method("rrdu", Reward.PROXY, Encoder.RAW, Fit.DRAWN_STEPS_UNBIASED, "RRD without the bias of drawing steps", RRD),
     Method(
         "rrdu-next",
         Reward.PROXY,
@@ -212,14 +212,20 @@ TABLE = (
         Decoder.ADDITIVE,
     ),
     Method(
-        "vib-rd", Reward.PROXY, Encoder.RAW, Fit.ALL_STEPS, "RD behind a bottleneck of its own", VIB, Decoder.BOTTLENECK
+        "vib-rd",
+        Reward.PROXY,
+        Encoder.RAW,
+        Fit.ALL_STEPS,
+        "RD after a learned information bottleneck",
+        VIB,
+        Decoder.BOTTLENECK,
     ),
     Method(
         "vib-rrdu",
         Reward.PROXY,
         Encoder.RAW,
         Fit.DRAWN_STEPS_UNBIASED,
-        "RRD-unbiased behind a bottleneck of its own",
+        "RRD-unbiased after a learned information bottleneck",
         VIB,
         Decoder.BOTTLENECK,
     ),
@@ -228,7 +234,7 @@ TABLE = (
         Reward.PROXY,
         Encoder.STATE_ACTION,
         Fit.SUBTRAJECTORIES,
-        "differences of what pieces of an episode pay",
+        "differences between predicted rewards of pieces of an episode",
         "Lin et al., Diaster, AAAI 2024",
         Decoder.DIASTER,
     ),
@@ -266,7 +272,7 @@ TABLE = (
         Reward.PROXY,
         Encoder.LATENT_AND_NEXT,
         Fit.EVIDENCE,
-        "regression on latent rewards and, where the returns ask for them, on functions of them and of raw features",
+        "regression on latent rewards and, if the returns require them, on functions of them and of raw features",
         BAYES,
         Decoder.ADDITIVE,
     ),
@@ -292,7 +298,7 @@ TABLE = (
         Reward.PROXY,
         Encoder.LATENT,
         Fit.ALL_STEPS,
-        "lare-rd without credit among agents: all get their mean",
+        "lare-rd without credit among agents: each agent gets the mean of all",
         LARE,
         shared=True,
     ),
@@ -305,7 +311,7 @@ def find_method(name: str) -> Method:
     """The row of that name.
 
     Raises:
-        LareError: there is none; the message lists those there are.
+        LareError: no method has this name; the message lists all methods.
     """
     if name in METHODS:
         return METHODS[name]

@@ -2,9 +2,9 @@
 
     R^2 = 1 - sum_k (R_k - R_hat_k)^2 / sum_k (R_k - mean R)^2
 
-over the last episodes, where R_hat_k is the sum of the proxy rewards that the decoder gave to the steps of episode k when
-it had not seen R_k yet. It needs no true reward of a step: where the environment pays only at the end, nothing else says
-whether the proxy rewards are any good. Below 0, the mean return predicts better.
+over the last episodes, where R_hat_k is the sum of the proxy rewards that the decoder gave to the steps of episode k before
+it had seen R_k. R^2 needs no true rewards of steps: if the environment pays only at the end, it is the only measure of the
+quality of proxy rewards. If it is below 0, the mean return predicts better than the decoder.
 """
 
 from typing import NamedTuple
@@ -13,22 +13,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 LAST = 32
-"""Episodes that are looked back on."""
+"""R^2 is computed over this many last episodes."""
 FEWEST = 8
-"""Below so many, nothing is said."""
+"""With fewer episodes, R^2 is NaN."""
 
 
 class Predictions(NamedTuple):
-    """Of the last episodes, in no order: what they returned, and what was predicted in several ways."""
+    """Returns of the last episodes, in no particular order, and the predictions of one or more ways to predict."""
 
     episodes: Float[Array, ""]
-    """That were ever predicted."""
+    """The number of episodes that were ever predicted."""
     returns: Float[Array, " last"]
     predicted: Float[Array, "last ways"]
 
 
 def no_predictions(ways: int) -> Predictions:
-    """Of no episodes."""
+    """The state before the first prediction."""
     return Predictions(jnp.zeros(()), jnp.zeros(LAST), jnp.zeros((LAST, ways)))
 
 
@@ -38,9 +38,9 @@ def remember(
     predicted: Float[Array, "episodes ways"],
     mask: Bool[Array, " episodes"],
 ) -> Predictions:
-    """With new episodes, at most `LAST` of them; those where `mask` is false are passed over."""
+    """Add new episodes, at most `LAST` of them. Episodes where `mask` is false are ignored."""
     place = (before.episodes.astype(jnp.int32) + jnp.cumsum(mask) - 1) % LAST
-    place = jnp.where(mask, place, LAST)  # a place that there is not, which is dropped
+    place = jnp.where(mask, place, LAST)  # an index out of bounds, which is dropped
     return Predictions(
         before.episodes + jnp.sum(mask),
         before.returns.at[place].set(returns.astype(jnp.float32), mode="drop"),
@@ -55,7 +55,7 @@ def squared_errors(known: Predictions) -> Float[Array, " ways"]:
 
 
 def r2(known: Predictions) -> Float[Array, " ways"]:
-    """R^2 of each way; NaN while episodes are few, or all returned the same."""
+    """R^2 of each way; NaN if there are too few episodes or all returns are equal."""
     there = jnp.arange(LAST) < known.episodes
     count = jnp.sum(there)
     mean = jnp.sum(jnp.where(there, known.returns, 0)) / jnp.maximum(count, 1)

@@ -1,6 +1,7 @@
-"""What whole episodes teach: their returns are predicted, then added to sums, then fitted to in closed form.
+"""Learning from whole episodes: their returns are predicted, then added to sums, then fitted in closed form.
 
-Every decoder predicts. Sums are for a fit in closed form: of the decoder itself, or one that finds out the form of the score.
+Every decoder predicts returns. Sums are only needed for a fit in closed form. Such a fit gives the decoder itself, or determines
+the form of the score.
 """
 
 from typing import Literal
@@ -19,28 +20,29 @@ from lare.credit.prediction import Predictions, remember, squared_errors
 from lare.credit.settings import CreditSettings
 
 BETTER = 0.95
-"""Times the squared error of a sum's predictions must be that of an average's, before it is taken for one. Where all episodes are
-equally long, both are the same but for rounding."""
+"""The score is treated as an average if the squared error of an average's predictions is below this fraction of that of a sum's.
+If all episodes are equally long, both errors are equal except for rounding."""
 GROWTH = 0.02
-"""By which the episodes must have grown before a decoder is told of the new ones. Where they are short, a few are waited for."""
+"""New episodes are given to a decoder when their number exceeds this fraction of the episodes before. Short episodes thus come in
+batches."""
 ROUNDING = 1e-6
-"""Of the squared returns: errors are not told apart that are smaller."""
+"""Squared errors below this fraction of the squared returns are treated as equal."""
 
 
 def is_fitted(state: Decomposition) -> Bool[Array, ""]:
     """Whether the decoder has learned anything yet."""
     if isinstance(state.decoder, LinearDecoder):
         assert state.closed is not None
-        return state.closed.fitted > 1  # of one episode it knows the mean reward, and no more
+        return state.closed.fitted > 1  # from one episode it only learns the mean reward
     return optax.tree_utils.tree_get(state.optimizer, "count") > 0
 
 
 def predict(
     state: Decomposition, episodes: Episodes, new: Bool[Array, " episodes"], settings: CreditSettings
 ) -> Decomposition:
-    """Remember what the decoder says of episodes before it is fitted to them, and what they returned.
+    """Store the returns of episodes, and the decoder's predictions of them before it is fitted to these episodes.
 
-    Those where `new` is false are passed over, and all as long as nothing has been fitted. At most `prediction.LAST` episodes.
+    Episodes where `new` is false are ignored; all are ignored before the first fit. At most `prediction.LAST` episodes.
     """
     returns, count = episodes.mean_reward * episodes.length, len(episodes.length)
     long = episodes.length[jnp.clip(episodes.episode, 0, count - 1)]
@@ -57,7 +59,7 @@ def predict(
 
 
 def mean_features(decoder: LinearDecoder, episodes: Episodes) -> Float[Array, "episodes features"]:
-    """The mean of a linear decoder's features over the steps of each episode, and over the agents that are there."""
+    """The mean of a linear decoder's features over the steps of each episode, and over the agents that are alive."""
     features = decoder.features(episodes.features)
     if features.ndim == 3:
         share = jnp.full(features.shape[:2], 1 / features.shape[1]) if episodes.share is None else episodes.share
@@ -67,19 +69,19 @@ def mean_features(decoder: LinearDecoder, episodes: Episodes) -> Float[Array, "e
 
 
 def is_stale(state: Decomposition) -> Bool[Array, ""]:
-    """Whether the sums over episodes are of features that were standardised long ago."""
+    """Whether the features in the sums were standardised by outdated statistics."""
     assert state.closed is not None
     return closed_form.is_stale(state.closed, state.statistics)
 
 
 def begin_again(state: Decomposition) -> Decomposition:
-    """Without sums over episodes, and with features that are standardised anew: all stored episodes are to be added."""
+    """Reset the sums, and standardise features by the newest statistics. All stored episodes must then be added again."""
     assert state.closed is not None
     return state._replace(closed=closed_form.begin_again(state.closed, state.statistics))
 
 
 def add_episodes(state: Decomposition, episodes: Episodes, new: Bool[Array, " episodes"]) -> Decomposition:
-    """Add whole episodes to the sums. Those where `new` is false are passed over. In float64, where that is enabled."""
+    """Add whole episodes to the sums, in float64 if that is enabled. Episodes where `new` is false are ignored."""
     assert state.closed is not None
     means = mean_features(state.closed.decoder, episodes)
     length = jnp.where(new, episodes.length, 0)
@@ -90,7 +92,7 @@ def add_episodes(state: Decomposition, episodes: Episodes, new: Bool[Array, " ep
 
 
 def form_found(state: Decomposition) -> Literal["sum", "average"] | None:
-    """The form that has predicted returns clearly better; None where it was not looked for, or makes no difference."""
+    """The form that has predicted returns clearly better; None if the form is given or makes no difference."""
     if state.rivals is None:
         return None
     of_sum, of_average = np.asarray(errors_told_apart(state.rivals))
@@ -100,12 +102,12 @@ def form_found(state: Decomposition) -> Literal["sum", "average"] | None:
 
 
 def errors_told_apart(rivals: Predictions) -> Float[Array, " forms"]:
-    """The squared errors of each form's predictions, and what rounding may add to any."""
+    """The squared error of each form's predictions, plus a margin for rounding."""
     return squared_errors(rivals) + ROUNDING * jnp.sum(rivals.returns**2)
 
 
 def fit_in_closed_form(state: Decomposition, method: Method, forms: tuple[int, ...]) -> Decomposition:
-    """Fit what is fitted in closed form to all episodes that have been added, and settle the form of the score."""
+    """Fit in closed form to all episodes that have been added, and determine the form of the score."""
     assert state.closed is not None
     signs = method.fit is Fit.SIGNS
     closed = closed_form.fit_signs(state.closed) if signs else closed_form.fit(state.closed, forms)
@@ -122,7 +124,7 @@ def fit_in_closed_form(state: Decomposition, method: Method, forms: tuple[int, .
 def deviation(
     state: Decomposition, rows: Float[Array, "rows features"], forms: tuple[int, ...]
 ) -> Float[Array, " rows"]:
-    """The posterior deviation of r_hat (of T r_hat, where the score is an average). Of `Fit.EVIDENCE`, in float64."""
+    """The posterior deviation of r_hat (of T r_hat, if the score is an average). For `Fit.EVIDENCE` only, in float64."""
     assert state.closed is not None
     assert isinstance(state.decoder, LinearDecoder)
     place = int(state.average) if len(forms) > 1 else 0

@@ -1,12 +1,12 @@
 """STAS: spatial-temporal return decomposition (Chen et al., AAAI 2024), its first and default version.
 
-Causal attention over the steps of each agent, then attention over the agents of each step under random coalitions, whose
-mean approximates the Shapley value of an agent:
+Causal attention over the steps of each agent is followed by attention over the agents of each step, under random coalitions.
+The mean over the coalitions approximates the Shapley value of an agent:
 
     r_hat_{i,t} = w . mean_k attention(h_t, mask_k)_i,    mask_k ~ Bernoulli(1/2)^{n x n}, 1 on the diagonal
 
-Learning draws coalitions, agent numbers and dropout anew for each part of a batch. At use the published code goes on
-drawing; here the reward is the mean over `USED` draws, the same at every call.
+During learning, each part of a batch has its own draws of coalitions, agent numbers and dropout. The published code also draws
+when it computes rewards. Here a reward is the mean over `USED` draws, the same at every call.
 """
 
 from functools import partial
@@ -23,20 +23,20 @@ from lare.networks import MLP, Linear
 SIZE, HEADS, LAYERS, COALITIONS = 128, 4, 3, 5
 
 USED = 8
-"""Draws of coalitions and agent numbers whose mean is what the policy is paid."""
+"""The policy's reward is the mean over this many draws of coalitions and agent numbers."""
 
 
 def dropout(x: Float[Array, "..."], key: PRNGKeyArray | None) -> Float[Array, "..."]:
-    """Half of the entries 0, the others twice as large; x itself without a key."""
+    """Set half of the entries, chosen at random, to 0 and double the others. Without a key, return x."""
     if key is None:
         return x
-    # A coin is one bit: a random number for each entry would be a fifth of all that STAS costs.
+    # One random bit per entry: a random number per entry would take a fifth of the time of STAS.
     coins = jnp.unpackbits(jax.random.bits(key, (-(-x.size // 8),), jnp.uint8))
     return 2 * x * coins[: x.size].reshape(x.shape)
 
 
 def gelu(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """X times the probability that a standard normal is less (Hendrycks and Gimpel, 2016), not approximated."""
+    """The exact GELU: x times the probability that a standard normal variable is below x (Hendrycks and Gimpel, 2016)."""
     return jax.nn.gelu(x, approximate=False)
 
 
@@ -72,10 +72,10 @@ class TimeLayer(eqx.Module):
 
 
 class Coalitions(eqx.Module):
-    """Attention over agents, each with queries of its own, as the mean over random coalitions."""
+    """Attention over agents, averaged over random coalitions. Each agent has its own projection to queries."""
 
     query: Linear
-    """One for each agent, stacked."""
+    """One layer for each agent, stacked."""
     key: Linear
     value: Linear
     merge: Linear
@@ -92,7 +92,7 @@ class Coalitions(eqx.Module):
         drops = (None,) * 2 if drop is None else jax.random.split(drop)
         query = heads(jnp.einsum("...ad,ade->...ae", x, self.query.weight) + self.query.bias)
         joined = jax.random.bernoulli(key, 0.5, (COALITIONS, agents, agents)) | jnp.eye(agents, dtype=bool)
-        # Each agent asks once for every coalition.
+        # Each agent needs one query for every coalition.
         found = attend(
             jnp.tile(query, (COALITIONS, 1, 1)),
             heads(self.key(x)),
@@ -108,10 +108,10 @@ class STAS(eqx.Module):
     """The published network, layer by layer."""
 
     embed: Linear
-    """Of the observation and of the action, which is a row with a single 1."""
+    """Embeds the observation and the one-hot action."""
     step: Float[Array, "steps size"]
     number: Float[Array, "agents size"]
-    """Embedding of agent numbers, given out at random."""
+    """Embeddings of agent numbers, which are assigned at random."""
     layers: tuple[TimeLayer, ...]
     coalitions: Coalitions
     last: Linear
@@ -145,7 +145,7 @@ class STAS(eqx.Module):
     def among_agents(
         self, x: Float[Array, "episodes steps agents size"], key: PRNGKeyArray, drop: PRNGKeyArray | None
     ) -> Float[Array, "episodes steps agents"]:
-        """The agents' shares by one draw of coalitions, and of the numbers that they are told apart by."""
+        """The agents' rewards for one draw of coalitions and of agent numbers."""
         coalitions_key, order_key = jax.random.split(key)
         order = jax.random.permutation(order_key, len(self.number))
         return self.gain * self.last(self.coalitions(x + self.number[order], coalitions_key, drop))[..., 0]

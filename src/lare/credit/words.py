@@ -1,4 +1,4 @@
-"""In words: how well returns can be told from the factors, which factors matter, and what may be missing."""
+"""Sentences that say how well the factors explain returns, which factors matter, and what may be missing."""
 
 import re
 
@@ -7,25 +7,25 @@ import numpy as np
 from lare.credit.explanation import Explanation
 
 FEWEST = 20
-"""Episodes, below which nothing is said."""
+"""With fewer episodes, there are no sentences."""
 NEXT_TO_NOTHING = 0.1
-"""Of the variation of the returns."""
+"""There is a warning if the factors explain less than this share of the variation of the returns."""
 NOTICEABLE = 0.05
-"""Of the variation: a share that is worth a word."""
+"""The effect of a factor can only be called curved if its share of the variation is larger than this."""
 STRIKING = 0.3
-"""A correlation with what the factors leave."""
+"""A raw entry is reported if its correlation with the residual of the factors is larger than this."""
 FORMS = ("sum", "average")
-"""Of a score, by number."""
+"""The names of the forms of a score, by index."""
 
 
 def entry_names(observation: str, action: str, entries: int, action_size: int) -> list[str]:
-    """What a task's texts call the entries of [s', a]: `7: angle of the foot` names entry 7.
+    """Names of the entries of [s', a], from a task's texts: the line `7: angle of the foot` names entry 7.
 
     Args:
-        observation: the text of the observation.
-        action: that of the action.
-        entries: all of them; none has fewer than those of the action, but 0.
-        action_size: how many of them, at the end, are the action's.
+        observation: the text that describes the observation.
+        action: the text that describes the action.
+        entries: the number of entries of [s', a]: 0, or at least `action_size`.
+        action_size: the number of entries of a, which come last.
     """
 
     def named(text: str, count: int, kind: str) -> list[str]:
@@ -40,17 +40,17 @@ def entry_names(observation: str, action: str, entries: int, action_size: int) -
 
 
 def is_bent(found: Explanation, factor: int) -> bool:
-    """Whether the score goes with a factor, but is not higher wherever the factor is larger: a target value, say."""
+    """Whether the score depends on a factor but does not simply rise or fall with it: a factor with a target value, for example."""
     return bool(found.share[factor] > NOTICEABLE and abs(found.weight[factor]) < 2 * found.deviation[factor])
 
 
 def words(found: Explanation, form: str | None, factors: list[str], entries: list[str]) -> list[str]:
-    """What is to be said, a sentence each.
+    """The sentences, one in each string.
 
     Args:
-        found: of one team's score.
-        form: `sum` or `average`, where it was found out; None where it makes no difference.
-        factors: names of the factors; empty for a method without.
+        found: the explanation of one team's score.
+        form: `sum` or `average`, if the returns have determined it; None if they have not.
+        factors: names of the factors; empty for a method without factors.
         entries: names of the raw entries.
     """
     count = int(found.episodes)

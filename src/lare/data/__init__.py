@@ -1,1 +1,1 @@
-"""What was met: trajectories, the replay that holds them, and which of it an update reads."""
+"""Experience: trajectories, the replay that stores them, and the samples that an update reads."""

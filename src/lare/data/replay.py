@@ -8,10 +8,10 @@ An episode of T steps takes T + 1 rows that follow each other, so that s' of a s
     factors      z0   z1   z2   -  |  z0   z1
     reward       r0   r1   r2   -  |  r0   r1
 
-Which columns there are is the caller's choice: what the algorithm and the decoder read, and no more. `row` leads from the
-number of a transition to its row, past the rows that begin none. Rows, transitions and episodes are numbered from 0 for ever
-and stored at their number modulo the capacity; when the rows run out, the oldest episode goes. Every environment has rows of
-its own. Everything here is for one seed; callers `vmap`.
+The caller chooses the columns: those that the algorithm and the decoder read. `row` maps the number of a transition to its
+row; the last row of an episode begins no transition. The numbers of rows, transitions and episodes count up from 0 without
+end, and each is stored at its number modulo the capacity. When no row is free, the oldest episode is removed. Every
+environment has its own rows. Everything here is for one seed; callers `vmap`.
 """
 
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 SHOWN = ("observation", "state", "available", "alive")
-"""Columns of what an environment shows: a step has them before it, and in the next row after it."""
+"""Columns that an environment shows before and after a step. The values after a step are in the next row."""
 
 BY_ROW = "columns"
 """The field of the replay that a checkpoint saves by row."""
@@ -50,7 +50,7 @@ class Replay(NamedTuple):
     transitions: Int[Array, " envs"]
     """Transitions ever added."""
     oldest: Int[Array, " envs"]
-    """The oldest episode that is still there."""
+    """The oldest episode that is still stored."""
     episodes: Int[Array, " envs"]
     """Episodes ever finished; also the number of the running one."""
     running: Bool[Array, " envs"]
@@ -65,26 +65,26 @@ class Index(NamedTuple):
 
 
 class StoredSteps(NamedTuple):
-    """Transitions read back."""
+    """Transitions, read from the replay."""
 
     before: dict[str, Array]
-    """Every column, [*batch ...]: what the step set out from, what was done, what it paid."""
+    """Every column, [*batch ...], of the step's row: the observation before the step, the action, the reward."""
     after: dict[str, Array]
-    """The columns of `SHOWN` that there are, of what the step led to."""
+    """The columns of `SHOWN` that are stored, after the step."""
     episodic_reward: Float[Array, "*batch teams"]
     """The whole return at the last step of a finished episode, else 0."""
     mean_reward: Float[Array, "*batch teams"]
-    """R/T of the step's episode; of what there is of it where it has not finished."""
+    """R/T of the step's episode; if it has not finished, of its steps so far."""
     finished: Bool[Array, "*batch"]
     """Whether the step's episode has finished."""
     last: Bool[Array, "*batch"]
     """Whether the step is the last one of a finished episode."""
     length: Int[Array, "*batch"]
-    """Steps of its episode; where that has not finished, at least as many as finished ones have on average."""
+    """Steps of its episode; if that has not finished, at least the mean length of the finished ones."""
 
 
 def empty(columns: Mapping[str, jax.ShapeDtypeStruct], envs: int, capacity: int, teams: int) -> Replay:
-    """A replay without a step; `columns` are the shapes of a single row."""
+    """An empty replay; `columns` are the shapes of a single row."""
     episodes = capacity // 2 + 1  # the shortest episode takes two rows; one more is running
 
     def zeros(*shape: int, dtype: DTypeLike = jnp.int32) -> Array:
@@ -110,7 +110,7 @@ def capacity(replay: Replay) -> int:
 
 
 def oldest_transition(replay: Replay) -> Int[Array, " envs"]:
-    """The number of the oldest transition that is still there."""
+    """The number of the oldest transition that is still stored."""
     known = replay.oldest < replay.episodes + replay.running
     first = jnp.take_along_axis(replay.first, (replay.oldest % replay.first.shape[-1])[:, None], axis=1)[:, 0]
     return jnp.where(known, first, replay.transitions)
@@ -133,12 +133,12 @@ def extend(
     team_reward: Float[Array | np.ndarray, "time envs teams"],
     ended: Bool[Array | np.ndarray, "time envs"],
 ) -> Replay:
-    """Store steps that follow each other.
+    """Store consecutive steps.
 
     Args:
-        replay: it must have room for all of the steps and the episode that is under way; see `room`.
+        replay: it must have room for all of the steps and the running episode; see `room`.
         before: every column, [time envs ...].
-        after: those of `SHOWN`, of what the steps led to.
+        after: the columns of `SHOWN`, after the steps.
         team_reward: the true reward of each team.
         ended: whether a step was the last of its episode.
     """
@@ -147,7 +147,7 @@ def extend(
 
 
 def room(steps: int, longest: int) -> int:
-    """The most rows of an environment that storing so many steps needs, with the episode that was under way before them."""
+    """The largest number of rows that an environment needs for so many steps and the running episode before them."""
     return 2 * steps + longest
 
 
@@ -158,7 +158,7 @@ def extend_one(
     team_reward: Float[Array, "time teams"],
     ended: Bool[Array, " time"],
 ) -> Replay:
-    """The steps of one environment, all at once; the oldest episodes go if their rows are needed."""
+    """Store the steps of one environment, all at once. The oldest episodes are removed if their rows are needed."""
     rows, slots, steps = replay.row.shape[0], replay.first.shape[0], ended.shape[0]
     over = jnp.cumsum(ended)
     earlier = over - ended  # episodes that have ended before each step
@@ -167,9 +167,9 @@ def extend_one(
     oldest = oldest_with_room(replay, row[-1] + 1)
     begins = jnp.append(~replay.running, ended[:-1])
     slot = episode % slots
-    begun = jnp.where(begins, slot, slots)  # a place that there is not, which is dropped
+    begun = jnp.where(begins, slot, slots)  # an index out of range, which is dropped
     columns = dict(replay.columns)
-    for name, values in after.items():  # first: the next step of the same episode writes the same row again
+    for name, values in after.items():  # first, because the next step of the same episode overwrites the row
         columns[name] = columns[name].at[(row + 1) % rows].set(values)
     for name, values in before.items():
         columns[name] = columns[name].at[row % rows].set(values)
@@ -188,7 +188,7 @@ def extend_one(
 
 
 def oldest_with_room(replay: Replay, last: Int[Array, ""]) -> Int[Array, ""]:
-    """The oldest episode that may stay where rows up to `last` are to be written: no row of it is among them."""
+    """The oldest episode that can stay when rows up to `last` are written: none of its rows is overwritten."""
     rows, slots = replay.row.shape[0], replay.first.shape[0]
 
     def crowded(oldest: Int[Array, ""]) -> Bool[Array, ""]:
@@ -199,7 +199,7 @@ def oldest_with_room(replay: Replay, last: Int[Array, ""]) -> Int[Array, ""]:
 
 
 def drop_running(replay: Replay, dropped: Bool[Array, " envs"]) -> Replay:
-    """Forget the episodes that are under way in some of the environments."""
+    """Forget the running episodes of some environments."""
     slot = (replay.episodes % replay.first.shape[-1])[:, None]
     first = jnp.take_along_axis(replay.first, slot, axis=1)
     row = jnp.take_along_axis(replay.row, first % capacity(replay), axis=1)[:, 0]
@@ -212,12 +212,12 @@ def drop_running(replay: Replay, dropped: Bool[Array, " envs"]) -> Replay:
 
 
 def flat(values: Array) -> Array:
-    """Environments and rows in one axis."""
+    """Merge the axes of environments and rows."""
     return values.reshape(-1, *values.shape[2:])
 
 
 def read(replay: Replay, index: Index) -> StoredSteps:
-    """The transitions of this index."""
+    """The transitions at this index."""
     rows = capacity(replay)
     slots = replay.first.shape[-1]
     place = index.env * rows
@@ -251,6 +251,6 @@ def end_of(replay: Replay, env: Int[Array, "*batch"], episode: Int[Array, "*batc
 
 
 def newest(replay: Replay, steps: int) -> Index:
-    """The last steps of every environment: [envs steps]. As many must have been stored."""
+    """The last steps of every environment: [envs steps]. At least so many must have been stored."""
     number = replay.transitions[:, None] - steps + jnp.arange(steps)
     return Index(jnp.broadcast_to(jnp.arange(len(number))[:, None], number.shape), number)

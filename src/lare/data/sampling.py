@@ -1,4 +1,4 @@
-"""Which stored steps an update reads. Only numbers are drawn here; the rows are read when their turn comes."""
+"""The choice of the stored steps that an update reads. Only their numbers are drawn here; the rows are read later."""
 
 from functools import partial
 from typing import NamedTuple
@@ -19,7 +19,7 @@ class EpisodeSample(NamedTuple):
     mean_reward: Float[Array, "*batch teams"]
     """R/T."""
     mask: Float[Array, "*batch"]
-    """1, or 0 for a place that holds no episode."""
+    """1, or 0 for an entry without an episode."""
 
 
 class CreditSample(NamedTuple):
@@ -28,12 +28,12 @@ class CreditSample(NamedTuple):
     steps: Index
     """[*updates rows]."""
     episode: Int[Array, "*updates rows"]
-    """Which of the episodes a row belongs to; as many as there are episodes, where it is padding."""
+    """The index of the episode that a row belongs to; for padding, the number of episodes."""
     episodes: EpisodeSample
 
 
 def one_of(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
-    """Uniform over all things that some environments have; `number` counts from 0 in each."""
+    """Uniform draws from the items of all environments, of which each has `counts`; `number` counts from 0 in each environment."""
     ends = jnp.cumsum(counts)
     number = jax.random.randint(key, shape, 0, jnp.maximum(ends[-1], 1))
     env = jnp.minimum(jnp.searchsorted(ends, number, side="right"), len(counts) - 1)
@@ -54,7 +54,7 @@ def sample_episodes(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -
 def sample_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> EpisodeSample:
     """Finished episodes, uniform, without replacement: the first of a random order of all slots that hold one.
 
-    Where there are fewer, `mask` is 0 for the places that are left.
+    If there are fewer than `count`, `mask` is 0 for the entries that are left.
     """
     there, slots = finished(replay), replay.first.shape[-1]
     stored = jnp.arange(slots) < there[:, None]
@@ -66,7 +66,7 @@ def sample_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> E
 
 
 def episodes_at(replay: Replay, place: Index) -> EpisodeSample:
-    """The finished episodes of these places, counted from each environment's oldest."""
+    """Finished episodes; `place` numbers them from each environment's oldest."""
     slots = replay.first.shape[-1]
     episode = replay.oldest[place.env] + place.number
     slot = episode % slots + place.env * slots
@@ -84,7 +84,7 @@ def episodes_at(replay: Replay, place: Index) -> EpisodeSample:
 def steps_of(
     episodes: EpisodeSample, number: Int[Array, "*episodes steps"], episode: Int[Array, "*episodes steps"]
 ) -> CreditSample:
-    """Steps of drawn episodes (their last axis) by their number within each, in a row."""
+    """Steps of drawn episodes (their last axis), given by their number within each, flattened into one axis."""
     index = Index(
         jnp.broadcast_to(episodes.first.env[..., None], number.shape), episodes.first.number[..., None] + number
     )
@@ -93,7 +93,7 @@ def steps_of(
 
 
 def sample_parts(replay: Replay, key: PRNGKeyArray, updates: int, count: int, drawn: int) -> CreditSample:
-    """`drawn` steps of each of `count` episodes, for RRD; of a shorter episode all, and padding."""
+    """`drawn` steps of each of `count` episodes, for RRD. A shorter episode gives all its steps, and padding."""
     episodes_key, steps_key = jax.random.split(key)
     episodes = sample_episodes(replay, episodes_key, (updates, count))
     number = sample_steps(steps_key, episodes.length, drawn)
@@ -102,23 +102,23 @@ def sample_parts(replay: Replay, key: PRNGKeyArray, updates: int, count: int, dr
 
 
 def sample_padded(replay: Replay, key: PRNGKeyArray, updates: int, count: int, longest: int) -> CreditSample:
-    """All steps of some episodes, and the last one again until each is as long as the longest can be."""
+    """All steps of some episodes. The last step of each is repeated until there are `longest`."""
     episodes = sample_episodes(replay, key, (updates, count))
     number = jnp.minimum(jnp.arange(longest), episodes.length[..., None] - 1)
     return steps_of(episodes, number, jnp.broadcast_to(jnp.arange(count)[:, None], number.shape))
 
 
 def sample_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, longest: int) -> CreditSample:
-    """All steps of max(1, steps // mean length) episodes, one behind the other, for RD.
+    """All steps of max(1, steps // mean length) episodes, one after the other, for RD.
 
-    The rows are as many as the longest episode has, or `steps` if that is more; an episode that would run over the end
-    is left out whole. Rows behind the last episode belong to none.
+    There are max(steps, longest) rows. An episode that does not fit into them is left out as a whole. Rows after the last
+    episode belong to none.
     """
     return jax.vmap(partial(pack, replay, steps=steps, longest=longest))(jax.random.split(key, updates))
 
 
 def pack(replay: Replay, key: PRNGKeyArray, steps: int, longest: int) -> CreditSample:
-    """One update's share of `sample_packed`."""
+    """`sample_packed` for one update."""
     drawn = sample_episodes(replay, key, (steps,))
     wanted = steps * jnp.sum(finished(replay)) // jnp.maximum(stored_steps(replay), 1)
     mask = drawn.mask * (jnp.arange(steps) < jnp.maximum(wanted, 1))
@@ -126,7 +126,7 @@ def pack(replay: Replay, key: PRNGKeyArray, steps: int, longest: int) -> CreditS
 
 
 def one_behind_the_other(episodes: EpisodeSample, rows: int) -> CreditSample:
-    """All steps of some episodes in so many rows, as far as they fit. Rows behind the last episode belong to none."""
+    """All steps of the episodes that fit into so many rows, one after the other. Rows after the last episode belong to none."""
     end, places = jnp.cumsum(episodes.length), len(episodes.length)
     mask = episodes.mask * (end <= rows)
     row = jnp.arange(rows)
@@ -141,16 +141,16 @@ def one_behind_the_other(episodes: EpisodeSample, rows: int) -> CreditSample:
 
 
 def episodes_since(replay: Replay, since: Int[Array, " envs"]) -> Int[Array, " envs"]:
-    """How many finished episodes of each environment have this number or a later one, and are still there."""
+    """How many finished episodes of each environment have this number or a later one, and are still stored."""
     return jnp.maximum(replay.episodes - jnp.maximum(since, replay.oldest), 0)
 
 
 def in_order(
     replay: Replay, since: Int[Array, " envs"], start: Int[Scalar, ""], places: int, rows: int
 ) -> CreditSample:
-    """Of the finished episodes that `episodes_since` counts, one environment after the other: those from the `start`-th on.
+    """The finished episodes that `episodes_since` counts, one environment after the other, from the `start`-th on.
 
-    As many as there are places and as fit, whole, in the rows.
+    At most `places` of them, and only those that fit into the rows as a whole.
     """
     counts = episodes_since(replay, since)
     ends = jnp.cumsum(counts)
@@ -162,16 +162,16 @@ def in_order(
 
 
 def stored_steps(replay: Replay) -> Int[Scalar, ""]:
-    """Steps of finished episodes that are still there."""
+    """Number of steps of the finished episodes that are still stored."""
     last = end_of(replay, jnp.arange(len(replay.episodes)), replay.episodes - 1)
     return jnp.sum(last - oldest_transition(replay))
 
 
 def sample_steps(key: PRNGKeyArray, length: Int[Array, "*episodes"], drawn: int) -> Int[Array, "*episodes {drawn}"]:
-    """K of the steps 0..T-1 of each episode, without replacement; where T < K all of them, and then the last one again.
+    """K of the steps 0..T-1 of each episode, without replacement; if T < K, all of them and copies of the last one.
 
-    Floyd's algorithm (Bentley and Floyd, 1987): for j = T-K .. T-1 take a uniform t of 0..j, or j where t was taken
-    before. O(K^2) on K numbers, whatever T is, for all the episodes at once.
+    Floyd's algorithm (Bentley and Floyd, 1987): for j = T-K .. T-1 take a uniform t of 0..j, or j if t was taken before.
+    O(K^2) on K numbers, independent of T, for all the episodes at once.
     """
     uniform = jax.random.uniform(key, (drawn, *length.shape))
 

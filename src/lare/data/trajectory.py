@@ -1,4 +1,4 @@
-"""Steps of some environments, as they are collected, on their way into the replay."""
+"""Steps of some environments as they are collected, before they go into the replay."""
 
 from typing import NamedTuple
 
@@ -8,21 +8,21 @@ from lare.tasks.env import Numbers, Timestep
 
 
 class Trajectory(NamedTuple):
-    """Steps that follow each other in each of some environments; an episode may go on from one trajectory to the next.
+    """Consecutive steps of some environments. An episode may continue in the next trajectory.
 
     `*lead` is the seeds' axis, or nothing within functions of one seed.
     """
 
     before: Timestep
-    """What each step set out from: [*lead time envs ...]."""
+    """What the environment showed before each action: [*lead time envs ...]."""
     action: Float[Numbers, "*lead time envs agents action"]
-    """What the policy chose: in [-1, 1], or a row with a single 1."""
+    """The policy's action: in [-1, 1], or one-hot."""
     taken: Float[Numbers, "*lead time envs agents action"]
-    """The same in the environment's units."""
+    """The same action in the environment's units."""
     after: Timestep
-    """What each step led to, also at the end of an episode."""
+    """What the environment showed after each action. At the end of an episode this is its final time step, not the next reset."""
 
     @property
     def ended(self) -> Bool[Numbers, "*lead time envs"]:
-        """Whether the step was the last of its episode: terminated, or out of time."""
+        """Whether the step was the last of its episode: terminated or truncated."""
         return self.after.terminated | self.after.truncated

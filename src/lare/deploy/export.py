@@ -1,11 +1,11 @@
 """`lare export`: what a run has learned, for programs that have neither LaRe nor JAX.
 
 DIRECTORY/
-  export.json              what is there: task, seed, step; inputs, outputs and operations of each function
+  export.json              task, seed, step; inputs, outputs and operations of each function
   policy.npz, .onnx        observation -> action
-  reward.npz, .onnx        steps -> r_hat, phi and decoder as one function; where teams learn, reward_TEAM
-  latent_function.py       phi, to be read
-  exported.py              the lines of NumPy that run the .npz files
+  reward.npz, .onnx        steps -> r_hat, phi and decoder as one function; one reward_TEAM each if several teams learn
+  latent_function.py       the source of phi
+  exported.py              NumPy code that runs the .npz files
 """
 
 import json
@@ -39,9 +39,9 @@ class Exported(NamedTuple):
     functions: tuple[str, ...]
     """`policy`, and `reward` or one for each team."""
     left_out: str | None
-    """Why there is no reward; None where there is one."""
+    """Why there is no reward function; None if there is one."""
     apart: dict[str, str]
-    """Rewards that take the factors of phi as an input, and what in phi has no translation."""
+    """The names of reward functions that take the factors of phi as an input, and the part of phi that cannot be translated."""
     onnx: bool
     """Whether there are ONNX files: the package `onnx` is installed."""
 
@@ -54,8 +54,8 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
     Args:
         run: the run, or its directory.
         out: the directory.
-        seed: one of the run's; the first, unless given.
-        best: the policy of the seed's best evaluation, instead of the last one.
+        seed: one of the run's seeds; the default is the first.
+        best: write the policy of the seed's best evaluation, instead of the last policy.
 
     Raises:
         LareError: there is no such seed, no checkpoint, or the directory exists or cannot be written.
@@ -63,7 +63,7 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
     out, run = Path(out), as_run(run)
     place = run.place_of(seed)
     if out.exists():
-        raise LareError(f"{out} exists, and is not overwritten; choose another --out")
+        raise LareError(f"{out} exists, and is not overwritten; choose another directory")
     config, learner, host, _ = load_learner(run)
     if best:
         _, actors, since = load_actor(run, of_best=True)
@@ -73,7 +73,7 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
     actor = jax.tree.map(lambda leaf: leaf[place], actors)
     start = choices(run).start if config.env.discrete and config.env.agents == 1 else 0
     graphs = {"policy": policy(actor, config, start)}
-    credit = of_seed(learner, place).credit
+    credit = of_seed(learner.credit, place)
     left_out = unexported(config, credit[0].decoder if credit else None)
     files: dict[str, str] = {}
     apart: dict[str, str] = {}
@@ -89,7 +89,7 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
     try:
         out.mkdir(parents=True)
     except FileExistsError:
-        raise LareError(f"{out} exists, and is not overwritten; choose another --out") from None
+        raise LareError(f"{out} exists, and is not overwritten; choose another directory") from None
     except OSError as error:
         raise LareError(f"{out} cannot be written: {error.strerror}") from error
     text: dict[str, Any] = {
@@ -127,5 +127,5 @@ def described(graph: Graph) -> dict[str, Any]:
 
 
 def write_arrays(path: Path, graph: Graph) -> None:
-    """The constants of a graph."""
+    """Write the constants of a graph."""
     write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **graph.constants))

@@ -4,7 +4,7 @@
     action = exported.load("policy")(observation=observation)["action"]
     r_hat = exported.reward(before, action, after)
 
-`export.json` says the inputs and outputs of each function, with their shapes. The first axis of all of them is the batch.
+`export.json` lists the inputs and outputs of each function, with their shapes. The first axis of all of them is the batch.
 """
 
 import json
@@ -69,7 +69,7 @@ OPERATIONS = {
 
 @cache
 def described(name):
-    """What `export.json` says of a function."""
+    """The entry of a function in `export.json`."""
     text = json.loads((HERE / "export.json").read_text(encoding="utf-8"))
     functions = [key for key, value in text.items() if isinstance(value, dict)]
     if name not in functions:
@@ -79,7 +79,7 @@ def described(name):
 
 @cache
 def load(name):
-    """The function of NAME.npz: arrays by name in, a dictionary of arrays out."""
+    """The function of NAME.npz. It takes arrays by name, and returns a dictionary of arrays."""
     graph = described(name)
     with np.load(HERE / f"{name}.npz", allow_pickle=False) as file:
         constants = dict(file)
@@ -97,10 +97,10 @@ def load(name):
 
 
 def reward(before, action, after, name="reward", **more):
-    """r_hat of steps, (batch, ...): phi and the decoder as one function.
+    """The proxy rewards r_hat of steps, (batch, ...): phi and the decoder as one function.
 
-    Observations and actions are (batch, ..., n), in the environment's units; a choice is a row with a single 1. `more` holds
-    `length` or `alive`, where `export.json` lists them among the inputs.
+    Observations and actions are (batch, ..., n), in the environment's units; a choice is a one-hot row. `more` holds `length`
+    or `alive`, if `export.json` lists them among the inputs.
     """
     given = {"before": before, "action": action, "after": after, **more}
     if "factors" in described(name)["inputs"]:
@@ -109,7 +109,7 @@ def reward(before, action, after, name="reward", **more):
 
 
 def factors(before, action, after, name="reward"):
-    """The factors phi(s, a) of steps, (batch, ..., factors), where phi could not be made a part of NAME.npz.
+    """The factors phi(s, a) of steps, (batch, ..., factors), for a phi that could not be made a part of NAME.npz.
 
     A language model has written phi, and it has passed LaRe's checks. Here it runs in this process, without LaRe's sandbox.
     """

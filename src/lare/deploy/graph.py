@@ -1,6 +1,6 @@
 """A function of arrays as a list of operations. Both exported forms are written from it: ONNX, and NumPy arrays.
 
-Operations have the names and the meaning that ONNX gives them. `exported.py` says the same in NumPy, a line for each.
+Operations have the names and the meaning that ONNX gives them. `exported.py` implements each of them in NumPy.
 """
 
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ import numpy as np
 from lare.networks import MLP, Linear
 
 BATCH = "batch"
-"""The first axis of every input and output: as many rows as the caller likes."""
+"""The first axis of every input and output: any number of rows."""
 
 
 class Operation(NamedTuple):
@@ -21,12 +21,12 @@ class Operation(NamedTuple):
     arguments: tuple[str, ...]
     result: str
     axis: int | None = None
-    """For an operation that needs to know one."""
+    """The axis, for an operation that needs one."""
 
 
 @dataclass(frozen=True)
 class Graph:
-    """What is computed, in order. Calling a method adds an operation, and gives the name of its result."""
+    """Operations, in order. A method adds an operation, and returns the name of its result."""
 
     inputs: dict[str, tuple[int, ...]] = field(default_factory=dict)
     """The shape of each, without the batch."""
@@ -57,7 +57,7 @@ class Graph:
         return name
 
     def output(self, name: str, value: str, shape: tuple[int, ...], kind: str = "float32") -> None:
-        """Give a result to the caller, under a name of its own."""
+        """Make a result an output, with this name."""
         self.apply("Identity", value, result=name)
         self.outputs[name], self.kinds[name] = shape, kind
 
@@ -73,11 +73,11 @@ class Graph:
         return self.linear(x, last)
 
     def clip(self, x: str, low: object, high: object) -> str:
-        """Within bounds, which may be arrays."""
+        """Clip to bounds, which may be arrays."""
         return self.apply("Min", self.apply("Max", x, np.asarray(low, np.float32)), np.asarray(high, np.float32))
 
     def standardised(self, x: str, mean: object, deviation: object, most: float | None = None) -> str:
-        """(x - mean) / deviation, at most `most` from 0; 0 where the deviation is 0."""
+        """(x - mean) / deviation, clipped to ±`most`; 0 where the deviation is 0."""
         spread = np.asarray(deviation, np.float64)
         inverse = np.where(spread > 0, 1 / np.where(spread > 0, spread, 1), 0).astype(np.float32)
         u = self.apply("Mul", self.apply("Sub", x, np.asarray(mean, np.float32)), inverse)

@@ -11,24 +11,24 @@ from lare.deploy.graph import BATCH, Graph, Operation
 from lare.files import write_atomically
 
 OPSET = 18
-"""Version of ONNX's operations. Runtimes of 2023 and later know it."""
+"""Version of ONNX's operations. Runtimes of 2023 and later support it."""
 ATTRIBUTES: dict[str, dict[str, Any]] = {"ArgMax": {"keepdims": 0}, "ArgMin": {"keepdims": 0}, "Cast": {"to": 1}}
-"""1 is float32."""
+"""`to` 1 is float32."""
 
 
 def is_installed() -> bool:
-    """Whether the package `onnx` is there."""
+    """Whether the package `onnx` is installed."""
     return find_spec("onnx") is not None
 
 
 def attributes_of(operation: Operation) -> dict[str, Any]:
-    """What ONNX does not take as an array."""
+    """The arguments of an operation that are attributes in ONNX, not arrays."""
     found = ATTRIBUTES.get(operation.name, {})
     return found if operation.axis is None else found | {"axis": operation.axis}
 
 
 def write(graph: Graph, path: Path, name: str) -> None:
-    """Write the model. Raises `LareError` where the file cannot be written."""
+    """Write the model. Raises `LareError` if the file cannot be written."""
     data = model(graph, name).SerializeToString()
     write_atomically(path, lambda file: file.write(data))
 

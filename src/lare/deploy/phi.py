@@ -1,7 +1,8 @@
 """`phi` as part of a graph: its source is read, not run.
 
-A walk over the syntax tree of a function that has passed the gate. Arrays become operations (`rows.py`). Constants are computed,
-loops over them are unrolled, and helpers are put in their place. What has no translation is `Untranslatable`.
+A walk over the syntax tree of a function that has passed the gate. Operations on arrays are added to the graph (`rows.py`).
+Constants are computed, loops over them are unrolled, and calls of helper functions are inlined. Code that cannot be translated
+raises `Untranslatable`.
 """
 
 import ast
@@ -17,7 +18,7 @@ from lare.deploy.rows import BATCH, FUNCTIONS, LARGEST, METHODS, Rows, Untransla
 from lare.latent.language.allowed import NAME
 
 MOST_STEPS = 20_000
-"""Of a walk, so that it ends."""
+"""Expressions that a walk evaluates at most, so that it ends."""
 ARITHMETIC: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
     ast.Add: ("add", operator.add),
     ast.Sub: ("subtract", operator.sub),
@@ -38,7 +39,7 @@ OF_CONSTANTS = frozenset("sqrt exp log tanh cos sin abs square maximum minimum s
 
 
 class Returned(Exception):
-    """A function has come to its end."""
+    """A `return` statement was reached."""
 
     def __init__(self, value: Any):
         self.value = value
@@ -48,7 +49,7 @@ def factors(graph: Graph, source: str, observation: Rows, action: Rows) -> Rows:
     """The factors of steps, [batch *agents factors]: `phi` added to a graph.
 
     Raises:
-        Untranslatable: it does something that has no translation.
+        Untranslatable: the source has code that cannot be translated.
     """
     if not source:
         raise Untranslatable("a source that the gate has not passed")
@@ -72,7 +73,7 @@ def factors(graph: Graph, source: str, observation: Rows, action: Rows) -> Rows:
 
 
 class Walk:
-    """What a program's names stand for."""
+    """Executes a program on the names of a graph. `names` holds the values of its variables and functions."""
 
     def __init__(self, source: str):
         self.names: dict[str, Any] = {}
@@ -81,7 +82,7 @@ class Walk:
             self.do(statement, self.names)
 
     def call(self, function: ast.FunctionDef, values: list[Any], named: Mapping[str, Any] | None = None) -> Any:
-        """A function of the program."""
+        """Call a function of the program."""
         arguments, names = function.args, dict(self.names)
         defaults = [self.value(one, names) for one in arguments.defaults]
         taken = [one.arg for one in arguments.args]
@@ -95,7 +96,7 @@ class Walk:
         raise Untranslatable("a function that returns nothing")
 
     def do(self, statement: ast.stmt, names: dict[str, Any]) -> None:
-        """A statement."""
+        """Execute a statement."""
         match statement:
             case ast.Import(names=[ast.alias(name="numpy", asname="np")]) | ast.Expr(value=ast.Constant()):
                 pass
@@ -128,14 +129,14 @@ class Walk:
                 raise Untranslatable("an assignment to a part of an array")
 
     def items(self, node: ast.expr, names: dict[str, Any]) -> list[Any] | tuple[Any, ...] | range:
-        """What a loop goes over."""
+        """The items that a loop iterates over."""
         found = self.value(node, names)
         if not isinstance(found, (list, tuple, range)):
             raise Untranslatable("a loop over an array")
         return found
 
     def value(self, node: ast.expr, names: dict[str, Any]) -> Any:
-        """An expression."""
+        """Evaluate an expression."""
         self.steps += 1
         if self.steps > MOST_STEPS:
             raise Untranslatable("too long a program")
@@ -189,7 +190,7 @@ class Walk:
         if not (is_rows(left) or is_rows(right)):
             check_size(name, left, right)
             return of_constants(left, right)
-        if name == "power" and not is_rows(right) and right == 2:  # where the base is negative, too
+        if name == "power" and not is_rows(right) and right == 2:  # correct for a negative base, too
             return FUNCTIONS["square"](left)
         return FUNCTIONS[name](left, right)
 
@@ -222,7 +223,7 @@ class Walk:
 
 
 def check_size(name: str, left: Any, right: Any) -> None:
-    """Raise `Untranslatable` where two constants would make something large."""
+    """Raise `Untranslatable` if the result for two constants would be large."""
     sizes = [value.size if isinstance(value, np.ndarray) else 1 for value in (left, right)]
     lists = [len(value) for value in (left, right) if isinstance(value, (list, tuple, str))]
     whole = [abs(value) for value in (left, right) if isinstance(value, int)]
@@ -233,7 +234,7 @@ def check_size(name: str, left: Any, right: Any) -> None:
 
 
 def applied(name: str, values: list[Any], named: Mapping[str, Any]) -> Any:
-    """A function of NumPy; of constants only where it makes nothing large of them."""
+    """Apply a function of NumPy. On constants, only functions whose results cannot become large are applied."""
     if any(is_rows(one) for value in values for one in (value if isinstance(value, list) else [value])):
         return FUNCTIONS[name](*values, **named)
     if name in ("asarray", "array"):

@@ -2,8 +2,8 @@
 
     observation [batch *agents observation]  ->  action [batch *agents action], or the number of a choice [batch *agents]
 
-`*agents` is there for tasks of many agents. QMIX and VDN remember: they take `hidden` and `last_action` (the numbers that they
-returned at the step before; at the first step zeros, and the number of choices), and return the next ones.
+Only tasks of many agents have the axis `*agents`. QMIX and VDN have a memory: they also take `hidden` (zeros at the first step,
+then the last `next_hidden`) and `last_action` (the number of choices at the first step, then the last `action`).
 """
 
 from typing import Any
@@ -27,9 +27,9 @@ def policy(actor: Any, config: TrainConfig, start: int) -> Graph:
     """The graph of an actor of one seed.
 
     Args:
-        actor: what the algorithm acts by.
-        config: of its run.
-        start: the number of the first choice, where actions are choices.
+        actor: the part of the algorithm's state that acts.
+        config: the configuration of its run.
+        start: the number of the first choice, if actions are choices.
     """
     graph, env = Graph(), config.env
     agents = (env.agents,) if env.agents > 1 else ()
@@ -41,7 +41,7 @@ def policy(actor: Any, config: TrainConfig, start: int) -> Graph:
         case ppo.Actor():
             values = stochastic(graph, observation, actor, config)
         case _:
-            # SAC's network says mean and log deviation, side by side; only the mean is needed.
+            # SAC's network outputs mean and log deviation, side by side; only the mean is needed.
             values = graph.apply("Tanh", graph.network(observation, first(actor, env.action_size), "Relu"))
     if not env.discrete:
         graph.output("action", scaled(graph, values, env), (*agents, env.action_size))
@@ -54,7 +54,7 @@ def policy(actor: Any, config: TrainConfig, start: int) -> Graph:
 
 
 def first(network: MLP, outputs: int) -> MLP:
-    """A network that has only the first of its outputs."""
+    """The network with only the first of its outputs."""
     last = network.layers[-1]
     return eqx.tree_at(
         lambda one: (one.layers[-1].weight, one.layers[-1].bias),
@@ -78,7 +78,7 @@ def stochastic(graph: Graph, x: str, actor: ppo.Actor, config: TrainConfig) -> s
 
 
 def told_apart(network: MLP, size: int, number: np.ndarray) -> MLP:
-    """A network that is given observations alone; which agent observes is in the bias of its first layer, (agents, width)."""
+    """A network of observations alone. The agent's number is moved into the bias of the first layer, (agents, width)."""
     layer = network.layers[0]
     return eqx.tree_at(lambda one: one.layers[0], network, of_agents(layer, size, number))
 
@@ -90,7 +90,7 @@ def of_agents(layer: Linear, size: int, number: np.ndarray) -> Linear:
 
 
 def recurrent(graph: Graph, x: str, agent: Recurrent, env: EnvSpec) -> str:
-    """What each choice is worth: QMIX and VDN."""
+    """The value of each choice: QMIX and VDN."""
     width, choices, observed = agent.memory.kept.weight.shape[0], env.action_size, env.observation_size
     hidden = graph.input("hidden", (env.agents, width))
     last = graph.input("last_action", (env.agents,), "int64")

@@ -1,13 +1,13 @@
 """The proxy rewards of a team as a graph: from steps to r_hat, in the unit of the true rewards.
 
-    before, after [batch *agents observation]       what a step set out from, and what it led to
-    action [batch *agents action]                   in the environment's units; a choice is a row with a single 1
-    length [batch *one]                             T of the step's episode, where the score is an average over its steps
+    before, after [batch *agents observation]       observations before and after a step
+    action [batch *agents action]                   in the environment's units; a choice is a one-hot row
+    length [batch *one]                             T of the step's episode, if the score is an average over its steps
     ->  r_hat [batch *agents]
 
-Only those inputs are there that the method looks at. `phi` is a part of the graph. Where it has no translation (`phi.py`), what it
-says is an input instead: factors [batch *agents factors]. Where credit is judged from the global state, `before` and `after` are
-states, `action` holds the actions of all agents side by side, and there is one r_hat for the team.
+The graph has only the inputs that the method uses. `phi` is a part of the graph. If it cannot be translated (`phi.py`), its output
+is an input instead: factors [batch *agents factors]. If credit is judged from the global state, `before` and `after` are states,
+`action` holds the actions of all agents side by side, and there is one r_hat for the team.
 """
 
 import numpy as np
@@ -27,11 +27,11 @@ from lare.tasks.spec import Judges
 from lare.training.config import TrainConfig
 
 STEP_DECODERS = (StepDecoder, Bottleneck, LinearDecoder)
-"""They pay a step by what is seen of it alone. Others look at whole episodes."""
+"""Decoders whose proxy reward depends on a single step alone. Other decoders look at whole episodes."""
 
 
 def unexported(config: TrainConfig, decoder: object | None) -> str | None:
-    """Why a method's rewards are no function of a step; None where they are one."""
+    """Why a method's rewards are not a function of a single step; None if they are."""
     method = config.method
     if not method.has_proxy:
         return f"{method.name} trains on what the environment pays"
@@ -52,14 +52,14 @@ def reward(
     """The graph of a team's proxy rewards, without optimism.
 
     Args:
-        credit: the decoder of one seed; None where phi itself is the reward.
-        config: of its run.
-        place: of the team.
-        phi: to be a part of the graph. Without it, the graph takes factors, if the method needs any.
+        credit: the decoder of one seed; None if phi itself is the reward.
+        config: the configuration of its run.
+        place: the index of the team.
+        phi: the function to make a part of the graph. Without it, the factors are an input, if the method needs any.
         judges: which observations phi judges.
 
     Raises:
-        Untranslatable: phi does something that has no translation.
+        Untranslatable: phi has code that cannot be translated.
     """
     graph, team = Graph(), config.env.teams[place]
     rows = () if config.of_state or team.size == 1 else (team.size,)
@@ -83,7 +83,7 @@ def reward(
 
 
 def of_phi(graph: Graph, phi: LatentFunction, judges: Judges, rows: tuple[int, ...], config: TrainConfig) -> str:
-    """What phi says of steps: of each agent by itself."""
+    """The factors of steps by phi, for each agent by itself."""
     width, parts = action_width(config), []
     for which in ("before", "after") if judges == "both" else (judges,):
         shown = graph.input(which, (*rows, config.shown))
@@ -103,7 +103,7 @@ def action_width(config: TrainConfig) -> int:
 
 
 def raw(graph: Graph, config: TrainConfig, rows: tuple[int, ...], place: int) -> list[str]:
-    """The raw part of what a decoder sees: as `training/learner.py`."""
+    """The raw part of a decoder's input, as in `training/learner.py`."""
     encoder, env = config.method.encoder, config.env
     if encoder in (None, Encoder.LATENT):
         return []
@@ -131,7 +131,7 @@ def raw(graph: Graph, config: TrainConfig, rows: tuple[int, ...], place: int) ->
 
 
 def decoded(graph: Graph, x: str, credit: Decomposition, config: TrainConfig) -> str:
-    """What the decoder says of a step, in the unit of the true rewards."""
+    """The decoder's output for a step, in the unit of the true rewards."""
     decoder = credit.decoder
     if isinstance(decoder, LinearDecoder):
         return additive(graph, x, decoder)
@@ -142,12 +142,12 @@ def decoded(graph: Graph, x: str, credit: Decomposition, config: TrainConfig) ->
         decoder = decoder.decoder
     assert isinstance(decoder, StepDecoder)
     size = np.float32(unit(credit, config.credit)) * np.float32(decoder.gain)
-    # The last axis has a single number, and goes.
+    # The product with a vector of length 1 removes the last axis.
     return graph.apply("MatMul", graph.network(x, decoder.network, "Relu"), np.full(1, size, np.float32))
 
 
 def additive(graph: Graph, x: str, decoder: LinearDecoder) -> str:
-    """r_hat = b + w . f(u), each group of features by itself; the groups are those of `credit/basis.py`."""
+    """r_hat = b + w . f(u), one group of features after the other; the groups are those of `credit/basis.py`."""
     basis, weights = decoder.basis, by_group(decoder)
     u = graph.standardised(x, decoder.mean, decoder.deviation)
     within = graph.clip(u, -HALF_PERIOD, HALF_PERIOD)
@@ -181,7 +181,7 @@ def by_group(decoder: LinearDecoder) -> dict[str, np.ndarray]:
 
 
 def shared(graph: Graph, said: str, rows: tuple[int, ...], config: TrainConfig) -> str:
-    """The mean over the agents, or over those that are alive where agents may leave; 0 for the others."""
+    """The mean over the agents. If agents may leave, the mean over those that are alive, and 0 for the others."""
     (agents,) = rows
     ones = np.ones((agents, agents), np.float32)
     if not config.env.agents_leave:

@@ -1,7 +1,7 @@
-"""NumPy's functions on rows of a graph: what `phi` may call, as operations of ONNX.
+"""NumPy's functions on rows of a graph: the functions that `phi` may call, as operations of ONNX.
 
-A value is a constant (a number, or an array), or `Rows`: an array whose first axis is the batch. No function here looks across the
-batch; what would is `Untranslatable`.
+A value is a constant (a number, or an array), or `Rows`: an array whose first axis is the batch. No function here combines
+rows of the batch; a call that would raises `Untranslatable`.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,11 +13,11 @@ import numpy as np
 from lare.deploy.graph import Graph
 
 LARGEST = 1 << 20
-"""Numbers in a constant."""
+"""The largest number of entries of a constant."""
 
 
 class Untranslatable(Exception):
-    """Something that has no translation."""
+    """The source has code that cannot be translated."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Rows:
     shape: tuple[int, ...]
     """Without the batch."""
     kind: str = "float32"
-    """Or `bool`, or `int64`."""
+    """`float32`, `bool` or `int64`."""
 
     def made(
         self, operation: str, *arguments: object, shape: tuple[int, ...] | None = None, kind: str = "float32"
@@ -38,7 +38,7 @@ class Rows:
         return Rows(self.graph, self.graph.apply(operation, *arguments), self.shape if shape is None else shape, kind)
 
     def as_numbers(self) -> "Rows":
-        """In float32."""
+        """The same values in float32."""
         return self if self.kind == "float32" else self.made("Cast", self.name)
 
 
@@ -47,7 +47,7 @@ def is_rows(value: Any) -> bool:
 
 
 def constant(value: Any) -> np.ndarray:
-    """A number or an array of the program, as one of float32 or bool."""
+    """A number or an array of the program, as an array of float32 or bool."""
     found = np.asarray(value)
     if found.dtype.kind not in "biuf" or found.size > LARGEST:
         raise Untranslatable(f"a constant of type {found.dtype}, of {found.size} numbers")
@@ -55,7 +55,7 @@ def constant(value: Any) -> np.ndarray:
 
 
 def together(operation: str, *values: Any, kind: str = "float32", of: str = "float32") -> Rows:
-    """An operation that goes element by element, with NumPy's broadcasting."""
+    """An elementwise operation, with NumPy's broadcasting."""
     one = next(value for value in values if is_rows(value))
     ranks = {len(value.shape) for value in values if is_rows(value)}
     if len(ranks) > 1:
@@ -82,7 +82,7 @@ def together(operation: str, *values: Any, kind: str = "float32", of: str = "flo
 
 
 def axes_of(x: Rows, axis: Any) -> list[int]:
-    """Axes that a reduction goes over, counted from the batch."""
+    """The axes of a reduction; the batch is axis 0."""
     given = [axis] if isinstance(axis, int) else list(axis) if isinstance(axis, tuple) else None
     if given is None:
         raise Untranslatable("a reduction over all axes")
@@ -93,7 +93,7 @@ def axes_of(x: Rows, axis: Any) -> list[int]:
 
 
 def squeezed(x: Rows, axes: Sequence[int]) -> Rows:
-    """Without axes of length 1, counted from the batch."""
+    """Remove axes of length 1; the batch is axis 0."""
     shape = tuple(size for place, size in enumerate(x.shape, start=1) if place not in axes)
     return x.made("Squeeze", x.name, np.array(axes, np.int64), shape=shape, kind=x.kind)
 
@@ -148,7 +148,7 @@ def where(condition: Rows, yes: Any, no: Any) -> Rows:
 
 
 def reshaped(x: Rows, *sizes: Any) -> Rows:
-    """`numpy.reshape`, the batch staying where it is."""
+    """`numpy.reshape`; the batch stays the first axis."""
     wanted = list(sizes[0] if len(sizes) == 1 and isinstance(sizes[0], tuple) else sizes)
     if not wanted or not (wanted[0] is BATCH or wanted[0] == -1) or wanted[1:].count(-1) + (wanted[0] == -1) > 1:
         raise Untranslatable("a reshape of the batch")
@@ -185,7 +185,7 @@ def stacked(parts: Sequence[Any], axis: int = 0) -> Rows:
 
 
 def unsqueezed(x: Rows, axis: int) -> Rows:
-    """With a new axis of length 1 at a place, counted from the batch."""
+    """Insert an axis of length 1; the batch is axis 0."""
     shape = (*x.shape[: axis - 1], 1, *x.shape[axis - 1 :])
     return x.made("Unsqueeze", x.name, np.array([axis], np.int64), shape=shape, kind=x.kind)
 
@@ -225,7 +225,7 @@ def indexed(x: Rows, index: tuple[Any, ...]) -> Rows:
 
 
 class Batch:
-    """How many rows there are: `observation.shape[0]`."""
+    """The number of rows, `observation.shape[0]`, which the graph does not know."""
 
 
 BATCH = Batch()
@@ -241,7 +241,7 @@ def filled(value: float) -> Callable[[Rows], Rows]:
 
 
 def passed(x: Any, *_: Any, **__: Any) -> Any:
-    """`numpy.asarray`, of what is an array already."""
+    """`numpy.asarray`, of an array."""
     return x.as_numbers() if is_rows(x) else np.asarray(x, np.float64)
 
 
@@ -309,5 +309,5 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "asarray": passed,
     "array": passed,
 }
-"""By NumPy's names. Those that are methods too have the same arguments there."""
+"""By NumPy's names. Functions that are methods too take the same arguments as methods."""
 METHODS = frozenset("sum mean max min prod any all argmax argmin clip reshape".split())

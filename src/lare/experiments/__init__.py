@@ -1,1 +1,1 @@
-"""What is made of finished runs."""
+"""Experiments: reports and comparisons of runs, evaluations of their policies, and sweeps of many runs."""

@@ -1,4 +1,4 @@
-"""What only runs of many agents have: steps of each team for statistics, and teams of two runs that meet."""
+"""For runs of many agents: sampled steps of each team, and matches between teams of two runs."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +23,7 @@ from lare.training.config import TrainConfig
 from lare.training.session import load_learner
 
 SAMPLED = 40
-"""Episodes for statistics."""
+"""Episodes of a sample."""
 
 
 @dataclass(frozen=True)
@@ -32,19 +32,19 @@ class Sample:
 
     team: Team
     observation: Float[np.ndarray, "rows observation"]
-    """What the step led to: what each agent observes, or the state."""
+    """What the environment shows after the step: each agent's observation, or the state."""
     factors: Float[np.ndarray, "rows factors"]
     reward: Float[np.ndarray, " rows"]
-    """True."""
+    """The true reward."""
 
     @property
     def correlations(self) -> Float[np.ndarray, " factors"]:
-        """Pearson's, of each factor with the true reward; NaN where one never varies."""
+        """Pearson's correlation of each factor with the true reward; NaN if one of the two never varies."""
         return correlations(self.factors, self.reward)
 
 
 def frames(run: Run, watched: Watched) -> list[UInt8[np.ndarray, "height width 3"]] | None:
-    """One episode as pictures, in which everybody wears its credit; None for an environment that cannot be drawn."""
+    """One episode as pictures that show each agent's credit; None for an environment that cannot be drawn."""
     env = make_env(run.config.task)
     if not isinstance(env, JaxEnv):
         env.close()
@@ -74,7 +74,7 @@ def sample(run: Run, random: bool = False) -> list[Sample]:
 
 
 class Match(NamedTuple):
-    """How the first team of one run did against the others of another: its return, for each pair of seeds."""
+    """The first team of one run against the second team of another: the first team's return, for each pair of seeds."""
 
     first: Run
     others: Run
@@ -82,10 +82,10 @@ class Match(NamedTuple):
 
 
 def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
-    """Let the first team of each run meet the other team of each: four matches, all from the same starts.
+    """Let the first team of each run play against the second team of each: four matches, all from the same initial states.
 
     Raises:
-        LareError: the runs are not of one task with two teams, or there is to be no episode.
+        LareError: the runs are not of one task with two teams, or `episodes` is less than 1.
     """
     if episodes < 1:
         raise LareError(f"episodes = {episodes}: at least one is needed")
@@ -121,7 +121,7 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
 def first_teams_return(
     env: JaxEnv, ours: Any, theirs: Any, key: PRNGKeyArray, episodes: int, config: TrainConfig
 ) -> Float[Array, ""]:
-    """The first team's return R, mean over episodes, where one policy leads it and another one all others."""
+    """The mean over episodes of the first team's return R. One policy controls this team, another one all other agents."""
     team = config.env.teams[0]
     act = partial(led_by_two, act=acting(config, greedy=False), team=team)
     played = play(env, (ours, theirs), key[None], episodes, config, greedy=False, act=act)
@@ -132,6 +132,6 @@ def first_teams_return(
 def led_by_two(
     actors: tuple[Any, Any], memory: Any, *shown: Any, act: Any, team: Team
 ) -> tuple[Float[Array, "seeds envs agents action"], Any]:
-    """The first team's actions by one actor, all others by the other; neither remembers anything."""
+    """The first team's actions by one actor, all other actions by the other actor. Neither has a memory."""
     first, others = (act(actor, memory, *shown)[0] for actor in actors)
     return jnp.where((jnp.arange(first.shape[-2]) < team.stop)[:, None], first, others), memory

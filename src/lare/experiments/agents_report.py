@@ -18,11 +18,11 @@ from lare.experiments.watch import Watched, watch
 from lare.run.directory import Run
 
 PICTURED = 1000
-"""Points of a t-SNE picture."""
+"""The largest number of points in a t-SNE picture."""
 
 
 def agents_details(run: Run) -> Iterable[str]:
-    """Who got which credit, the episode as a film, the factors of each team, and where its steps lie."""
+    """The credit of each agent and step, the episode as a film, the factors of each team, and a t-SNE picture of its steps."""
     watched = watch(run)
     true = watched.of_episode(watched.reward)
     proxy = None if watched.proxy is None else watched.of_episode(watched.proxy)
@@ -32,7 +32,7 @@ def agents_details(run: Run) -> Iterable[str]:
     if proxy is not None:
         sums += f", of the proxy rewards {proxy.sum():.1f}"
     yield note(
-        f"One episode of the first seed's policy, every agent a row. {sums}. In a film each agent wears its credit as "
+        f"One episode of the first seed's policy, every agent a row. {sums}. A film shows the credit beside each agent as "
         "number and colour: blue for more, red for less."
     )
     yield moving(run, watched)
@@ -42,7 +42,7 @@ def agents_details(run: Run) -> Iterable[str]:
 
 
 def moving(run: Run, watched: Watched) -> str:
-    """The film, inside the page; nothing for an environment that cannot be drawn."""
+    """The film, embedded in the page; empty for an environment that cannot be drawn."""
     pictures, buffer = frames(run, watched), io.BytesIO()
     if pictures is None:
         return ""
@@ -59,8 +59,8 @@ def of_team(run: Run, place: int, taken: Sample) -> Iterable[str]:
     yield factor_table(factor_labels(run, place), of_factors)
     raw, latent = (np.nanmean(np.abs(values)) for values in (of_observation, of_factors))
     yield note(
-        f"Absolute correlation with the true reward, mean over dimensions: {raw:.2f} of the {taken.observation.shape[1]} "
-        f"numbers that are judged, {latent:.2f} of the {taken.factors.shape[1]} factors."
+        f"Absolute correlation with the true reward, mean over dimensions: {raw:.2f} for the {taken.observation.shape[1]} "
+        f"numbers of an observation, {latent:.2f} for the {taken.factors.shape[1]} factors."
     )
     yield from neighbourhoods(taken)
     yield f"<h3>The latent function of {escape(name)}</h3>"
@@ -72,7 +72,7 @@ def neighbourhoods(taken: Sample) -> Iterable[str]:
     try:
         from sklearn.manifold import TSNE
     except ImportError:
-        yield note(f"After {pip_install('tsne')} a t-SNE picture of observations and factors would stand here.")
+        yield note(f"A t-SNE picture of observations and factors is drawn here after {pip_install('tsne')}.")
         return
     chosen = np.random.default_rng(0).permutation(len(taken.reward))[:PICTURED]
 
@@ -84,4 +84,4 @@ def neighbourhoods(taken: Sample) -> Iterable[str]:
     yield figures.scatters(
         {"observations": plane(taken.observation), "factors": plane(taken.factors)}, taken.reward[chosen]
     )
-    yield note("t-SNE of steps of agents; steps that are alike lie together. Colour: the true reward.")
+    yield note("t-SNE of steps of agents: similar steps are close together. Colour: the true reward.")

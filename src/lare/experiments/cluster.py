@@ -8,7 +8,7 @@ from lare.experiments.jobs import Job, as_json, train_one
 
 
 def on_ray(jobs: Sequence[Job], cores: int, address: str) -> Generator[tuple[Job, str | None], None, None]:
-    """Train on a Ray cluster, each run with its number of cores; the directory must be one that all machines see."""
+    """Train on a Ray cluster, each run on `cores` cores. All machines must share the directory of the runs."""
     try:
         import ray
         from ray.exceptions import RayError

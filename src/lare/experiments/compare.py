@@ -1,4 +1,4 @@
-"""A comparison of methods as a page: the table, and the figures that rliable's authors ask for."""
+"""A comparison of methods as a page: the table, and the figures that rliable's authors recommend."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
@@ -15,19 +15,19 @@ HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draw
 
 
 def find_runs(places: Sequence[Path]) -> list[Run]:
-    """The runs that are given, and those in directories that are given, or one level further down, as in a sweep's.
+    """The given runs, and the runs in given directories, up to two levels down, as in the directory of a sweep.
 
     Raises:
-        LareError: there is none in one of them, or nothing is given.
+        LareError: no directory is given, or one of them contains no run.
     """
     if not places:
         raise LareError("say which runs to compare")
     runs = []
     for place in places:
-        # Not those whose name begins with a dot: a run that was killed before it was made.
+        # A name that begins with a dot is the directory of a run that was killed before its directory was complete.
         found = sorted(path.parent for depth in ("", "[!.]*/", "[!.]*/[!.]*/") for path in place.glob(depth + CONFIG))
         if not found:
-            raise LareError(f"{place} is no run, and there is none in it")
+            raise LareError(f"{place} is not a run, and contains none")
         runs += map(read_measured, found)
     return runs
 
@@ -49,20 +49,20 @@ def cells(comparison: Comparison) -> list[tuple[str, ...]]:
 
 
 def what_scores_are(comparison: Comparison) -> str:
-    """In a sentence or two."""
+    """What the scores are, in a sentence or two."""
     step = int(comparison.curves[comparison.rows[0].label].x[-1])
     when = f"at step {step:,}, the last at which all runs were evaluated"
     if not comparison.normalised:
         return f"Scores are true returns on {comparison.tasks[0]} {when}."
     ends = (f"{task}: 0 is {REFERENCES[task][0]:g}, 1 is {REFERENCES[task][1]:g}" for task in comparison.tasks)
-    return f"Scores are true returns {when}, between fixed ends. {'; '.join(ends)}."
+    return f"Scores are true returns {when}, scaled linearly between two fixed returns. {'; '.join(ends)}."
 
 
 def write_comparison(runs: Sequence[Run], out: Path) -> Comparison:
     """Compare runs, and write the page.
 
     Raises:
-        LareError: they cannot be compared, or the file not be written.
+        LareError: the runs cannot be compared, or the file cannot be written.
     """
     comparison = compare(by_label(runs))
     title = f"{', '.join(comparison.tasks)}: {len(comparison.rows)} contenders"
@@ -76,9 +76,9 @@ def body(title: str, comparison: Comparison) -> Iterable[str]:
     yield note(
         what_scores_are(comparison)
         + f" IQM: interquartile mean. Intervals: stratified bootstrap over the seeds, {REPETITIONS} "
-        "repetitions; over the draws of the language model where it says draws. sd: standard deviation over the seeds. Better than "
-        "first: the probability that a run scores more than one of the first method. A single seed has no interval, nor has a "
-        f"probability of 0 or 1. {too_few(comparison)}"
+        "repetitions; in the column with draws, over the draws of the language model. sd: standard deviation over the seeds. "
+        "Better than first: the probability that a run scores more than a run of the first method. A single seed has no interval, "
+        f"and neither has a probability of 0 or 1. {too_few(comparison)}"
     )
     score = "score" if comparison.normalised else "true return"
     yield from figure("Learning", comparison.curves, "environment steps", f"IQM of the {score}", steps=True)

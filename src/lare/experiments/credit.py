@@ -1,4 +1,4 @@
-"""What a run's decoders give to the steps of an episode, beside what they truly paid."""
+"""The proxy rewards that a run's decoders give to the steps of an episode, beside the true rewards."""
 
 from dataclasses import dataclass
 
@@ -24,18 +24,19 @@ class Credit:
     """The last finished episode of a run's first seed, and the factors' correlations."""
 
     reward: Float[np.ndarray, "steps agents"]
-    """True."""
+    """True rewards."""
     proxy: Float[np.ndarray, "steps agents"]
-    """By the decoders of the last checkpoint."""
+    """Proxy rewards, by the decoders of the last checkpoint."""
     uncertainty: Float[np.ndarray, " steps"] | None
-    """How far the proxy reward of a single agent may be off: two posterior deviations of a decoder in closed form."""
+    """Two posterior standard deviations of the proxy reward, for a single agent and a closed-form decoder."""
     factors: Float[np.ndarray, "steps rows factors"]
     correlations: Float[np.ndarray, " factors"]
-    """Pearson's, of each factor with the true reward, over the last steps of all seeds. NaN where one never varies."""
+    """Pearson's correlation of each factor with the true reward, over the last steps of all seeds. NaN if one of the two never
+    varies."""
 
 
 def factor_labels(run: Run, place: int = 0) -> list[tuple[str, str]]:
-    """Name and meaning of each column of z, by the function of one of the task's roles."""
+    """Name and meaning of each column of z, for the function of one of the task's roles."""
     if not run.functions:
         return []
     function = run.functions[place]
@@ -44,7 +45,7 @@ def factor_labels(run: Run, place: int = 0) -> list[tuple[str, str]]:
 
 
 def credit_of(run: Run) -> Credit | None:
-    """None for a method without proxy rewards, and as long as no episode has finished."""
+    """The credit of a run; None for a method without proxy rewards, and while no episode has finished."""
     config, learner, _, _ = load_learner(run)
     one = of_seed(learner)
     index = newest_episode(one)
@@ -65,13 +66,16 @@ def credit_of(run: Run) -> Credit | None:
 def correlations(
     columns: Float[np.ndarray, "rows columns"], reward: Float[np.ndarray, " rows"]
 ) -> Float[np.ndarray, " columns"]:
-    """Pearson's, of each column with the reward; NaN where one never varies."""
+    """Pearson's correlation of each column with the reward; NaN if one of the two never varies."""
     with np.errstate(invalid="ignore"):
         return np.array([np.corrcoef(column, reward)[0, 1] for column in columns.T])
 
 
 def factor_correlations(learner: Learner, config: TrainConfig) -> Float[np.ndarray, " factors"]:
-    """Of a single agent's factors with its true reward, over the newest steps. NaN where only returns are known, none for many."""
+    """Correlations of a single agent's factors with its true reward, over the newest steps.
+
+    NaN if only returns are known; empty for many agents.
+    """
     if not config.method.latent or config.judged_rows > 1 or config.env.agents > 1:
         return np.zeros(0)
     buffer = learner.replay
@@ -80,6 +84,6 @@ def factor_correlations(learner: Learner, config: TrainConfig) -> Float[np.ndarr
     steps = jax.vmap(lambda one: replay.read(one, replay.newest(one, count)))(buffer)
     reward, last = np.asarray(steps.before["reward"]).ravel(), np.asarray(steps.last).ravel()
     factors = np.asarray(steps.before["factors"]).reshape(len(reward), -1)
-    if not reward[~last].any():  # paid at the end only: what each step is worth is not known
+    if not reward[~last].any():  # paid at the end only, so the true reward of each step is unknown
         return np.full(factors.shape[1], np.nan)
     return correlations(factors, reward)

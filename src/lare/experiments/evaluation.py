@@ -20,21 +20,21 @@ from lare.training.evaluation import Evaluation, together
 from lare.training.session import load_actor
 
 AT_A_TIME = 20
-"""Environments of a seed that are open together."""
+"""Environments of a seed that are open at the same time."""
 
 
 def evaluate_run(
     run: Run | str | Path, episodes: int = 10, best: bool = False
 ) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
-    """True returns by team; the only team of most tasks is called by the task's name.
+    """True returns by team. If a task has a single team, its name is that of the task.
 
-    From starts that no evaluation of the run has used. A single agent acts without noise, many as their algorithm is evaluated.
-    A team's return is the sum over the steps of the mean over its agents.
+    The episodes begin in initial states that no evaluation of the run has used. A single agent acts without noise, many agents
+    act as in training's evaluations. A team's return is the sum over the steps of the mean over its agents.
 
     Args:
         run: the run, or its directory.
-        episodes: of each seed.
-        best: play the policy of each seed's best evaluation, instead of the last one.
+        episodes: number of episodes for each seed.
+        best: play the policy of each seed's best evaluation, instead of the last policy.
 
     Raises:
         LareError: there is nothing to evaluate, or the task's environment has changed.
@@ -45,7 +45,7 @@ def evaluate_run(
 
 
 def evaluation_of(run: Run, episodes: int, best: bool = False) -> Evaluation:
-    """All that is measured of these episodes. Raises `LareError` as `evaluate_run`."""
+    """All measurements of these episodes. Raises `LareError` like `evaluate_run`."""
     if not isinstance(episodes, int) or episodes < 1:
         raise LareError(f"episodes = {episodes}: a whole number, 1 or more")
     task, settings = run.config.task, run.config.settings

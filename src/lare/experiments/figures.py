@@ -21,7 +21,7 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#0
 """Okabe and Ito's colours, which the colour-blind can tell apart."""
 
 LINES = tuple(product(("-", "--", ":", "-."), COLOURS))
-"""Of many curves: every colour with one style, then with the next."""
+"""Styles of curves: every colour with one line style, then every colour with the next."""
 
 STYLE: Any = {
     "svg.fonttype": "none",
@@ -36,7 +36,7 @@ STYLE: Any = {
 }
 
 Curve = tuple[Float[np.ndarray, " evaluations"], Float[np.ndarray, "seeds evaluations"]]
-"""Steps, and what was measured at them."""
+"""Steps, and the values that were measured at them."""
 
 
 def svg(figure: Figure) -> str:
@@ -48,7 +48,7 @@ def svg(figure: Figure) -> str:
 
 
 def new_figure(rows: int = 1, height: float = 3.4, columns: int = 1) -> tuple[Figure, np.ndarray]:
-    """A figure and its axes, row by row. They share x, and y where they stand side by side."""
+    """A figure and its axes, row by row. All share x; axes side by side also share y."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, height), layout="constrained")
         return figure, figure.subplots(rows, columns, sharex=True, sharey=columns > 1, squeeze=False).ravel()
@@ -68,12 +68,12 @@ def curves(
 
     Args:
         by_name: the curves.
-        label: of the axis upwards.
-        bottom: where that axis begins.
-        lowest: where it begins at the least.
-        marks: values to measure by, each a dotted line with its name.
-        random_until: the steps that random actions took are shaded.
-        spreads: of single seeds, half the width of the band.
+        label: the label of the y axis.
+        bottom: the lower end of the y axis.
+        lowest: a bound on the lower end of the y axis, which cuts off what is below it.
+        marks: reference values, each drawn as a dotted line with its name.
+        random_until: the number of first steps with random actions, which are shaded.
+        spreads: half the width of the band, for curves of a single seed.
     """
     figure, (axes,) = new_figure(height=3.0)
     for (line, colour), (name, (steps, values)) in zip(cycle(LINES), by_name.items(), strict=False):
@@ -108,9 +108,9 @@ def bands(
     steps: bool = False,
     decades: bool = False,
 ) -> str:
-    """Curves, each with an interval at every point. Where x counts no `steps`, what it shows is a share: stairs.
+    """Curves, each with an interval at every point. If x does not count `steps`, y is a share, drawn as stairs.
 
-    With `decades`, y goes by its logarithm.
+    With `decades`, the y axis is logarithmic.
     """
     figure, (axes,) = new_figure()
     draw_bands(axes, by_name, steps)
@@ -122,7 +122,7 @@ def bands(
 
 
 def bands_side_by_side(panels: Mapping[str, Mapping[str, Band]], across: str, up: str) -> str:
-    """Panels of curves over steps, by title, two in a row. They share their axes, and what a colour stands for."""
+    """Panels of curves over steps, by title, two in a row. They share their axes and the meaning of the colours."""
     rows = math.ceil(len(panels) / 2)
     figure, every = new_figure(rows, height=0.6 + 2.2 * rows, columns=2)
     for axes in every[len(panels) :]:
@@ -145,11 +145,11 @@ def draw_bands(axes: Axes, by_name: Mapping[str, Band], steps: bool) -> None:
 
 
 WINDOW = 100
-"""Steps of an episode that can be told apart in a picture."""
+"""The largest number of steps that can be told apart in a picture."""
 
 
 def window(steps: int) -> slice:
-    """Those that are shown: all, or as many as can be told apart from the middle of a long episode."""
+    """The steps that are shown: all, or the middle ones of a long episode."""
     first = max(0, (steps - WINDOW) // 2)
     return slice(first, min(steps, first + WINDOW))
 
@@ -159,7 +159,7 @@ def credit(
     proxy: Float[np.ndarray, " steps"],
     uncertainty: Float[np.ndarray, " steps"] | None = None,
 ) -> str:
-    """Proxy and true reward of an episode: step by step, and every step as a point."""
+    """Proxy and true rewards of an episode: curves over the steps, and a scatter plot with a point for each step."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 3.2), layout="constrained")
         axes, scatter = figure.subplots(1, 2, width_ratios=(2.1, 1))
@@ -168,7 +168,7 @@ def credit(
     if uncertainty is not None:
         band = (proxy[shown] - uncertainty[shown], proxy[shown] + uncertainty[shown])
         axes.fill_between(x, *band, color=COLOURS[0], alpha=0.2, linewidth=0)
-        # A band that leaves the picture must not flatten the curves in it.
+        # A wide band must not flatten the curves.
         low, high = (pick(np.append(reward[shown], proxy[shown])) for pick in (np.min, np.max))
         axes.set_ylim(low - (high - low), high + (high - low))
     axes.plot(x, reward[shown], color="#777777", linewidth=1.8, label="true reward")
@@ -183,7 +183,7 @@ def credit(
 
 
 def courses(factors: Float[np.ndarray, "steps factors"], names: Sequence[str]) -> str:
-    """Each factor over the same steps, one under the other."""
+    """Each factor over the same steps, one panel below the other."""
     figure, rows = new_figure(len(names), height=0.6 + 1.05 * len(names))
     shown = window(len(factors))
     for colour, axes, name, column in zip(COLOURS * len(names), rows, names, factors[shown].T, strict=False):
@@ -196,7 +196,7 @@ def courses(factors: Float[np.ndarray, "steps factors"], names: Sequence[str]) -
 
 
 def credit_map(reward: Float[np.ndarray, "steps agents"], proxy: Float[np.ndarray, "steps agents"] | None) -> str:
-    """Who got which reward when: true, and beside it proxy, each on a scale of its own (a decoder knows sums only)."""
+    """The rewards by agent and step: true and, beside them, proxy. Each has its own scale, because a decoder knows sums only."""
     parts = {"true reward": reward} | ({} if proxy is None else {"proxy reward": proxy})
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
         figure = Figure(figsize=(6.4, 1.2 + 0.16 * reward.shape[1]), layout="constrained")
@@ -224,7 +224,7 @@ def scatters(by_title: Mapping[str, Float[np.ndarray, "rows 2"]], values: Float[
 
 
 def legend_above(axes: Axes) -> None:
-    """Names in two columns, in one where they are long: a legend that is wider than the picture squeezes the curves."""
+    """A legend in two columns, or in one if names are long: a legend that is wider than the picture squeezes the curves."""
     handles, labels = axes.get_legend_handles_labels()
     labels = [textwrap.fill(label, 66) for label in labels]
     columns = 2 if max(map(len, labels)) <= 34 else 1

@@ -1,4 +1,4 @@
-"""Pieces of a page, and the page."""
+"""The parts of an HTML page, and the page itself."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -26,10 +26,10 @@ PAGE = """<!doctype html>
 
 
 def write_page(path: Path, title: str, body: str, refresh: int | None = None) -> Path:
-    """One HTML file that needs nothing else; a browser reads it again after `refresh` seconds.
+    """Write one self-contained HTML file. A browser reloads it after `refresh` seconds.
 
     Raises:
-        LareError: it cannot be written. What was there is as it was.
+        LareError: the file cannot be written. An older file is left unchanged.
     """
     again = "" if refresh is None else f'<meta http-equiv="refresh" content="{refresh}">\n'
     style = (files("lare.experiments") / "report.css").read_text(encoding="utf-8")
@@ -42,7 +42,7 @@ def write_page(path: Path, title: str, body: str, refresh: int | None = None) ->
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """An HTML table of escaped cells; the columns in `numbers` are set as figures."""
+    """An HTML table of escaped cells; the columns in `numbers` are formatted as numbers."""
 
     def cells(tag: str, row: Sequence[str]) -> str:
         kinds = (' class="number"' if place in numbers else "" for place in range(len(row)))
@@ -53,7 +53,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[
 
 
 def factor_table(labels: Iterable[tuple[str, str]], correlations: Iterable[float]) -> str:
-    """Names and meanings of factors, and how each goes with the true reward."""
+    """Names and meanings of factors, and their correlations with the true reward."""
     rows = [
         (name, meaning, "-" if math.isnan(value) else f"{value:.2f}")
         for (name, meaning), value in zip(labels, correlations, strict=True)
@@ -62,11 +62,11 @@ def factor_table(labels: Iterable[tuple[str, str]], correlations: Iterable[float
 
 
 def note(text: str) -> str:
-    """Small print."""
+    """A paragraph in small print."""
     return f'<p class="note">{escape(text)}</p>'
 
 
 def function_text(model: str, digest: str, source: str) -> str:
-    """A latent function, to be read."""
+    """The source of a latent function, and who wrote it."""
     by = "Written by hand" if model.startswith("none: written by hand") else f"By {model}"
     return note(f"{by}. SHA-256 {digest}.") + f"<pre>{escape(source)}</pre>"

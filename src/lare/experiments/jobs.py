@@ -1,4 +1,4 @@
-"""Runs that are to be: each in its place, begun or not, and how it is trained."""
+"""Planned runs (jobs): the directory of each, how far it is, and how it is trained."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,28 +21,28 @@ from lare.training.train import chosen_functions
 
 @dataclass(frozen=True)
 class Job:
-    """One run that is to be."""
+    """A planned run."""
 
     directory: Path
     task: TaskSpec
     settings: Settings
-    """As they are given."""
+    """As the user gave them."""
     resolved: ResolvedSettings
     functions: tuple[Path, ...] = ()
-    """Latent functions of one's own, instead of recorded ones: one for each team."""
+    """Files of latent functions to use instead of recorded ones: one for each team."""
 
     @property
     def name(self) -> str:
         return f"{self.directory.parent.name}/{self.directory.name}"
 
     def step(self) -> int:
-        """How far it is: the step of its last evaluation."""
+        """The step of the last evaluation; 0 before the first."""
         lines = read_metrics(self.directory)
         return lines[-1]["step"] if lines else 0
 
     @property
     def done(self) -> bool:
-        """Whether every seed has come to its end, and the checkpoint with them, where one has been kept."""
+        """Whether every seed has reached the last step, and so has the checkpoint, if there is one."""
         if not self.begun:
             return False
         ended = {line["seed"] for line in read_metrics(self.directory) if line["step"] == self.resolved.steps}
@@ -55,7 +55,9 @@ class Job:
 
 
 def job_of(root: Path, task: TaskSpec, settings: Settings, functions: Sequence[Path] = ()) -> Job:
-    """A run in its place: ROOT/TASK/METHOD-ALGORITHM, with the draw and an unusual number of candidates where they matter."""
+    """The job in ROOT/TASK/METHOD-ALGORITHM. The name of a recorded function's draw, and of an unusual number of candidates,
+    follows.
+    """
     resolved = decide(settings, task)
     ending = ""
     latent = find_method(resolved.method).latent
@@ -67,7 +69,7 @@ def job_of(root: Path, task: TaskSpec, settings: Settings, functions: Sequence[P
 
 
 def check(job: Job) -> None:
-    """Raise `LareError` where a job could not be trained, or something else is in its place."""
+    """Raise `LareError` if a job could not be trained, or if its directory holds something else."""
     method = find_method(job.resolved.method)
     functions = chosen_functions(job.task, job.resolved, job.functions) if job.functions else ()
     if job.begun:
@@ -99,10 +101,10 @@ def as_json(job: Job) -> dict[str, Any]:
 
 
 def train_one(order: dict[str, Any]) -> None:
-    """Begin a run, or go on with it."""
+    """Begin a run, or resume it."""
     directory = Path(order["directory"])
     if (directory / CONFIG).is_file():
-        env_spec(TaskSpec(**order["task"]))  # the user named what this imports, and not the run
+        env_spec(TaskSpec(**order["task"]))  # imports the module of the user's task, so that the run may too
         lare.resume(directory)
     else:
         settings = Settings(**order["settings"])

@@ -1,4 +1,4 @@
-"""A page that shows a run while it trains: the verdict and the curves, drawn anew after every evaluation."""
+"""A page that shows a run while it trains: the verdict and the curves, redrawn after every evaluation."""
 
 import webbrowser
 from contextlib import suppress
@@ -12,14 +12,14 @@ from lare.run.directory import read_measured
 from lare.training.progress import Metrics
 
 PAGE = "watch.html"
-"""In the run's directory."""
+"""The file in the run's directory."""
 
 REFRESH = 10
-"""Seconds after which a browser reads the page again."""
+"""Seconds after which a browser reloads the page."""
 
 
 class LivePage:
-    """Writes the page, and opens it in the browser when training begins. Tells nobody where it cannot be written."""
+    """Writes the page, and opens it in the browser when training begins. Errors of writing are ignored."""
 
     def __init__(self, directory: Path):
         self.directory, self.running, self.random = directory, False, None
@@ -41,7 +41,7 @@ class LivePage:
             self.draw()
 
     def draw(self) -> None:
-        """Write the page as things are."""
+        """Write the page for the current state of the run."""
         with suppress(LareError):
             run = read_measured(self.directory)
             task, method = run.config.task, run.config.settings.method
@@ -54,7 +54,7 @@ class LivePage:
                 done = metrics[-1]["step"]
             else:
                 done = 0
-            state = f"read again every {REFRESH} seconds" if self.running else "not under way"
+            state = f"reloaded every {REFRESH} seconds" if self.running else "not running"
             parts.append(
                 note(
                     f"Step {done:,} of {run.config.settings.steps:,}; {state}. lare report draws credit and factors too."

@@ -1,4 +1,4 @@
-"""The policy of a finished (or stopped) run, for a program of one's own."""
+"""The policy of a finished (or stopped) run, to use in your own program."""
 
 from contextlib import closing
 from pathlib import Path
@@ -21,7 +21,7 @@ from lare.training.session import load_actor
 class Policy:
     """A deterministic policy: from one observation to one action of the environment, or from a batch of them to a batch.
 
-    Where it remembers its episode (`qmix`, `vdn`), observations come one at a time, in order, and `reset` begins a new episode.
+    A policy with a memory (`qmix`, `vdn`) takes observations one at a time, in order, and `reset` begins a new episode.
     """
 
     def __init__(self, run: Run, place: int, best: bool):
@@ -52,11 +52,11 @@ class Policy:
         return found[0] if single else found
 
     def row(self, observation: Any) -> Float[np.ndarray, " action"]:
-        """The action for one observation in the environment's units; of a choice, a row with a single 1."""
+        """The action for one observation in the environment's units; for a choice, a one-hot row."""
         return self.in_units(self.rows(observation)[0])[0]
 
     def in_units(self, rows: Float[np.ndarray, "batch observation"]) -> Float[np.ndarray, "batch action"]:
-        """The actions in the environment's units; of a choice, a row with a single 1."""
+        """The actions in the environment's units; for a choice, a one-hot row."""
         count, remembers = len(rows), bool(jax.tree.leaves(self.memory))
         if remembers and count > 1:
             raise LareError(
@@ -68,7 +68,7 @@ class Policy:
         return in_units(np.asarray(action)[0, :, 0], self.env)
 
     def rows(self, given: Any) -> tuple[Float[np.ndarray, "batch observation"], bool]:
-        """Observations as rows, and whether it was a single one."""
+        """Observations as rows, and whether a single one was given."""
         size = self.env.observation_size
         try:
             rows = np.asarray(given, np.float32)
@@ -88,12 +88,12 @@ class Policy:
 def policy_of(run: Run | str | Path, seed: int | None = None, best: bool = False) -> Policy:
     """The deterministic policy of a seed, from one observation to one action of the environment, or from a batch to a batch.
 
-    Observations that are not one row of numbers are to be flattened first (`gymnasium.spaces.flatten`).
+    Observations that are not one row of numbers must be flattened first (`gymnasium.spaces.flatten`).
 
     Args:
         run: the run, or its directory.
-        seed: one of the run's; the first, unless given.
-        best: the policy of the seed's best evaluation, instead of the last one.
+        seed: one of the run's seeds; the default is the first.
+        best: return the policy of the seed's best evaluation, instead of the last policy.
 
     Raises:
         LareError: it is a run of many agents, or has no such seed, or no checkpoint.
@@ -103,7 +103,7 @@ def policy_of(run: Run | str | Path, seed: int | None = None, best: bool = False
 
 
 def choices(run: Run) -> OneHot:
-    """The actions of a run's environment, which are a choice."""
+    """The action space of a run's environment, whose actions are choices."""
     with closing(GymnasiumEnv(run.config.task)) as env:
         assert isinstance(env.environment.action_space, OneHot)
         return env.environment.action_space

@@ -1,4 +1,4 @@
-"""Runs on this machine: each a process of its own on cores of its own, which outlives nobody."""
+"""Runs on this machine: each in its own process, on its own cores. A process ends when its parent ends."""
 
 import contextlib
 import json
@@ -18,18 +18,18 @@ from lare.experiments.jobs import Job, as_json, train_one
 from lare.run.directory import Busy
 
 PATIENCE = 60.0
-"""Seconds that a run is waited for, which another process has just been told to end."""
+"""Seconds to wait for another process that was told to stop and still holds the run."""
 
 
 def in_processes(
     jobs: Sequence[Job], processes: int, cores: int, said: Callable[[str], None]
 ) -> Generator[tuple[Job, str | None], None, None]:
-    """Train, so many at a time; gives each job as it ends, and what went wrong.
+    """Train, `processes` jobs at a time; yields each job when it ends, and its error or None.
 
-    Whoever stops listening stops all of them: those under way save themselves first.
+    Closing the generator stops all jobs; those that are running save a checkpoint first.
 
     Raises:
-        LareError: there are not as many cores.
+        LareError: there are not enough cores.
     """
     slots: queue.Queue[list[int]] = queue.Queue()
     for share in shares(processes, cores):
@@ -41,7 +41,7 @@ def in_processes(
         try:
             said(f"{job.name} begins" + (f" again at step {job.step()}" if job.begun else ""))
             return in_a_process(job, share, running)
-        except (LareError, OSError) as error:  # of this run alone: the others go on
+        except (LareError, OSError) as error:  # only this run fails; the others continue
             return str(error)
         finally:
             slots.put(share)
@@ -57,7 +57,7 @@ def in_processes(
 
 
 class Running:
-    """The processes under way, which can be stopped together, and none is begun after that."""
+    """The running processes. They can be stopped together; after that no process is started."""
 
     def __init__(self):
         self.processes: set[subprocess.Popen] = set()
@@ -78,7 +78,7 @@ class Running:
             self.processes.discard(process)
 
     def stop(self) -> None:
-        """Ask all of them to save themselves and end."""
+        """Tell all processes to save and end."""
         with self.lock:
             self.stopped = True
             for process in self.processes:
@@ -86,40 +86,40 @@ class Running:
 
 
 def shares(processes: int, cores: int) -> list[list[int]]:
-    """Which cores each process gets; none in particular where the system cannot say.
+    """The cores of each process; an empty list for each if the system cannot tell which cores are usable.
 
     Raises:
-        LareError: there are not as many.
+        LareError: there are not enough cores.
     """
     if not hasattr(os, "sched_getaffinity"):
         return [[] for _ in range(processes)]
     usable = sorted(os.sched_getaffinity(0))
     if processes * cores > len(usable):
         raise LareError(
-            f"processes = {processes} of cores = {cores} are {processes * cores} cores, and this machine lends {len(usable)}"
+            f"processes = {processes} with cores = {cores} each need {processes * cores} cores, and {len(usable)} are usable here"
         )
     return [usable[place * cores : (place + 1) * cores] for place in range(processes)]
 
 
 def in_a_process(job: Job, cores: list[int], running: Running) -> str | None:
-    """Train one run in a process of its own; returns what went wrong. What the process says is in RUN.log."""
+    """Train one run in its own process; returns the error or None. The output of the process is in RUN.log."""
     job.directory.parent.mkdir(parents=True, exist_ok=True)
     log = job.directory.with_name(job.directory.name + ".log")
     order = json.dumps({"job": as_json(job), "cores": cores})
     with log.open("a", encoding="utf-8") as file:
         said_before = file.tell()
         command = [sys.executable, "-m", "lare.experiments.processes"]
-        # In a session of its own, so that Ctrl-C reaches it once, through us.
+        # In its own session, so that Ctrl-C reaches it only once, through this process.
         process = running.start(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file, text=True, start_new_session=True
         )
         if process is None:
-            return "it was not begun: the others were being stopped"
+            return "it was not started, because all runs were being stopped"
         assert process.stdin is not None
         assert process.stdout is not None
         last_word = ""
         try:
-            with contextlib.suppress(BrokenPipeError), process.stdin:  # which stays open as long as this process lives
+            with contextlib.suppress(BrokenPipeError), process.stdin:  # stdin stays open as long as this process lives
                 with contextlib.suppress(BrokenPipeError):
                     process.stdin.write(order + "\n")
                     process.stdin.flush()
@@ -130,9 +130,9 @@ def in_a_process(job: Job, cores: list[int], running: Running) -> str | None:
             running.ended(process)
     if process.returncode == 0:
         return None if job.done else f"it ended at step {job.step()} of {job.resolved.steps} ({log})"
-    if process.returncode < 0:  # there is no last word of a process that was killed, for memory as it may be
+    if process.returncode < 0:  # a process that was killed, perhaps for its memory, has sent no error
         return f"it was ended by {signal.Signals(-process.returncode).name} ({log})"
-    if last_word:  # not from the log, which a full disk may have cut short
+    if last_word:  # not read from the log, which a full disk may have cut short
         return f"{last_word} ({log})"
     with log.open("rb") as file:
         file.seek(said_before)
@@ -155,7 +155,7 @@ def main() -> None:
     try:
         patiently(order["job"])
     except LareError as error:
-        for place in (sys.stderr, answer):  # where the disk is full, or nobody is there any more, the other may do
+        for place in (sys.stderr, answer):  # if one fails (a full disk, a parent that has ended), the other may work
             with contextlib.suppress(OSError):
                 place.write(f"{error}\n")
                 place.flush()
@@ -163,14 +163,14 @@ def main() -> None:
 
 
 def end_with_the_input() -> None:
-    """Save and stop, as after Ctrl-C, when nobody is there any more who wanted this run."""
-    while os.read(0, 1):  # past Python's buffer, whose lock would be held at the end
+    """Save and stop, as after Ctrl-C, when the parent has ended."""
+    while os.read(0, 1):  # not through Python's buffer, whose lock would still be held at exit
         pass
     os.kill(os.getpid(), signal.SIGINT)
 
 
 def patiently(order: dict) -> None:
-    """Train, as soon as a process that was there before has let go of the run."""
+    """Train, as soon as an earlier process has released the run."""
     until = time.monotonic() + PATIENCE
     while True:
         try:

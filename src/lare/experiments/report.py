@@ -1,4 +1,4 @@
-"""The report: one HTML file that needs nothing else, of one run or of several laid over each other."""
+"""The report: one self-contained HTML file on one run, or on several runs whose curves are drawn in the same charts."""
 
 import base64
 import json
@@ -35,16 +35,16 @@ from lare.tasks.trust import TRUSTED, is_trusted, module_of
 from lare.training.explain import explanation_of
 
 FILM, LARGEST_FILM = "film.gif", 64 << 20
-"""Of a run, in its directory; in bytes."""
+"""The film in a run's directory, and the largest size in bytes at which a page shows it."""
 
 COMMAND = re.compile(r"`([^`]*)`")
-"""In a sentence."""
+"""A command within a sentence."""
 
 RANDOM_EPISODES, PATIENCE = 10, 5.0
-"""Of random actions, at most; and seconds within which they begin."""
+"""The largest number of episodes with random actions, and the seconds within which they begin."""
 
-TOP = "True rewards, for a million steps of the best public TD3,"
-"""What the upper ends of `REFERENCES` are."""
+TOP = "In public benchmarks, a million steps of TD3 on true rewards"
+"""Explains the upper ends of `REFERENCES`."""
 
 
 def write_report(
@@ -54,11 +54,11 @@ def write_report(
 
     Args:
         runs: one run or several, or their directories; finished or not.
-        out: the file; report.html in the first run's directory unless given.
-        film: film an episode of each run of a single agent, as `film.gif` in its directory; a page shows the film that is there.
+        out: the file; the default is report.html in the first run's directory.
+        film: film an episode of each run, as `film.gif` in its directory. The page shows every film that exists.
 
     Raises:
-        LareError: one of them is no run, or has nothing to show yet, or the file cannot be written.
+        LareError: one of them is not a run, or has nothing to show yet, or the file cannot be written.
     """
     every = [runs] if isinstance(runs, (Run, str, Path)) else list(runs)
     if not every:
@@ -90,13 +90,13 @@ def write_report(
 
 
 def read_run(directory: Path) -> Run:
-    """A run, without its functions where its environment is of a module that is named in its files: a report imports none."""
+    """A run. If only its files name the module of its environment, it comes without functions: a report imports no such module."""
     config = read_config(directory)
     return open_run(directory) if unknown_module(config.task) is None else Run(directory, config, ())
 
 
 def unknown_module(task: TaskSpec) -> str | None:
-    """The module that a task's environment would import, unless this process has it, or the user names it."""
+    """The module that a task's environment would import, unless this process has imported it, or the user trusts it."""
     module = module_of(task)
     return None if module is None or is_trusted(module) else module
 
@@ -104,7 +104,7 @@ def unknown_module(task: TaskSpec) -> str | None:
 def random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
     """True returns of random actions: up to ten episodes, or as many as begin within some seconds.
 
-    None where the environment is not to be imported for a report, or does not run.
+    Empty if the environment must not be imported for a report, or does not run.
     """
     found, until = [], time.monotonic() + PATIENCE
     if unknown_module(task) is None:
@@ -116,7 +116,7 @@ def random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
 
 
 def verdicts(runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> Iterable[str]:
-    """In words: what came of each run of a task."""
+    """The verdict on each run of a task."""
     ends = {name: curve(run, RETURN) for name, run in runs.items()}
     without = [name for name, run in runs.items() if run.config.settings.method == "episodic"]
     at_the_end = {name: float(np.nanmean(found[1][:, -1])) for name, found in ends.items() if found is not None}
@@ -137,7 +137,7 @@ def verdicts(runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> It
 
 
 def labels(runs: Sequence[Run]) -> list[str]:
-    """A name for each run: its method; where two would be the same, the directory that holds the method's name, or both."""
+    """A name for each run: its method. Runs of the same method are named by their directories, or by method and directory."""
     methods = [run.config.settings.method for run in runs]
     named = []
     for method, run in zip(methods, runs, strict=True):
@@ -148,7 +148,7 @@ def labels(runs: Sequence[Run]) -> list[str]:
 
 
 def curve(run: Run, key: str) -> figures.Curve | None:
-    """One number of metrics.jsonl over the steps; None where the run has none of it."""
+    """One metric of metrics.jsonl over the steps; None if the run has never measured it."""
     lines = [line for line in run.metrics() if line["seed"] in run.seeds]
     steps = sorted({line["step"] for line in lines})
     place = {(line["step"], line["seed"]): line.get(key) for line in lines}
@@ -187,7 +187,7 @@ def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
 
 
 def learning(task: str, runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> Iterable[str]:
-    """Curves of one task, all its runs in each."""
+    """Charts of one task, with all its runs in each."""
     yield f"<h2>Learning {escape(task)}</h2>"
     marks = {"random actions": float(random.mean())} if len(random) else {}
     marks |= reference(task, runs)
@@ -220,13 +220,13 @@ def learning(task: str, runs: dict[str, Run], random: Float[np.ndarray, " episod
         if max(len(run.seeds) for run in runs.values()) > 1
         else "Band of the return: ± one standard deviation over the episodes of an evaluation.",
         *(["Grey: random actions, before the first update."] if random_until else []),
-        *([f"{TOP} reach {REFERENCES[task][1]:,g}."] if task in REFERENCES else []),
+        *([f"{TOP} reach up to {REFERENCES[task][1]:,g}."] if task in REFERENCES else []),
     ]
     yield note(" ".join(explained))
 
 
 def reference(task: str, runs: dict[str, Run]) -> dict[str, float]:
-    """What true rewards reach, where that is known and not so far away that the curves would be flat beside it."""
+    """The return that true rewards reach, if it is known and not so high that the curves would look flat below it."""
     if task not in REFERENCES:
         return {}
     ends = [np.nanmax(found[1]) for run in runs.values() if (found := curve(run, RETURN)) is not None]
@@ -235,7 +235,7 @@ def reference(task: str, runs: dict[str, Run]) -> dict[str, float]:
 
 
 def curves_of(task: TaskSpec) -> Iterable[tuple[str, str, str]]:
-    """What is drawn over time: key of metrics.jsonl, title, unit; one of each team, where there are several."""
+    """The metrics that are drawn over time: key of metrics.jsonl, title, unit; one for each team, if there are several."""
     teams = {f"_{role.team}": f", team of {role.team}" for role in task.teams} or {"": ""}
     for key, title, unit in (
         (RETURN, "true return", "return"),
@@ -265,13 +265,13 @@ def details(name: str, run: Run) -> Iterable[str]:
             yield from paragraphs(said)
         yield from agents_details(run) if env_spec(run.config.task).agents > 1 else one_agent_details(run)
     else:
-        yield note("Its checkpoint is not there any more, and with it what credit and factors would be drawn from.")
+        yield note("Its checkpoint is not there any more, so that credit and factors cannot be drawn.")
     yield "<h3>Settings</h3>"
     yield settings_table(run)
 
 
 def film_of(run: Run) -> str:
-    """The film that `lare report --film` has made, inside the page; nothing where there is none."""
+    """The film that `lare report --film` has made, embedded in the page; empty if there is none."""
     path = run.directory / FILM
     if not path.is_file() or path.stat().st_size > LARGEST_FILM:
         return ""
@@ -301,8 +301,8 @@ def one_agent_details(run: Run) -> Iterable[str]:
             + (
                 ""
                 if credit.uncertainty is None
-                else " The band is two posterior deviations wide on either side: what the returns so far leave open, where the "
-                "true rewards are made of what the decoder sees."
+                else " The band is ± two posterior standard deviations: the uncertainty that the returns so far leave, if the true "
+                "rewards depend only on what the decoder sees."
             )
         )
     if run.function is not None:
@@ -326,7 +326,7 @@ def judged(run: Run) -> str:
 
 
 def settings_table(run: Run) -> str:
-    """What differs from the defaults in sight, everything else folded away."""
+    """A table of the settings that differ from the defaults; all settings are folded away below it."""
     settings = run.config.settings
     defaults = {}
     if unknown_module(run.config.task) is None:

@@ -1,7 +1,7 @@
-"""Which runs are laid beside which, and the scores that make them comparable.
+"""How runs are grouped for a comparison, and the scores that make them comparable.
 
-A *score* is a run's return at an evaluation: as it is where there is one task, else between 0, what a random policy earns, and
-1, a fixed reference (`REFERENCES`).
+A *score* is a run's return at an evaluation. If there are several tasks, it is scaled: 0 is the return of a random policy, and 1
+a fixed reference (`REFERENCES`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,13 +23,13 @@ REFERENCES = {
 million steps, the upper end of what public benchmarks report."""
 
 RETURN, RETURN_STD = "evaluation/return", "evaluation/return_std"
-"""What is compared, unless something else is asked for."""
+"""The metric that is compared by default, and its standard deviation over episodes."""
 
 SUMMED_RETURN = "evaluation/summed_return"
-"""The sum over a team's agents, where there are many."""
+"""The sum of the returns of a team's agents, if there are many."""
 
 ERROR, CORRELATION, RETURN_R2 = "credit/error", "credit/correlation", "credit/return_r2"
-"""How near the proxy rewards come to the true ones."""
+"""How close the proxy rewards are to the true ones."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Group:
 
 
 def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """The runs by method; with the algorithm where several are compared, and with whatever else tells runs of a method apart."""
+    """The runs by label: the method, the algorithm if there are several, and the settings in which runs of a method differ."""
     plans = [run.config.settings.in_force(run.config.task) for run in runs]
     several = len({plan["algorithm"] for plan in plans}) > 1
     found: dict[str, list[Run]] = {}
@@ -57,7 +57,7 @@ def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 def by_function(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Runs that are alike in all but their latent functions, by these; draws of the language model are told apart by number."""
+    """Runs with the same settings, split by their latent functions, unless these differ only from draw to draw."""
     places = {run.directory: (run.config.task.name, run.config.settings.draw) for run in runs}
     functions = {(places[run.directory], run.config.function_sha256) for run in runs}
     if len(functions) == len(set(places.values())):
@@ -70,15 +70,15 @@ def by_function(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 IGNORED = {"seed", "seeds", "draw", "steps", "evaluate_every", "evaluation_episodes"}
-"""Settings that make no other method of it."""
+"""Settings that do not distinguish methods."""
 
 
 def grouped(runs: Mapping[str, Sequence[Run]], key: str) -> tuple[list[Group], tuple[str, ...]]:
-    """The curves by label, and the tasks. Raises `LareError` where a table of them would have holes."""
+    """The curves by label, and the tasks. Raises `LareError` if their table would be incomplete."""
     tasks = tuple(sorted({run.config.task.name for of_label in runs.values() for run in of_label}))
     if len(tasks) > 1 and (unknown := [task for task in tasks if task not in REFERENCES]):
         raise LareError(
-            f"there is no reference for {', '.join(unknown)}, so its returns cannot be laid beside those of other tasks: "
+            f"there is no reference for {', '.join(unknown)}, so its returns cannot be compared with those of other tasks: "
             "compare the runs of each task by themselves"
         )
     specs: dict[str, Run] = {}
@@ -87,7 +87,7 @@ def grouped(runs: Mapping[str, Sequence[Run]], key: str) -> tuple[list[Group], t
         if other.config.task.digest != run.config.task.digest:
             raise LareError(
                 f"{run.directory} and {other.directory} are runs of two tasks that are both called {run.config.task.name}: "
-                "compare them apart"
+                "compare them separately"
             )
     curves: dict[tuple[str, str, int, int], tuple[Run, dict[int, float]]] = {}
     for label, run in ((label, run) for label, of_label in runs.items() for run in of_label):
@@ -123,5 +123,5 @@ def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[
 
 
 def curve(lines: Sequence[Mapping[str, Any]], seed: int, key: str) -> dict[int, float]:
-    """What was measured, by step."""
+    """The measured values, by step."""
     return {line["step"]: float(line[key]) for line in lines if line["seed"] == seed and line.get(key) is not None}

@@ -1,8 +1,8 @@
 """Honest statistics of few runs (Agarwal et al., "Deep RL at the edge of the statistical precipice", NeurIPS 2021), by rliable.
 
-Of scores (see `scores.py`) at the last evaluation that all runs have. Intervals are of 95%, by stratified bootstrap over the
-seeds; and apart from that over the draws of the language model, where a method was trained on several, each of them a mean
-over its seeds.
+The scores (see `scores.py`) are those of the last evaluation that all runs have. Intervals have 95%, by stratified bootstrap over
+the seeds. A method that was trained on several draws of the language model has a second interval, over the draws, each of which
+is a mean over its seeds.
 """
 
 import contextlib
@@ -22,18 +22,18 @@ from lare.experiments.scores import RETURN, Group, grouped
 from lare.run.directory import Run
 
 REPETITIONS = 2000
-"""Of the bootstrap."""
+"""Samples of the bootstrap."""
 
 FEW = {2: ("two", "one of two"), 3: ("three", "three of four")}
-"""Numbers n of seeds, or of draws, that are too few for a 95% interval: one bootstrap sample in n^n is the lowest seed n times,
-and that is more than 2.5% of them."""
+"""Numbers n of seeds, or of draws, that are too few for a 95% interval: one bootstrap sample in n^n has the lowest seed n times,
+which is more than 2.5% of the samples."""
 
 Scores = Float[np.ndarray, "runs tasks *steps"]
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number and its 95% interval; none where the bootstrap has a single run to draw from."""
+    """A number and its 95% interval. The interval has no width if the bootstrap has a single run to draw from."""
 
     value: float
     low: float
@@ -47,7 +47,7 @@ class Estimate:
 
 
 def rounded(number: float, spread: float) -> str:
-    """A number to three digits of its spread, or to four of its own where it has none; never more than six places."""
+    """A number rounded to three digits of its spread, or to four of its own if the spread is 0; at most six decimal places."""
     digits, size = (2, spread) if spread > 0 else (3, abs(number))
     places = min(max(digits - math.floor(math.log10(size)), 0), 6) if size > 0 else 3
     return f"{number:.{places}f}"
@@ -61,7 +61,7 @@ def plus_minus(mean: float, deviation: float | None) -> str:
 
 
 def mean_and_deviation(values: Float[np.ndarray, " seeds"]) -> tuple[float, float | None]:
-    """Over the seeds. A single one deviates from nothing."""
+    """Mean and standard deviation over the seeds. A single seed has no deviation."""
     return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
 
 
@@ -76,11 +76,11 @@ class Row:
     """Interquartile mean, its interval over the seeds."""
     mean: float
     deviation: float | None
-    """Standard deviation over the seeds of their means over the tasks; None where there is one seed."""
+    """Standard deviation over the seeds of their means over the tasks; None if there is one seed."""
     over_draws: Estimate | None
-    """The mean, its interval over the draws; None where there is one draw."""
+    """The mean, and its interval over the draws; None if there is one draw."""
     better: Estimate | None
-    """Probability that a run of it scores more than one of the first method; None for the first, and of single seeds."""
+    """Probability that a run scores more than a run of the first method; None for the first method, and for single seeds."""
 
 
 class Band(NamedTuple):
@@ -94,7 +94,7 @@ class Band(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """What can be said of some runs."""
+    """The statistics of some runs."""
 
     tasks: tuple[str, ...]
     rows: tuple[Row, ...]
@@ -108,7 +108,7 @@ class Comparison:
 
 
 def too_few(comparison: Comparison) -> str:
-    """What is to be said of intervals that promise too much; nothing, where there are enough seeds and draws."""
+    """A warning about intervals that are too narrow; empty if there are enough seeds and draws."""
     counts = {"seeds": {row.seeds for row in comparison.rows}, "draws": {row.draws for row in comparison.rows}}
     found = [(FEW[count], what) for what, some in counts.items() for count in sorted(some & FEW.keys())]
     if found and len(comparison.tasks) > 1:
@@ -124,11 +124,11 @@ def compare(runs: Mapping[str, Sequence[Run]], key: str = RETURN) -> Comparison:
     """Compare runs by their labels, on the tasks that all of them were trained on.
 
     Args:
-        runs: of each label, one for each task, seed and draw; see `by_label`.
-        key: what is compared, of the keys of metrics.jsonl.
+        runs: for each label, one run for each task, seed and draw; see `by_label`.
+        key: the metric to compare, a key of metrics.jsonl.
 
     Raises:
-        LareError: the runs do not make up a whole table, or rliable is not there.
+        LareError: the table of runs is incomplete, or rliable is not installed.
     """
     groups, tasks = grouped(runs, key)
     by_seed = {group.label: group.scores.mean(axis=0) for group in groups}
@@ -159,10 +159,10 @@ def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:
 
 
 def mann_whitney_p(pairs: Sequence[tuple[Float[np.ndarray, " ours"], Float[np.ndarray, " theirs"]]]) -> float:
-    """How likely it is that so many pairs, or more, are won by luck: Mann and Whitney's test, exact, over several tasks.
+    """The probability that at least so many pairs are won by chance: the exact Mann-Whitney test, over several tasks.
 
-    U = sum over tasks and over all pairs of [ours > theirs] + [ours = theirs] / 2; its distribution, were both alike, is that
-    over all ways to deal out the values of each task.
+    U = sum over tasks and over all pairs of [ours > theirs] + [ours = theirs] / 2. If both had the same distribution, all ways to
+    split the values of each task into two groups would be equally likely.
     """
     chances, won = {0.0: 1.0}, 0.0
     for ours, theirs in pairs:
@@ -178,17 +178,17 @@ def mann_whitney_p(pairs: Sequence[tuple[Float[np.ndarray, " ours"], Float[np.nd
 
 
 def mann_whitney_u(ours: Float[np.ndarray, " ours"], theirs: Float[np.ndarray, " theirs"]) -> float:
-    """Of all pairs, ties half."""
+    """The number of pairs in which ours is larger; a tie counts half."""
     return float(np.sum(ours[:, None] > theirs) + 0.5 * np.sum(ours[:, None] == theirs))
 
 
 def curve_of_iqm(scores: Scores) -> Float[np.ndarray, " steps"]:
-    """The `aggregate_iqm` of rliable at every step, all at once: a bootstrap asks for it thousands of times."""
+    """The `aggregate_iqm` of rliable at every step, computed at once, because a bootstrap calls this thousands of times."""
     return trim_mean(scores.reshape(-1, scores.shape[-1]), 0.25, axis=0)
 
 
 def share_above(scores: Scores, taus: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points"]:
-    """The run-score distribution."""
+    """The share of runs that score more than each tau: the run-score distribution."""
     return np.mean(scores[..., None] > taus, axis=(0, 1))
 
 
@@ -198,10 +198,10 @@ def band(x: Float[np.ndarray, " points"], scores: Scores, function: Callable[...
 
 
 def estimates(scores: Scores | tuple[Scores, Scores], function: Callable[..., np.ndarray]) -> list[Estimate]:
-    """What `function` gives, with intervals by stratified bootstrap, always from the same random numbers."""
+    """The values of `function`, with intervals by stratified bootstrap, always with the same random numbers."""
     library, _ = rliable()
     with warnings.catch_warnings(), random_numbers(0):
-        warnings.simplefilter("ignore")  # of the libraries beneath it about each other
+        warnings.simplefilter("ignore")  # warnings of rliable's dependencies about each other
         points, intervals = library.get_interval_estimates({"": scores}, function, reps=REPETITIONS)
     values = np.atleast_1d(points[""])
     return [Estimate(*map(float, one)) for one in zip(values, *np.reshape(intervals[""], (2, -1)), strict=True)]
@@ -209,7 +209,7 @@ def estimates(scores: Scores | tuple[Scores, Scores], function: Callable[..., np
 
 @contextlib.contextmanager
 def random_numbers(seed: int) -> Iterator[None]:
-    """NumPy's own random numbers from a seed: rliable draws them there, whatever state it is given."""
+    """Seed NumPy's global random numbers for a while. Rliable draws from them, whatever random state it is given."""
     state = np.random.get_state()
     np.random.seed(seed)
     try:

@@ -1,7 +1,7 @@
 """Many runs from one file: tasks x methods x algorithms x draws, the seeds of each in lockstep, each run a process of its own.
 
-What has come to its end is left alone, what was begun goes on from its checkpoint, what is missing is trained. So the same
-command ends a sweep that was killed, and grows one whose file has got longer.
+Finished runs are left alone, runs that have begun continue from their checkpoints, and missing runs are trained. So the same
+command completes a sweep that was killed, and extends one whose file lists more runs than before.
 """
 
 import contextlib
@@ -28,37 +28,37 @@ Draws = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
 class Share(Checked):
-    """Of the machine."""
+    """The part of the machine that runs use."""
 
     processes: Annotated[int, Field(ge=1)] = 1
     """Runs at a time."""
     cores: Annotated[int, Field(ge=1)] = 1
-    """Of each run."""
+    """Cores of each run."""
 
 
 class Sweep(Share):
-    """What the file says. Paths are relative to it."""
+    """The contents of the file. Paths are relative to it."""
 
     tasks: Texts
     """Shipped names, or paths of task files."""
     methods: Texts
     algorithms: tuple[Name, ...] = ()
-    """Each task's own, unless given."""
+    """The default is each task's own."""
     draws: Draws = (0,)
-    """Of the recorded replies; methods without a latent function are trained once."""
+    """Draws of the recorded replies. Methods without a latent function are trained once."""
     functions: dict[str, tuple[Path, ...]] = Field(default_factory=dict)
-    """Latent functions of one's own by the name of their task, one for each team; recorded ones, unless given."""
+    """Files of latent functions by the name of their task, one for each team. The default is the recorded functions."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """Whatever else `lare train` takes, as steps and seeds."""
+    """Other settings of `lare train`, such as steps and seeds."""
     out: Path | None = None
-    """The directory for all runs: `runs/NAME` beside a file NAME.toml, unless given."""
+    """The directory for all runs. The default is `runs/NAME` beside the file NAME.toml."""
 
     @field_validator("settings")
     @classmethod
     def nothing_twice(cls, settings: dict[str, Any]) -> dict[str, Any]:
         for name in ("method", "algorithm", "draw"):
             if name in settings:
-                raise ValueError(f"{name} stands above, as {name}s")
+                raise ValueError(f"{name} is not one of the settings: list {name}s above them")
         return settings
 
 
@@ -68,8 +68,9 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
     Raises:
         LareError: it cannot be read, one of its runs could not be trained, or a setting makes no difference to any of them.
     """
+    text = read_text(path, LARGEST_SETTINGS)
     try:
-        values = read_toml(read_text(path, LARGEST_SETTINGS))
+        values = read_toml(text)
         sweep = Sweep(**values)
         jobs = list(jobs_of(sweep, path))
     except (LareError, ValueError) as error:
@@ -87,7 +88,7 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
 
 
 def jobs_of(sweep: Sweep, path: Path) -> Iterator[Job]:
-    """Every run of a sweep, those of one task behind each other."""
+    """Every run of a sweep, task by task."""
     root = path.parent / (sweep.out or Path("runs") / path.stem)
     tasks = [load_task(path.parent / name if name.endswith(".toml") else name) for name in sweep.tasks]
     if unknown := sorted(sweep.functions.keys() - {task.name for task in tasks}):
@@ -111,7 +112,7 @@ def jobs_of(sweep: Sweep, path: Path) -> Iterator[Job]:
 
 
 def is_done(job: Job) -> bool:
-    """Not one that is damaged: what is wrong with it is said when its turn comes."""
+    """Whether a job is done. A damaged run is not; its error is reported when it is trained."""
     try:
         return job.done
     except LareError:
@@ -119,11 +120,11 @@ def is_done(job: Job) -> bool:
 
 
 def run_sweep(share: Share, jobs: Sequence[Job], said: Callable[[str], None], ray: str | None = None) -> list[Job]:
-    """Train what is not done, on this machine or on a Ray cluster; returns what failed.
+    """Train the jobs that are not done, on this machine or on a Ray cluster; returns the jobs that failed.
 
     Raises:
         Interrupted: the user stopped it.
-        LareError: there are not as many cores, or Ray cannot be had.
+        LareError: there are not enough cores, or Ray is not available.
     """
     missing = [job for job in jobs if not is_done(job)]
     done = len(jobs) - len(missing)
@@ -141,5 +142,5 @@ def run_sweep(share: Share, jobs: Sequence[Job], said: Callable[[str], None], ra
                 if error:
                     failed.append(job)
     except KeyboardInterrupt:
-        raise Interrupted("stopped; what was under way has saved itself, and the same command goes on") from None
+        raise Interrupted("stopped; all running runs were saved, and the same command continues them") from None
     return failed

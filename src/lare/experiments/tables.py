@@ -1,4 +1,4 @@
-"""The metrics of many runs as one table on the disk, that anybody can load."""
+"""The metrics of many runs as one table on the disk, in CSV and Parquet."""
 
 import csv
 import io
@@ -33,7 +33,7 @@ def rows_of(directories: Iterable[Path]) -> list[dict[str, Any]]:
 
 
 def write_table(rows: Sequence[dict[str, Any]], path: Path) -> list[Path]:
-    """Write PATH.csv, and PATH.parquet where the extra `statistics` is there; returns what was written."""
+    """Write PATH.csv and, with the extra `statistics`, PATH.parquet; returns the files written."""
     names = [*KEYS, *sorted({name for row in rows for name in row} - {*KEYS})]
     text = io.StringIO()
     writer = csv.DictWriter(text, names)

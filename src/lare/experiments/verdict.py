@@ -1,4 +1,4 @@
-"""A run in words: did it learn, do the factors tell the score, and what to do next."""
+"""A run in words: whether it learned, whether its proxy rewards explain the score, and what to do next."""
 
 import math
 from dataclasses import dataclass, field
@@ -7,27 +7,27 @@ import numpy as np
 from jaxtyping import Float
 
 NEXT_TO_NOTHING, MOSTLY = 0.1, 0.8
-"""R^2 of returns, below and above which proxy rewards say next to nothing, or nearly all, of the score."""
+"""R^2 of returns: proxy rewards below the first explain next to nothing of the score, above the second nearly all."""
 
 FEW = 5
-"""Evaluations, below which nothing is said of a direction."""
+"""With fewer evaluations, the verdict says nothing about a trend."""
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What a verdict goes by."""
+    """The facts that a verdict is based on."""
 
     name: str
-    """Of the run, where several are shown."""
+    """The name of the run."""
     steps: Float[np.ndarray, " evaluations"]
     returns: Float[np.ndarray, "seeds evaluations"]
     """True returns, means over the episodes of an evaluation."""
     random: Float[np.ndarray, " episodes"] = field(default_factory=lambda: np.zeros(0))
-    """True returns of random actions; none where they are not known."""
+    """True returns of random actions; empty if they are not known."""
     at_the_end: float | None = None
-    """The last return of a run that was trained on the return at the end alone, where one is shown beside it."""
+    """The last return of another run, which was trained on the return at the end alone; None without such a run."""
     return_r2: float | None = None
-    """How well returns were predicted before anything was fitted to them; None where nothing predicts them."""
+    """How well returns were predicted before anything was fitted to them; None if the method predicts none."""
     latent: bool = False
     """Whether the method has a phi."""
     directory: str = "RUN"
@@ -45,7 +45,7 @@ class Facts:
 
 
 def verdict(run: Facts) -> list[str]:
-    """A few sentences, the most important first; commands stand between backticks."""
+    """A few sentences, the most important first; commands are in backticks."""
     if not np.isfinite(run.returns[:, -1]).any():
         return ["Nothing can be said: the last evaluation gave no return."]
     return [learned(run), *compared(run), *told(run), *todo(run)]
@@ -73,7 +73,7 @@ def better_than_chance(run: Facts) -> bool:
 
 
 def compared(run: Facts) -> list[str]:
-    """Beside training on the return at the end."""
+    """A comparison with training on the return at the end alone."""
     if run.at_the_end is None:
         return []
     way = "more" if run.last > run.at_the_end else "no more"
@@ -81,13 +81,13 @@ def compared(run: Facts) -> list[str]:
 
 
 def told(run: Facts) -> list[str]:
-    """Whether the proxy rewards tell the score."""
+    """Whether the proxy rewards explain the score."""
     if run.return_r2 is None or not np.isfinite(run.return_r2):
         return []
     share, by = max(run.return_r2, 0.0), "factors and raw features" if run.latent else "raw features"
     how = "next to nothing" if share < NEXT_TO_NOTHING else "nearly all" if share > MOSTLY else "a part"
     return [
-        f"Its proxy rewards, from {by}, tell {how} of the score: R² of the last returns, before they were learned from, "
+        f"Its proxy rewards, from {by}, explain {how} of the score: R² of the last returns, before they were learned from, "
         f"is {share:.2f}."
     ]
 
@@ -98,10 +98,10 @@ def todo(run: Facts) -> list[str]:
     known = run.return_r2 is not None and np.isfinite(run.return_r2)
     if known and (run.return_r2 or 0) < NEXT_TO_NOTHING:
         other = f"`lare design {run.task} --reflect 2 --model NAME` asks for another phi; " if run.latent else ""
-        found.append(f"Next: the score is made of something else. {other}`--method bayes` goes without a phi.")
+        found.append(f"Next: the score depends on something else. {other}`--method bayes` needs no phi.")
     elif is_rising(run):
         found.append(
-            f"Next: it was still rising. To go on: `lare train --resume {run.directory} --steps {2 * int(run.steps[-1])}`."
+            f"Next: it was still rising. To continue: `lare train --resume {run.directory} --steps {2 * int(run.steps[-1])}`."
         )
     elif (best := fell_from(run)) is not None:
         step, value = best
@@ -111,10 +111,10 @@ def todo(run: Facts) -> list[str]:
         )
     elif len(run.random) and not better_than_chance(run):
         good = known and (run.return_r2 or 0) > MOSTLY
-        what = "the proxy rewards are good, so it is up to the algorithm" if good else "it may need more steps"
+        what = "the proxy rewards are good, so it depends on the algorithm" if good else "it may need more steps"
         found.append(f"Next: {what}: more `--steps`, or another `--algorithm` (`lare algorithms`).")
     if len(run.returns) == 1:
-        found.append("One seed says little: another may end elsewhere (`--seeds 3`).")
+        found.append("One seed says little: another one may reach a different return (`--seeds 3`).")
     return found
 
 
@@ -148,12 +148,12 @@ def fell_from(run: Facts) -> tuple[int, float] | None:
 
 
 def shown(value: float) -> str:
-    """A return: whole numbers where it is large."""
+    """A return as text, as a whole number if it is large."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def last_known(values: Float[np.ndarray, "seeds evaluations"]) -> float | None:
-    """The last evaluation's mean over the seeds, of the last evaluation in which one is known."""
+    """The mean over the seeds at the last evaluation that has a known value."""
     for column in values.T[::-1]:
         if len(known := column[np.isfinite(column)]):
             return float(known.mean())

@@ -21,16 +21,16 @@ from lare.tasks.table import env_spec, make_host_env
 from lare.training.streams import Stream, episode_seed
 
 FRAMES_PER_SECOND = 8
-"""Of a film of many agents."""
+"""The frame rate of a film of many agents."""
 
 FRAME = {"width": 320, "height": 320}
-"""Pixels of a MuJoCo film: its usual 480 by 480 take twice as long, and as much room."""
+"""Pixels of a MuJoCo film. The default, 480 by 480, takes twice the time and space."""
 
 
 def record_video(run: Run, path: str | Path, best: bool = False) -> None:
     """Film one episode of the first seed's policy, the last or the best, as a .gif, or as an .mp4 with the extra `lare-rl[video]`.
 
-    Agents of particle tasks wear their credit, as number and colour.
+    A film of a particle task shows each agent's credit, as number and colour.
 
     Raises:
         LareError: the environment cannot be drawn on this machine, or the file cannot be written.
@@ -39,7 +39,7 @@ def record_video(run: Run, path: str | Path, best: bool = False) -> None:
     check_video(path)
     if env_spec(run.config.task).agents > 1:
         if best:
-            raise LareError("a film of many agents shows their credit, and so the last policy: leave --best out")
+            raise LareError("a film of many agents shows their credit, and so the last policy: leave best out")
         pictures = agents.frames(run, watch(run))
         if pictures is None:
             raise LareError(f"{run.config.task.name} steps on the host, where only single agents are filmed")
@@ -55,7 +55,7 @@ def record_video(run: Run, path: str | Path, best: bool = False) -> None:
 
 
 def drawn(run: Run, environment: HostEnv, every: int, best: bool) -> Iterator[np.ndarray]:
-    """Pictures of every so many steps of an episode. Raises `LareError` where this machine draws none."""
+    """Pictures of an episode, one in `every` steps. Raises `LareError` if this machine cannot draw them."""
     policy = Policy(run, 0, best)
     shown = environment.reset(episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
     ended, step = False, 0
@@ -67,7 +67,7 @@ def drawn(run: Run, environment: HostEnv, every: int, best: bool) -> Iterator[np
 
 
 def gif(file: BytesIO, frames: Sequence[np.ndarray]) -> None:
-    """Pictures of many agents as a film within a page."""
+    """Write pictures of many agents as an animated GIF."""
     first, *others = (Image.fromarray(frame) for frame in frames)
     first.save(file, format="GIF", save_all=True, append_images=others, duration=1000 // FRAMES_PER_SECOND, loop=0)
 
@@ -76,9 +76,9 @@ def picture(environment: HostEnv, run: Run) -> np.ndarray:
     """The environment as it is now."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of graphics libraries that find no screen: another one may do without
+            warnings.simplefilter("ignore")  # of graphics libraries that find no screen; another one may not need it
             return np.asarray(environment.render())
-    except Exception as error:  # a missing display shows itself in as many ways as there are graphics libraries
+    except Exception as error:  # every graphics library has its own error for a missing display
         raise LareError(
             f"{run.config.task.environment} cannot be drawn here: "
             f"{error}; without a screen, MUJOCO_GL=egl in the environment may help"
@@ -94,7 +94,7 @@ def has_tracking_camera(run: Run) -> bool:
 
 
 def check_video(path: Path) -> None:
-    """Raise `LareError` where a video could not be written, before the work is done."""
+    """Raise `LareError` if a video could not be written, before the work is done."""
     if path.suffix not in (".gif", ".mp4"):
         raise LareError(f"{path} is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]")
     if not path.parent.is_dir():
@@ -102,7 +102,7 @@ def check_video(path: Path) -> None:
 
 
 def write_video(path: Path, frames: Sequence[np.ndarray], seconds: float) -> None:
-    """Write pictures that are shown for so many seconds each. Raises `LareError` where that cannot be done."""
+    """Write pictures that are shown for so many seconds each. Raises `LareError` if that fails."""
     import imageio.v3 as imageio
 
     timing: dict[str, Any] = {"duration": 1000 * seconds, "loop": 0} if path.suffix == ".gif" else {"fps": 1 / seconds}

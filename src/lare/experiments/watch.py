@@ -1,4 +1,4 @@
-"""Episodes of a run's policy, played anew, with everybody's credit: what films, credit maps and statistics are made of."""
+"""New episodes of a run's policy, with each agent's credit, for films, credit maps and statistics."""
 
 import contextlib
 from dataclasses import dataclass
@@ -40,32 +40,32 @@ class Watched:
     """Whether the episode had not ended before the step."""
     factors: Float[np.ndarray, "time episodes rows factors"]
     proxy: Float[np.ndarray, "time episodes agents"] | None
-    """By the decoders of the last checkpoint; None for a method without."""
+    """Proxy rewards, by the decoders of the last checkpoint; None for a method without any."""
     state: Any
-    """The states after each step, where the environment is made of pure functions."""
+    """The states after each step, if the environment is made of pure functions."""
 
     @property
     def reward(self) -> Float[np.ndarray, "time episodes agents"]:
-        """True."""
+        """True rewards."""
         return np.asarray(self.steps.after.reward)
 
     @property
     def credit(self) -> Float[np.ndarray, "time episodes agents"]:
-        """Proxy rewards, or the true ones of a method without."""
+        """Proxy rewards; for a method without any, the true rewards."""
         return self.reward if self.proxy is None else self.proxy
 
     def of_episode(self, values: np.ndarray, place: int = 0) -> np.ndarray:
-        """What belongs to one episode, [time ...]."""
+        """The values of one episode, [time ...]."""
         return values[: int(self.mask[:, place].sum()), place]
 
 
 def watch(run: Run, episodes: int = 1, random: bool = False, key: int = 0) -> Watched:
-    """Play episodes as in training, or by random actions."""
+    """Play episodes as in training, or with random actions."""
     config, learner, _, _ = load_learner(run)
     one = jax.tree.map(lambda leaf: leaf[:1], learner)
     actor = module_of(config).actor(one, run.config.settings.steps, config)
     if random:
-        actor = jax.tree.map(jnp.zeros_like, actor)  # networks of zeros prefer nothing
+        actor = jax.tree.map(jnp.zeros_like, actor)  # networks of zeros have no preference
     env = make_env(run.config.task)
     if isinstance(env, HostEnv):
         env.close()
@@ -86,7 +86,7 @@ def on_device(env: JaxEnv, config: TrainConfig, actor: Any, episodes: int, key: 
 
 
 def on_host(run: Run, config: TrainConfig, actor: Any, episodes: int) -> tuple[Trajectory, np.ndarray]:
-    """As many steps of each environment as an episode can have; what comes behind an end is masked."""
+    """Steps until every environment has finished an episode; steps after the end of an episode are masked."""
     functions, env = compiled(config), config.env
     memory = [new_memory(config, 1, episodes)]
     steps, random = [], jax.random.key(0)
@@ -118,7 +118,7 @@ def on_host(run: Run, config: TrainConfig, actor: Any, episodes: int) -> tuple[T
 def proxy_of(
     learner: Learner, steps: Trajectory, factors: np.ndarray, config: TrainConfig
 ) -> Float[np.ndarray, "time episodes agents"]:
-    """What a single seed's decoders say of episodes: these alone are put into a replay, and read."""
+    """The proxy rewards of episodes by a single seed's decoders. A new replay holds these episodes alone."""
     time, episodes = np.shape(steps.after.terminated)
     buffer = replay.empty(config.columns, episodes, 2 * time + 2, len(config.env.teams))
 
@@ -133,7 +133,7 @@ def proxy_of(
 
 
 def newest_episode(learner: Learner) -> Index | None:
-    """The steps of the last episode of a seed's first environment that has ended; None as long as there is none."""
+    """The steps of the last finished episode of a seed's first environment; None if there is none yet."""
     buffer = learner.replay
     if not int(replay.finished(buffer)[0]):
         return None

@@ -1,1 +1,1 @@
-"""From replies to a function that can be trusted."""
+"""From replies of a language model to a verified function."""

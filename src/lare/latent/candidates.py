@@ -1,6 +1,6 @@
-"""How many candidates a function is made of (line 2 of Algorithm 1 of the LaRe paper).
+"""The number of candidates for a function (line 2 of Algorithm 1 of the LaRe paper).
 
-Apart from `design.py`, so that the command line can say it without what designing needs.
+Separate from `design.py`, so that the command line can show it without importing the dependencies of `design.py`.
 """
 
 CANDIDATES = 5

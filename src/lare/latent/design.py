@@ -29,7 +29,7 @@ LONGEST_QUOTE = 20_000
 
 
 class DesignFailed(LareError):
-    """No attempt passed. `recorder` holds all of them, and whatever else was said."""
+    """No attempt passed. `recorder` holds all exchanges with the model."""
 
     status = 1
 
@@ -39,27 +39,27 @@ class DesignFailed(LareError):
 
 
 class DesignBroken(DesignFailed):
-    """The model could not be asked any more before an attempt passed."""
+    """The model became unavailable before an attempt passed."""
 
     status = 2
 
 
 class DesignStopped(DesignFailed):
-    """Somebody stopped it before an attempt passed."""
+    """The user stopped the design before an attempt passed."""
 
     status = 130
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """A reply, and what was found of it."""
+    """A reply, and the result of its verification."""
 
     reply: str
     source: str
-    """Empty where the reply could not be read."""
+    """Empty if the reply could not be read."""
     verdict: Verdict
     errors: str
-    """Everything that is wrong with it, for the model; empty where it passed."""
+    """All errors of the reply, for the model; empty if it passed."""
 
 
 def examine(reply: str, task: TaskSpec, kind: Kind, steps: Steps | None = None) -> Attempt:
@@ -73,14 +73,14 @@ def examine(reply: str, task: TaskSpec, kind: Kind, steps: Steps | None = None) 
 
 
 def first_line(attempt: Attempt) -> str:
-    """What was found, in a line."""
+    """The first error of an attempt, in one line."""
     lines = attempt.errors.splitlines() or ["passes"]
     return lines[0] + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else "")
 
 
 @dataclass(frozen=True)
 class Conversation:
-    """A model, and what it is asked about a task. Every reply is taken down."""
+    """A model, and the requests to it about a task. Every reply is recorded."""
 
     task: TaskSpec
     kind: Kind
@@ -88,19 +88,18 @@ class Conversation:
     recorder: Recorder
     said: Callable[[str], None]
     steps: Steps | None = None
-    """What functions are tried on; random steps of the environment where None."""
+    """The steps that functions are tried on. None means random steps of the environment."""
 
     def ask(self, stage: Stage, messages: Sequence[Message]) -> str:
-        """A reply to a request, another one each time that it is asked."""
+        """A reply to a request. Each call asks for a new reply."""
         reply = self.model.reply(messages, self.recorder.asked(stage, messages))
         self.recorder.take(stage, messages, reply, self.model.name)
         return reply
 
     def begin(self, candidates: int, pre_verification: bool) -> tuple[list[Message], str]:
-        """Candidates, and their combination: the last request, and the reply to it.
+        """Ask for candidates and their combination. Returns the last request and the reply to it.
 
-        A candidate that cannot be read or does not pass is left out of the combination, as long as another one passes;
-        without pre-verification nobody looks.
+        Only candidates that pass verification are combined. If none passes, or without pre-verification, all are combined.
         """
         request = prompts.candidate(self.task, self.kind)
         replies = [self.ask("candidate", request) for _ in range(candidates)]
@@ -111,7 +110,7 @@ class Conversation:
         return request, self.ask("combine", request)
 
     def sound(self, replies: Sequence[str]) -> list[str]:
-        """Those that can be read and pass."""
+        """The replies that can be read and pass verification."""
         with ThreadPoolExecutor() as pool:
             tried = list(pool.map(lambda reply: examine(reply, self.task, self.kind, self.steps), replies))
         for number, attempt in enumerate(tried, start=1):
@@ -119,7 +118,7 @@ class Conversation:
         return [attempt.reply for attempt in tried if not attempt.errors]
 
     def correct(self, request: list[Message], reply: str) -> Attempt:
-        """Verify a reply, and ask for a better one as long as it does not pass. Raises `DesignFailed`."""
+        """Verify a reply, and ask for corrections until one passes. Raises `DesignFailed` after the last attempt."""
         attempt = examine(reply, self.task, self.kind, self.steps)
         for number in range(2, ATTEMPTS + 1):
             self.said(f"attempt {number - 1}: {first_line(attempt)}")
@@ -133,7 +132,7 @@ class Conversation:
         raise self.failed(f"none of {ATTEMPTS} attempts passed; the last one failed: {first_line(attempt)}")
 
     def once(self, reply: str) -> Attempt:
-        """Take a reply as it is if it runs at all: the ablation without pre-verification. Raises `DesignFailed`."""
+        """Accept a reply if it runs at all: the ablation without pre-verification. Raises `DesignFailed` if it does not."""
         try:
             source = normal(parse(reply).functions)
             factors = run_once(source, self.task, self.kind, self.steps)
@@ -142,14 +141,14 @@ class Conversation:
         return Attempt(reply, source, Verdict((Check("executed", True, ""),), factors.shape[1]), "")
 
     def made(self, attempt: Attempt) -> LatentFunction:
-        """The artifact of an attempt."""
+        """The latent function of an attempt."""
         verdict = attempt.verdict
         return self.with_exchanges(
             replace(of_verdict(attempt.source, self.task, self.kind, verdict), model=self.model.name)
         )
 
     def with_exchanges(self, function: LatentFunction) -> LatentFunction:
-        """A function with all that was said up to now."""
+        """The function with all exchanges so far."""
         return replace(function, exchanges=tuple(exchange.model_dump() for exchange in self.recorder.exchanges))
 
     def failed(self, why: str) -> DesignFailed:
@@ -157,7 +156,7 @@ class Conversation:
 
 
 def check_recorded(task: TaskSpec, kind: Kind, draw: int, candidates: int) -> None:
-    """Raise `LareError` where the shipped recordings lack what a design asks for when every candidate passes."""
+    """Raise `LareError` if the shipped recordings lack a reply that a design needs when every candidate passes."""
     model, request = recorded_model(task.name, kind, draw), prompts.candidate(task, kind)
     replies = [model.reply(request, sample) for sample in range(candidates)]
     if candidates > 1:
@@ -165,12 +164,12 @@ def check_recorded(task: TaskSpec, kind: Kind, draw: int, candidates: int) -> No
 
 
 def quoted(reply: str) -> str:
-    """A reply as it is shown to the model again: not without end, and not empty, which some servers refuse."""
+    """A reply as it is shown to the model again: shortened, and never empty, because some servers refuse empty messages."""
     return reply[:LONGEST_QUOTE] if reply.strip() else "(an empty reply)"
 
 
 def run_once(source: str, task: TaskSpec, kind: Kind, steps: Steps | None = None) -> np.ndarray:
-    """What a program gives on steps of its task, without the gate, in the jail. Raises where it does not run."""
+    """The factors of a program on steps of its task, without the gate, in the jail. Raises if the program does not run."""
     observation, action = tried_on(task, steps)
     with contextlib.closing(JailedProgram(source, observation.shape[1], action.shape[1], gated=False)) as program:
         return factors_of(program.failed or program.call(observation, action), len(observation), kind)
@@ -187,7 +186,7 @@ def design(
     said: Callable[[str], None] = lambda _: None,
     steps: Steps | None = None,
 ) -> LatentFunction:
-    """Ask a model for `phi` until there is one that passes every check.
+    """Ask a model for `phi` until one passes every check.
 
         xi_1 .. xi_n <- M(task, role)                       Eq. 2: candidates
         xi           <- M(task, role, xi_1..n)              Eq. 3: combine
@@ -197,27 +196,27 @@ def design(
     Args:
         task: a name, a path, or a spec.
         kind: several factors, or one reward.
-        model: whom to ask; without one, the shipped recordings.
-        draw: which of the shipped recordings answers (0 to 4). Nothing to do with a training seed.
+        model: the language model to ask. Without one, the shipped recordings answer.
+        draw: the number of the shipped recording that answers (0 to 4). It is independent of the training seed.
         candidates: n; with 1 (the paper's ablation without self-prompting), the single candidate is the function and
             nothing is combined.
         pre_verification: without it (the paper's ablation), the first function is kept if it runs at all, in its jail.
-        record: a file that takes every exchange, from the first reply on.
-        said: is told how it goes.
-        steps: observations and actions that functions are tried on, where there is no environment: (n, observation size) and
-            (n, action size), as `lare.logged_steps` takes them from a data set.
+        record: the file to which every exchange is written, from the first reply on.
+        said: a function that receives messages about the progress.
+        steps: observations (n, observation size) and actions (n, action size) that functions are tried on if there is no
+            environment, as `lare.logged_steps` reads them from a data set.
 
     Raises:
-        DesignFailed: no attempt passed. `DesignBroken` where the model could not be asked any more, `DesignStopped` after Ctrl-C.
-        LareError: the model cannot answer, the environment does not run, or each team of the task has a function of its own.
+        DesignFailed: no attempt passed. `DesignBroken` if the model became unavailable, `DesignStopped` after Ctrl-C.
+        LareError: the model cannot answer, the environment does not run, or each team of the task needs its own function.
     """
     task = the_role(as_task(task))
     if model is not None and not isinstance(model, Model):
-        raise LareError(f"a model has a name and a method reply(messages, sample): {shortened(model)} has not")
+        raise LareError(f"a model must have a name and a method reply(messages, sample): {shortened(model)} does not")
     if not 1 <= candidates <= MOST_CANDIDATES:
         raise LareError(f"candidates = {candidates}: from 1 to {MOST_CANDIDATES}")
     model = model or recorded_model(task.name, kind, draw)
-    # What cannot be played is found out before a model is paid; and it is played once, before threads want the steps.
+    # Detects an environment that does not run before a model is paid. It also caches the steps before threads need them.
     tried_on(task, steps)
     recorder = Recorder(task.name, kind, getattr(model, "temperature", None), record)
     conversation = Conversation(task, kind, model, recorder, said, steps)

@@ -1,6 +1,6 @@
-"""Reflection, beyond the paper: the model is shown what returns say of its function, and may improve it.
+"""Reflection, an extension of the paper: the model sees how well its factors explain returns, and may improve its function.
 
-Who judges is given: it knows returns, which nothing in this folder does (`lare.training.reflect`).
+The caller passes the judge (`lare.training.reflect`), because no module of this folder has access to returns.
 """
 
 from collections.abc import Callable
@@ -19,16 +19,16 @@ from lare.tasks.spec import TaskSpec
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the returns of some episodes say of a function."""
+    """How well a function explains the returns of some episodes."""
 
     r2: float
-    """How well they could have been told from the factors, each before it was seen; NaN where that cannot be said."""
+    """R^2 of the returns, each predicted from the factors before it was seen; NaN if it cannot be computed."""
     text: str
-    """For the model: what the factors explain, each factor, and what they leave."""
+    """The description for the model: what the factors explain together, what each one explains, and what may be missing."""
 
 
 Judge = Callable[[LatentFunction], Evidence]
-"""The same episodes for every function that it is asked about. May raise `LareError` where a function fails on them."""
+"""It must judge every function on the same episodes. It may raise `LareError` if a function fails on them."""
 
 
 def improve(
@@ -40,18 +40,18 @@ def improve(
     record: Path | None = None,
     said: Callable[[str], None] = lambda _: None,
 ) -> LatentFunction:
-    """Show the model what returns say of a function; keep the function whose factors tell returns best.
+    """Show the model how well a function explains returns, ask for a better one, and keep the one that predicts returns best.
 
-    Whatever goes wrong on the way, and whoever stops it, the best function so far is returned.
+    After an error or an interruption, the best function so far is returned.
 
     Args:
-        function: verified; its own exchanges are gone on with.
-        task: that it is designed for.
-        model: whom to ask.
-        judge: what the returns of some episodes say.
-        rounds: how often the model is asked for a better one.
-        record: a file that takes every exchange; the one of the design, if that had one.
-        said: is told how it goes.
+        function: a verified function. New exchanges are appended to its own.
+        task: the task that the function is designed for.
+        model: the language model to ask.
+        judge: judges a function by the returns of some episodes.
+        rounds: how often the model is asked for a better function.
+        record: the file to which every exchange is written; the file of the design, if the design had one.
+        said: a function that receives messages about the progress.
     """
     exchanges = [Exchange(**one) for one in function.exchanges]
     recorder = Recorder(task.name, function.kind, getattr(model, "temperature", None), record, exchanges)
@@ -62,7 +62,7 @@ def improve(
     except (LareError, KeyboardInterrupt) as error:
         said(f"no reflection: {str(error) or 'stopped'}")
         return function
-    said(f"reflection: before it, the factors tell unseen returns with R^2 = {known.r2:.3f}")
+    said(f"reflection: the factors of the first function predict unseen returns with R^2 = {known.r2:.3f}")
     for number in range(1, rounds + 1):
         try:
             request = prompts.reflect(task, said_of(best), known.text, function.kind)
@@ -83,7 +83,7 @@ def improve(
 
 
 def said_of(function: LatentFunction) -> str:
-    """The reply that a function was read from; its source, where a person wrote it."""
+    """The reply that a function was read from; the function's source if there is no such reply."""
     replies = [reply for exchange in function.exchanges for reply in exchange["replies"]]
     for reply in reversed(replies):
         try:

@@ -1,4 +1,4 @@
-"""Answers that end: 120 s for all of one, headers too, and 8 MB, whatever its status."""
+"""Limits on a server's answers: 120 s for a whole answer, headers included, and 8 MB, whatever its status."""
 
 import importlib
 import queue
@@ -12,32 +12,32 @@ TIMEOUT = 120.0
 """Seconds for one reply."""
 
 LARGEST_BODY = 8 << 20
-"""Bytes of an answer."""
+"""The largest size in bytes of an answer."""
 
 
 class TooMuch(Exception):
-    """An answer has no end."""
+    """An answer is too large."""
 
 
 class Elsewhere(Exception):
-    """A server sends whoever asks to another one."""
+    """A server redirects to another server."""
 
 
 def stay(response: Any) -> None:
-    """Raise `Elsewhere` where an answer leads to another origin: the request would be told to it, task and all."""
+    """Raise `Elsewhere` if an answer redirects to another origin, which would receive the request with the task."""
     if not response.has_redirect_location:
         return
     here = response.request.url
     there = here.join(response.headers["location"])
     if (there.scheme, there.host, there.port) != (here.scheme, here.host, here.port):
         raise Elsewhere(
-            f"it redirects to {there.scheme}://{there.netloc.decode()}, another server: name that one if you mean it"
+            f"it redirects to {there.scheme}://{there.netloc.decode()}, another server: name that one to use it"
         )
 
 
 def bound(response: Any) -> None:
-    """Let the body of an answer, of whatever status, be read in time and no further than it may go."""
-    # Which HTTP library is beneath depends on the client's version; a stream must be one of its own kind.
+    """Limit the time and the size of an answer's body, whatever its status."""
+    # The HTTP library depends on the client's version, and a stream must be of that library's class.
     library = importlib.import_module(type(response).__module__.partition(".")[0])
 
     class Bounded(library.SyncByteStream):
@@ -58,17 +58,17 @@ def bound(response: Any) -> None:
         def close(self) -> None:
             self.stream.close()
 
-    # A few bytes can unpack to gigabytes, so that is done here, no further than the answer may go.
+    # A few bytes can unpack to gigabytes, so they are unpacked here, up to the largest size.
     packing = response.headers.pop("content-encoding", "identity").strip().lower()
     if packing not in ("identity", "", "gzip", "deflate"):
-        raise OSError(f"the answer is packed as {packing}, which nobody asked for")
+        raise OSError(f"the answer is packed as {packing}, which was not asked for")
     unpacked = zlib.decompressobj(47) if packing in ("gzip", "deflate") else None
     response.stream = Bounded(response.stream)
 
 
 def in_time(fetch: Callable[[], bytes], limit: float) -> bytes:
-    """What `fetch` returns or raises. Raises `TimeoutError` where it does neither in so many seconds: a server may say its headers
-    letter by letter, and each one starts a socket's clock anew.
+    """What `fetch` returns or raises. Raises `TimeoutError` if it takes longer than `limit` seconds. A socket's own time-out is not
+    enough: a server may send its headers byte by byte, and each byte starts that time-out again.
     """
     outcome: queue.SimpleQueue[tuple[bytes, BaseException | None]] = queue.SimpleQueue()
 
@@ -80,7 +80,7 @@ def in_time(fetch: Callable[[], bytes], limit: float) -> bytes:
 
     threading.Thread(target=run, daemon=True).start()
     try:
-        body, error = outcome.get(timeout=1.1 * limit)  # the sockets' own clocks come first, and say more
+        body, error = outcome.get(timeout=1.1 * limit)  # the sockets' own time-outs come first, with better messages
     except queue.Empty:
         raise TimeoutError(f"the answer was not complete after {limit:.0f} s") from None
     if error is not None:

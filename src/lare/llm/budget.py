@@ -1,4 +1,4 @@
-"""What a design may cost: requests, tokens and time, counted before each request so that they are never passed."""
+"""The budget of a design: requests, tokens and time, checked before each request so that it is never exceeded."""
 
 import contextlib
 import time
@@ -10,11 +10,11 @@ from lare.errors import LareError
 from lare.llm.prompts import Message
 
 MOST_TOKENS = 1 << 40
-"""A server that counts more does not know what it says."""
+"""A server that reports more tokens is wrong."""
 
 
 class BudgetSpent(LareError):
-    """The next request might pass the budget."""
+    """The next request might exceed the budget."""
 
 
 @dataclass
@@ -24,19 +24,19 @@ class Budget:
     requests: int = 60
     tokens: int = 400_000
     seconds: float = 900.0
-    """Waiting for the model, between two tries too."""
+    """Waiting for the model, the pauses between two tries included."""
     requests_made: int = 0
     tokens_in: int = 0
     tokens_out: int = 0
     seconds_waited: float = 0.0
     estimated: bool = False
-    """Whether a server said nothing of tokens, and they were counted as bytes."""
+    """Whether a server did not report its tokens, so that bytes were counted instead."""
 
     def allow(self, messages: Sequence[Message], least: int = 1) -> int:
-        """How many tokens the reply to a request may have, `least` or more. No token is shorter than a byte.
+        """How many tokens the reply to a request may have, `least` or more. Each byte of the request counts as a token.
 
         Raises:
-            BudgetSpent: there is no request, or there are not as many tokens, left.
+            BudgetSpent: no request is left, or not enough tokens.
         """
         if self.requests_made >= self.requests:
             raise BudgetSpent(f"the budget of {self.requests} requests is spent")
@@ -44,7 +44,7 @@ class Budget:
         left = self.tokens - self.tokens_in - self.tokens_out - most_tokens(messages)
         if left < least:
             used = self.tokens_in + self.tokens_out
-            raise BudgetSpent(f"the next request might pass the budget of {self.tokens:,} tokens ({used:,} are used)")
+            raise BudgetSpent(f"the next request might exceed the budget of {self.tokens:,} tokens ({used:,} are used)")
         return left
 
     @property
@@ -52,7 +52,7 @@ class Budget:
         return max(0.0, self.seconds - self.seconds_waited)
 
     def wait(self, seconds: float) -> None:
-        """Count a wait that is to come. Raises `BudgetSpent` where no time would be left after it."""
+        """Count a wait before it begins. Raises `BudgetSpent` if no time would be left after it."""
         if seconds >= self.seconds_left:
             spent = f"{self.seconds_waited:.0f} s are used" + (
                 f", and {seconds:.0f} s are to be waited" if seconds else ""
@@ -70,11 +70,11 @@ class Budget:
             self.seconds_waited += time.monotonic() - start
 
     def patience(self, longest: float) -> str:
-        """How long a reply is waited for that may take so many seconds, in words."""
+        """How long the next reply is waited for, at most `longest` seconds, in words."""
         return f"{min(longest, self.seconds_left):.0f} s at most ({minutes(self.seconds_left)} are left for all)"
 
     def count(self, usage: Any, messages: Sequence[Message], reply: str) -> None:
-        """Add what a reply cost, by the server's own count where it gives one."""
+        """Add the tokens of a reply, by the server's own count if it gives one."""
         try:
             tokens_in, tokens_out = int(usage["prompt_tokens"]), int(usage["completion_tokens"])
             if not 0 <= min(tokens_in, tokens_out) <= max(tokens_in, tokens_out) <= MOST_TOKENS:
@@ -99,5 +99,5 @@ def minutes(seconds: float) -> str:
 
 
 def most_tokens(messages: Sequence[Message]) -> int:
-    """No request has more tokens than this: one for each byte, and a few around each message."""
+    """The most tokens that a request can have: one for each byte, and a few around each message."""
     return sum(len(message["content"].encode(errors="replace")) + 16 for message in messages)

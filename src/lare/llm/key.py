@@ -1,4 +1,4 @@
-"""The key of a model: read from the environment, sent in the header of a request, and taken out of every text that is kept."""
+"""The key of a model: read from the environment, sent in the header of a request, and removed from every text that is kept."""
 
 import functools
 import os
@@ -7,7 +7,7 @@ import re
 VARIABLE = "OPENAI_API_KEY"
 
 SHORTEST = 8
-"""Characters of a key that is looked for. What is shorter is no secret, but a word like "none"."""
+"""The fewest characters of a key that is removed from texts. A shorter one is not a secret, but a word like "none"."""
 
 
 def key() -> str:
@@ -15,14 +15,14 @@ def key() -> str:
 
 
 def without_key(text: str) -> str:
-    """A text without the key, whoever put it there, as it is or spelled by the escapes of JSON and Python."""
+    """A text without the key, whether it is written literally or by the escapes of JSON and Python."""
     secret = key()
     return spellings(secret).sub("[key]", text) if len(secret) >= SHORTEST else text
 
 
 @functools.lru_cache(maxsize=8)
 def spellings(secret: str) -> re.Pattern[str]:
-    """What becomes the key when escapes are read, once or twice over."""
+    """A pattern of all texts that become the key when their escapes are read, once or twice."""
     return re.compile("".join(spelled(letter) for letter in secret))
 
 

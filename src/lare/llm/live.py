@@ -1,13 +1,13 @@
 """A live language model behind any OpenAI-compatible endpoint: OpenAI, vLLM, Ollama, llama.cpp, gateways.
 
     time-outs    see `bounded`; of all replies together, see `budget`
-    redirects    to another server are refused: the request would be told to it
-    retries      408, 409, 429, 5xx and broken connections, with back-off or as long as the server says
-    structure    asked for as a JSON schema; of servers that know none, as a JSON object; else only in words
+    redirects    to another server are refused, because it would receive the request
+    retries      408, 409, 429, 5xx and broken connections, with back-off or after the time that the server names
+    structure    requested as a JSON schema; as a JSON object if the server has no schemas; else only in words
     budget       see `budget`
     the key      see `key`
 
-What a reply says is read by `reply`, whatever way it was asked for.
+`reply` parses every reply, however its structure was requested.
 """
 
 import os
@@ -26,25 +26,25 @@ from lare.llm.key import VARIABLE, key, without_key
 from lare.llm.prompts import Message
 
 TRIES = 6
-"""Of one request, the first included."""
+"""Tries of one request, the first included."""
 
 LONGEST_WAIT = 60.0
 """Seconds between two tries, whatever the server asks for."""
 
 REPLY_TOKENS, SHORTEST_REPLY = 16_384, 1024
-"""The most that a reply may have; halved as long as the model allows less, down to the second."""
+"""The largest number of tokens of a reply. It is halved while the model allows less, down to the second number."""
 
 LONGEST_EXCERPT = 200
-"""Characters of an answer that cannot be read."""
+"""The most characters that a message quotes of an answer that cannot be read."""
 
 RETRIED = {408, 409, 429}
 
 HOPELESS = ("UnsupportedProtocol", "InvalidURL", "LocalProtocolError", "Elsewhere")
 NOT_SENT = ("Connect", *HOPELESS)
-"""Beginnings of names of errors. HOPELESS: asking again gives the same one. NOT_SENT: the request did not reach the server."""
+"""Beginnings of names of errors. HOPELESS: another try would fail too. NOT_SENT: the request did not reach the server."""
 
 PLAIN = {"Accept-Encoding": "identity"}
-"""What is not packed needs no room to be unpacked."""
+"""Asks for answers that are not packed, which need no memory to be unpacked."""
 
 SCHEMA = {
     "type": "object",
@@ -61,7 +61,7 @@ LADDER: tuple[dict[str, Any] | None, ...] = (
 """Ways to ask for structure, the strictest first."""
 
 LIMITS = ("max_completion_tokens", "max_tokens")
-"""What the longest reply is called, by newer servers and by older ones."""
+"""The name of the limit on a reply's tokens, for newer servers and for older ones."""
 
 
 class ModelFailed(LareError):
@@ -72,8 +72,8 @@ class ModelFailed(LareError):
 class LiveModel:
     """Asks an OpenAI-compatible endpoint.
 
-    `base_url` and the key are those of the environment (OPENAI_BASE_URL, OPENAI_API_KEY) unless given; a server of
-    one's own may need no key.
+    The key is that of the environment variable OPENAI_API_KEY; a server of your own may need none. The default of `base_url` is
+    OPENAI_BASE_URL, or else OpenAI's.
     """
 
     name: str
@@ -81,7 +81,7 @@ class LiveModel:
     temperature: float | None = None
     budget: Budget = field(default_factory=Budget)
     said: Callable[[str], None] = lambda _: None
-    """Is told of retries."""
+    """Called with messages about waiting and retries."""
     sleep: Callable[[float], None] = time.sleep
     rung: int = 0
     limit_name: int = 0
@@ -91,12 +91,12 @@ class LiveModel:
         if not self.name.strip() or not self.name.isprintable():
             raise ModelFailed(f"{self.name!a} is not the name of a model")
         if not re.fullmatch(r"[!-~]*", key()):
-            raise ModelFailed(f"the environment variable {VARIABLE} holds characters that are in no key")
+            raise ModelFailed(f"the environment variable {VARIABLE} holds characters that no key can have")
         base_url = self.base_url or os.environ.get("OPENAI_BASE_URL")
         if not key() and base_url is None:
             raise ModelFailed(
                 f"to ask {self.name!r}, put a key into the environment variable {VARIABLE}, or name a server of "
-                "your own with --base-url (as http://localhost:11434/v1 for Ollama)"
+                "your own with --base-url (http://localhost:11434/v1 for Ollama)"
             )
         self.endpoint = base_url
         try:
@@ -107,7 +107,7 @@ class LiveModel:
             raise ModelFailed(f"the endpoint {base_url!r} cannot be used: {scrubbed(error)}") from None
 
     def connect(self) -> Any:
-        """A client that reads no answer without end."""
+        """A client that limits the time and the size of answers."""
         import openai
 
         http = openai.DefaultHttpxClient(event_hooks={"response": [stay, bound]}, timeout=TIMEOUT)
@@ -116,7 +116,7 @@ class LiveModel:
         )
 
     def reply(self, messages: Sequence[Message], sample: int) -> str:
-        """One reply. `sample` makes no difference here: a model says something new each time.
+        """One reply. `sample` is not used: a live model gives a new reply each time.
 
         Raises:
             ModelFailed: there was no reply, after all tries.
@@ -171,7 +171,7 @@ class LiveModel:
             hopeless = type(cause).__name__.startswith(HOPELESS)
             return Failure(scrubbed(f"{where} cannot be reached: {cause}"), again=not hopeless)
         except (openai.OpenAIError, OSError) as error:
-            if isinstance(error, TimeoutError):  # whoever goes on reading is left behind
+            if isinstance(error, TimeoutError):  # the thread that is still reading keeps the old client
                 self.client.close()
                 self.client = self.connect()
             self.count_all(messages, allowed)
@@ -181,17 +181,17 @@ class LiveModel:
             return Failure(str(error), again=False)
         except Elsewhere as error:
             return Failure(scrubbed(error), again=False)
-        except Exception as error:  # what the transport raises while a body is read depends on the client's version
+        except Exception as error:  # the transport's errors while a body is read depend on the client's version
             self.count_all(messages, allowed)
             return Failure(scrubbed(f"the answer broke off ({type(error).__name__}: {error})"), again=True)
         return self.read(body, messages, allowed)
 
     def count_all(self, messages: Sequence[Message], allowed: int) -> None:
-        """Count a request that was broken off at the most that it may have cost: somebody may have answered it."""
+        """Count an aborted request at the most that it may have cost, because the server may have answered it."""
         self.budget.count(None, messages, "x" * allowed)
 
     def read(self, body: bytes, messages: Sequence[Message], allowed: int) -> "str | Failure":
-        """The text of a chat completion. An answer that is none is tried again: something is wrong on the way."""
+        """The text of a chat completion. If the answer is not a chat completion, the request is tried again."""
         try:
             answer = read_json(body)
             choice = answer["choices"][0]
@@ -199,7 +199,7 @@ class LiveModel:
             text = message.get("content") or message.get("refusal") or ""
             if not isinstance(text, str):
                 raise TypeError("the content is not a text")
-            text = text.encode(errors="replace").decode()  # half a character is none
+            text = text.encode(errors="replace").decode()  # replaces lone surrogates
         except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
             self.budget.count(None, messages, body.decode(errors="replace"))
             what = f"the answer is not a chat completion ({type(error).__name__}: {error})"
@@ -210,9 +210,9 @@ class LiveModel:
         return text
 
     def refused(self, error: Any) -> "Failure":
-        """An HTTP status that is no success: ask for less, wait, or give up."""
+        """Handle an HTTP error: ask for less, wait, or give up."""
         status, body = error.status_code, getattr(error, "body", None)
-        # The client's own message tells nothing of a body that is not JSON: a page of a proxy, or a plain sentence.
+        # The client's own message leaves out a body that is not JSON, such as the page of a proxy or a plain sentence.
         said = scrubbed(f"{error}: {excerpt(body)}" if isinstance(body, str) and body.strip() else error)
         if status in (400, 422) and self.step_down(said.lower()):
             return Failure(said, again=True, wait=None)
@@ -221,7 +221,7 @@ class LiveModel:
         return Failure(f"HTTP {status}: {said}", again, wait)
 
     def step_down(self, said: str) -> bool:
-        """Ask for less, of a server that knows or allows less. False where there is nothing less to ask for."""
+        """Ask for less, of a server that supports or allows less. False if there is nothing less to ask for."""
         too_long = "token" in said and any(
             word in said for word in ("large", "at most", "maximum", "context", "exceed")
         )
@@ -247,11 +247,11 @@ class Failure:
     said: str
     again: bool
     wait: float | None = 0.0
-    """Seconds until the next try; 0 where nobody has said, None where something else is tried at once."""
+    """Seconds until the next try; 0 if the server has not named them, None if a different request is sent at once."""
 
 
 def scrubbed(text: object) -> str:
-    """A message in one line, without the key, and without what a terminal would obey."""
+    """A message in one line, without the key, and without control characters."""
     return without_key(in_a_line(text))[:500]
 
 
@@ -262,7 +262,7 @@ def excerpt(body: str) -> str:
 
 
 def seconds(retry_after: str | None) -> float:
-    """The header Retry-After in seconds; 0 where it is not there, or is a date."""
+    """The header Retry-After in seconds; 0 if it is missing, or is a date."""
     try:
         return max(0.0, float(retry_after or 0))
     except ValueError:

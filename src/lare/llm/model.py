@@ -1,4 +1,4 @@
-"""Whom to ask: anything with a name and a reply. The design loop knows no more of a model."""
+"""The interface of a language model: a name, and replies. The design loop uses nothing else of a model."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ from lare.llm.recording import RecordedModel, read_recording, shipped_recordings
 
 @runtime_checkable
 class Model(Protocol):
-    """Whoever answers a request."""
+    """Anything that answers a request."""
 
     name: str
 

@@ -1,7 +1,7 @@
 """From a task to the messages that a language model gets: candidate, combine, correct.
 
-Every text is stripped of surrounding white space. A request is a list of messages, and the same task always gives the
-same request, byte for byte: recordings are found by it.
+Every text is stripped of surrounding white space. A request is a list of messages. The same task always gives the same
+request, byte for byte, because recorded replies are looked up by the request.
 """
 
 from collections.abc import Sequence
@@ -50,7 +50,7 @@ def correct(conversation: Sequence[Message], reply: str, errors: str) -> list[Me
 
 
 def reflect(task: TaskSpec, reply: str, evidence: str, kind: Kind = "factors") -> list[Message]:
-    """The request that shows what a function's factors did on whole episodes. Not in the paper."""
+    """The request that shows how a function's factors relate to the returns of whole episodes. Not in the paper."""
     return [
         *candidate(task, kind),
         {"role": "assistant", "content": reply.strip()},

@@ -17,7 +17,7 @@ SHIPPED = files("lare.llm") / "recordings"
 
 
 class Exchange(Checked):
-    """A request and the replies to it, as they came."""
+    """A request and the replies to it, unchanged."""
 
     stage: Stage
     messages: list[Message]
@@ -40,7 +40,7 @@ def shipped_recordings(kind: Kind, draw: int) -> list[Recording]:
     """The recordings of that kind and draw that come with the package, by task.
 
     Raises:
-        LareError: there are none with that number.
+        LareError: no recording has that draw.
     """
     ending = f".draw{draw}.json"
     entries = sorted((SHIPPED / kind).iterdir(), key=lambda entry: entry.name)
@@ -52,7 +52,7 @@ def shipped_recordings(kind: Kind, draw: int) -> list[Recording]:
 
 
 def read_recording(text: str, name: str) -> Recording:
-    """Raises `LareError` where `text` is not a recording; `name` says in the message which one."""
+    """Parse a recording. Raises `LareError` if `text` is not one; the message contains `name`."""
     try:
         values = read_json(text)
         json.dumps(values, ensure_ascii=False).encode()
@@ -69,10 +69,10 @@ def read_recording(text: str, name: str) -> Recording:
 
 
 class RecordedModel:
-    """Answers the requests that it knows, word for word, and no others."""
+    """Answers requests that match a recorded one word for word, and no others."""
 
     def __init__(self, recordings: Sequence[Recording], task: str):
-        """`task` is named when a request is refused."""
+        """`task` is named in the error for an unknown request."""
         self.recordings = recordings
         self.task = task
         self.name = "recorded"
@@ -89,18 +89,18 @@ class RecordedModel:
                 self.name = f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
                 return replies[sample]
         raise LareError(
-            f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}): only the tasks that ship have "
-            "some, for their exact texts. Ask a model (lare design TASK --model NAME --out phi.py), train with a function that you "
-            "have (--function phi.py), or by a method that needs none (--method bayes)"
+            f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}): only the shipped tasks have "
+            "recorded replies, for their exact texts. Ask a model (lare design TASK --model NAME --out phi.py), train with a "
+            "function that you have (--function phi.py), or by a method that needs none (--method bayes)"
         )
 
 
 @dataclass
 class Recorder:
-    """Takes down every exchange of a design, and keeps it in a file from the first reply on, if there is one.
+    """Records every exchange of a design, and saves it to `path`, if there is one, after each reply.
 
-    A file is never overwritten: it must not be there when the first reply comes. What it holds is never lost: it is replaced as
-    a whole.
+    An existing file is never overwritten: the file must not exist when the first reply comes. After that it is replaced as a
+    whole, so that no reply is lost.
     """
 
     task: str
@@ -109,14 +109,14 @@ class Recorder:
     path: Path | None = None
     exchanges: list[Exchange] = field(default_factory=list)
     begun: bool = False
-    """Whether the file is ours."""
+    """Whether this recorder has created the file."""
 
     def asked(self, stage: Stage, messages: Sequence[Message]) -> int:
-        """How many replies there are to a request already."""
+        """How many replies to a request are recorded already."""
         return sum(len(one.replies) for one in self.exchanges if (one.stage, one.messages) == (stage, list(messages)))
 
     def take(self, stage: Stage, messages: Sequence[Message], reply: str, model: str) -> None:
-        """Add a reply to a request; the same request again adds to its replies."""
+        """Add a reply to a request. If the last request was the same, the reply is added to its replies."""
         if self.exchanges and (self.exchanges[-1].stage, self.exchanges[-1].messages) == (stage, list(messages)):
             last = self.exchanges.pop()
             replies = [*last.replies, reply]
@@ -127,13 +127,13 @@ class Recorder:
             self.keep(model)
 
     def keep(self, model: str) -> None:
-        """Write all of it to its own file."""
+        """Write all exchanges to `path`."""
         assert self.path is not None
         self.write(self.path, model, new=not self.begun)
         self.begun = True
 
     def write(self, path: Path, model: str, new: bool = True) -> None:
-        """Raises `LareError` where the file cannot be written, or is there and should be `new`."""
+        """Write the recording. Raises `LareError` if the file cannot be written, or if it exists and should be `new`."""
         try:
             if new:
                 path.touch(exist_ok=False)
@@ -144,12 +144,12 @@ class Recorder:
                     path.unlink(missing_ok=True)
                 raise
         except FileExistsError:
-            raise LareError(f"{path} exists, and is not overwritten; choose another --record") from None
+            raise LareError(f"{path} exists, and is not overwritten; choose another file") from None
         except OSError as error:
             raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
     def text(self, model: str) -> str:
-        """The file."""
+        """The contents of the file."""
         recording = Recording(
             task=self.task,
             kind=self.kind,

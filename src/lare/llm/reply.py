@@ -1,4 +1,4 @@
-"""What a reply must look like, and reading it."""
+"""The form of a model's reply, and its parser."""
 
 import json
 import re
@@ -11,10 +11,10 @@ from lare.foreign import integer, read_json, shallow
 from lare.llm.key import without_key
 
 LONGEST = 200_000
-"""Characters of a reply."""
+"""The most characters of a reply."""
 
 MOST_STARTS = 100
-"""Places where an object may begin, in a text that is not one."""
+"""In a text that is not a JSON object, at most so many places are tried as the beginning of one."""
 
 
 class MalformedReply(LareError):
@@ -36,10 +36,10 @@ FENCE = re.compile(r"```[ \t]*+([\w.+-]*+)[ \t]*+\r?\n(.*?)```", re.DOTALL)
 """A fenced block, with its language."""
 
 THOUGHT = re.compile(r"</think(?:ing)?>")
-"""What ends that which some models say to themselves, drafts and all, before they answer."""
+"""The end of the reasoning, which some models write before their answer and which may contain drafts of it."""
 
 START = re.compile(r'\{\s*"')
-"""Where an object may begin."""
+"""A place where an object may begin."""
 
 KEYS = {"Understand", "Analyze", "Functions"}
 
@@ -76,7 +76,7 @@ def parse(text: str) -> Reply:
 
 
 def check_characters(text: str) -> None:
-    """Raise `MalformedReply` where a text has half a character in it: JSON can say one, and no file can keep it."""
+    """Raise `MalformedReply` if a text has a lone surrogate: JSON can express it, but no file can store it."""
     try:
         text.encode()
     except UnicodeEncodeError as error:
@@ -86,7 +86,7 @@ def check_characters(text: str) -> None:
 
 
 def embedded(text: str) -> dict[str, Any] | None:
-    """The last whole object that stands somewhere in a text, or the function that stands in a fence."""
+    """The last complete object within a text, or else the function in a fenced block."""
     decoder, partial = json.JSONDecoder(strict=False, parse_int=integer), None
     text = THOUGHT.split(text)[-1]
     for start in [match.start() for match in START.finditer(text)][: -MOST_STARTS - 1 : -1]:

@@ -1,1 +1,1 @@
-"""Logs of the past: proxy rewards for episodes that somebody recorded, without a simulator."""
+"""Logged episodes: proxy rewards for recorded steps, without a simulator."""

@@ -1,4 +1,4 @@
-"""Episodes in memory: flat arrays, as D4RL and CORL have them, or one mapping of arrays for each episode."""
+"""Episodes in memory: flat arrays, as in D4RL and CORL, or one mapping of arrays for each episode."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -12,11 +12,11 @@ from lare.logs.episode import KEYS, NEEDED, Hints, Logged, Paid, checked, form_o
 from lare.logs.output import check_free
 
 D4RL = {"terminals": "terminations", "timeouts": "truncations"}
-"""Names of flags in D4RL's data sets, and ours."""
+"""From the names of flags in D4RL's data sets to the names here."""
 
 
 class ListedLogs:
-    """Any iterable of mappings that can be gone through more than once. They are taken one at a time."""
+    """Any iterable of mappings that can be iterated more than once. One episode is read at a time."""
 
     def __init__(self, episodes: Iterable[Mapping[str, Any]], hints: Hints):
         self.name, self.given = "episodes", episodes
@@ -29,22 +29,22 @@ class ListedLogs:
         self.form = form_of("episode 0", mapping("episode 0", first), hints.sizes, hints.limit)
 
     def episodes(self) -> Iterator[Logged]:
-        """In their order."""
+        """All episodes, in their order."""
         for number, values in enumerate(self.given):
             name = f"episode {number}"
             yield checked(name, mapping(name, values), self.form, values)
 
     def check_out(self, out: str | Path, overwrite: bool) -> None:
-        """A directory."""
+        """Check the directory to write."""
         check_free(Path(out), overwrite)
 
     def write(self, out: str | Path, episodes: Iterable[Paid], overwrite: bool, about: str) -> str | Path:
-        """A directory of .npz files."""
+        """Write a directory of .npz files."""
         return npz.write(Path(out), ((f"{number:08d}.npz", paid) for number, paid in enumerate(episodes)), overwrite)
 
 
 class FlatLogs(ListedLogs):
-    """Arrays of all steps, one behind the other. An episode ends where a flag says so; what is behind the last flag was cut."""
+    """Arrays of all steps, one after the other. A flag marks the end of an episode; steps after the last flag were cut off."""
 
     def __init__(self, arrays: Mapping[str, Any], hints: Hints):
         flat = {D4RL.get(key, key): np.asarray(value) for key, value in arrays.items()}
@@ -57,8 +57,8 @@ class FlatLogs(ListedLogs):
         if not {"terminations", "truncations"} & set(flat):
             raise LareError("the arrays have no terminations and no truncations: nothing says where episodes end")
         if "next_observations" not in flat:
-            raise LareError("the arrays have no next_observations: flat arrays must say what each step led to")
-        # What is not of steps (D4RL's metadata) is of no episode.
+            raise LareError("the arrays have no next_observations: flat arrays need the observation after each step")
+        # Arrays without a row for each step (D4RL's metadata) belong to no episode.
         self.flat = {key: value for key, value in flat.items() if key in KEYS or np.shape(value)[:1] == (steps,)}
         for key, value in self.flat.items():
             if np.shape(value)[:1] != (steps,):

@@ -1,4 +1,4 @@
-"""A first spec of a log: sizes from its arrays and, of a Minari data set, its description."""
+"""The first draft of a task for a log: sizes from its arrays and, for a Minari data set, its description."""
 
 import re
 from typing import Any
@@ -12,10 +12,10 @@ LIMIT = "# max_episode_steps = 1000 # episodes that did not terminate, and are s
 
 
 def draft_of_logs(source: Any) -> Draft:
-    """Write down what a log says of itself.
+    """A draft with all that a log says about itself.
 
     Raises:
-        LareError: it cannot be read.
+        LareError: the log cannot be read.
     """
     logs = open_logs(source)
     described, left_out = without_rewards(plain(description_of(logs)))
@@ -26,7 +26,7 @@ def draft_of_logs(source: Any) -> Draft:
     lines = [
         *warning(left_out),
         f'name = "{name}"',
-        f'environment = "{NO_ENVIRONMENT}" # there are logs only; or the id of the environment that they are of, to train in it',
+        f'environment = "{NO_ENVIRONMENT}" # there are logs only; to train, the id of the environment that they come from',
         f"observation_size = {layouts['observation'].size}",
         f"action_size = {layouts['action'].size}",
         'judges = "after"',
@@ -39,7 +39,7 @@ def draft_of_logs(source: Any) -> Draft:
 
 
 def description_of(logs: Source) -> str:
-    """What a data set of Minari's says of itself; other logs say nothing."""
+    """The description of a Minari data set; empty for other logs."""
     dataset = getattr(logs, "dataset", None)
     return "" if dataset is None else str(dataset.storage.metadata.get("description") or "")
 

@@ -1,4 +1,4 @@
-"""One logged episode, checked: every log is foreign, and what does not fit is a `LareError` that names file and key."""
+"""One logged episode, checked: no log is trusted, and a value that does not fit raises a `LareError` with file and key."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,16 +24,16 @@ class Logged:
     """An episode of T steps."""
 
     name: str
-    """Where it stands, for messages."""
+    """The file or the place of the episode, for messages."""
     before: Float[np.ndarray, "steps observation"]
     action: Float[np.ndarray, "steps action"]
     after: Float[np.ndarray, "steps observation"]
     paid: Float[np.ndarray, " steps"]
-    """What was paid for each step. A score stands at the last one."""
+    """The original reward of each step. A score is that of the last step."""
     whole: bool
-    """Whether it has a return to learn from: it was not cut."""
+    """Whether the episode was not cut, so that its return can be learned from."""
     kept: Any = field(repr=False)
-    """What its file says, for whoever writes it again."""
+    """The contents of its file, to write them again."""
 
     def __len__(self) -> int:
         return len(self.paid)
@@ -41,12 +41,12 @@ class Logged:
 
 @dataclass(frozen=True)
 class Form:
-    """What all episodes of a log have in common."""
+    """The form that all episodes of a log have in common."""
 
     observation: Layout
     action: Layout
     limit: int | None = None
-    """Steps after which an episode is ended by its time limit; None where that is not known."""
+    """Steps after which the time limit ends an episode; None if it is not known."""
 
 
 class Paid(NamedTuple):
@@ -57,24 +57,24 @@ class Paid(NamedTuple):
 
 
 class Hints(NamedTuple):
-    """What a task says of logs."""
+    """What a task says about its logs."""
 
     sizes: Mapping[str, int]
-    """Of `observation` and `action` rows."""
+    """Sizes of `observation` and `action` rows."""
     limit: int | None
-    """Steps of an episode that the time limit ended."""
+    """The time limit, in steps."""
 
 
 def checked(name: str, values: Mapping[str, Any], form: Form, kept: Any) -> Logged:
-    """An episode from what its file says.
+    """An episode from the contents of its file.
 
     Args:
-        name: of the file, or the episode in it.
+        name: name of the file, or of the episode in it.
         values: `observations` (T + 1, ...) or, with `next_observations` (T, ...), (T, ...); `actions` (T, ...); `rewards` (T,) or
-            `score`, a single number; where there are any `terminations` and `truncations`, (T,) or one flag, `cut`, one flag, and
-            `paid` (T,), what `rewards` were before they were relabelled.
-        form: of all episodes.
-        kept: for whoever writes it again.
+            `score`, a single number. Optional: `terminations` and `truncations`, (T,) or one flag; `cut`, one flag; `paid` (T,),
+            the rewards before they were relabelled.
+        form: the form of all episodes.
+        kept: the contents of the file, to write them again.
 
     Raises:
         LareError: something is missing, of another shape or type, or not finite.
@@ -92,7 +92,7 @@ def checked(name: str, values: Mapping[str, Any], form: Form, kept: Any) -> Logg
         wanted, there = f"{steps}, one for each action", (len(before), len(after))
     else:
         before, after = shown[:-1], shown[1:]
-        wanted, there = f"{steps + 1}, one more than there are actions (or next_observations be there)", (len(before),)
+        wanted, there = f"{steps + 1}, one more than there are actions (or give next_observations)", (len(before),)
     if set(there) != {steps}:
         what = "observations and next_observations" if "next_observations" in values else "observations"
         raise LareError(f"{name}: {what} must have {wanted}, and the shape of observations is {shown.shape}")
@@ -125,7 +125,7 @@ def leaves(values: Any) -> list[np.ndarray]:
 
 
 def paid(name: str, values: Mapping[str, Any], steps: int) -> Float[np.ndarray, " steps"]:
-    """What an episode was paid. What was paid before it was relabelled comes first."""
+    """The original rewards of an episode: those before it was relabelled, if it was."""
     key = next((key for key in ("paid", "score", "rewards") if key in values), None)
     if key is None:
         raise LareError(f"{name} has no rewards and no score: an episode has {NEEDED}")
@@ -144,9 +144,9 @@ def paid(name: str, values: Mapping[str, Any], steps: int) -> Float[np.ndarray, 
 
 
 def is_whole(name: str, values: Mapping[str, Any], steps: int, form: Form) -> bool:
-    """Whether an episode went on to its end: it terminated, or was ended by the time limit.
+    """Whether an episode is complete: it terminated, or the time limit ended it.
 
-    Where the time limit is not known, what is truncated was ended by it; where nothing is said of ends, every episode is whole.
+    If the time limit is not known, every truncated episode counts as ended by it. Without any flags, every episode is whole.
     """
     ends = {key: flag_at_end(name, key, values, steps) for key in ("terminations", "truncations")}
     if flag_at_end(name, "cut", values, steps):
@@ -157,7 +157,7 @@ def is_whole(name: str, values: Mapping[str, Any], steps: int, form: Form) -> bo
 
 
 def flag_at_end(name: str, key: str, values: Mapping[str, Any], steps: int) -> bool | None:
-    """The flag of the last step; None where there is none."""
+    """The flag of the last step; None if there is no flag."""
     if key not in values:
         return None
     flags = np.asarray(values[key])
@@ -172,16 +172,16 @@ def flag_at_end(name: str, key: str, values: Mapping[str, Any], steps: int) -> b
 
 
 def form_of(name: str, values: Mapping[str, Any], sizes: Mapping[str, int], limit: int | None) -> Form:
-    """The form of a log whose spaces nobody says, from its first episode.
+    """The form of a log without spaces, from its first episode.
 
     Args:
-        name: of the episode.
-        values: what its file says.
-        sizes: of `observation` and `action` rows, where a task says them.
+        name: name of the episode.
+        values: the contents of its file.
+        sizes: sizes of `observation` and `action` rows, if a task gives them.
         limit: the time limit, if it is known.
 
     Raises:
-        LareError: actions are whole numbers, and nobody says of how many they are chosen.
+        LareError: actions are whole numbers, and the number of choices is not known.
     """
     found = {}
     for kind in ("observation", "action"):

@@ -1,4 +1,4 @@
-"""A Hugging Face data set on the disk, as `Dataset.save_to_disk` leaves it."""
+"""A Hugging Face data set on the disk, as `Dataset.save_to_disk` writes it."""
 
 import contextlib
 import shutil
@@ -22,7 +22,7 @@ STATE, SPLITS = "state.json", "dataset_dict.json"
 
 
 def batches(path: Path) -> Iterator[pa.RecordBatch]:
-    """Some rows at a time."""
+    """Read some rows at a time."""
     if (path / SPLITS).exists():
         names = ", ".join(sorted(str(state.parent) for state in path.glob(f"*/{STATE}")))
         raise LareError(f"{path} holds several data sets: name one of {names}")
@@ -35,7 +35,7 @@ def batches(path: Path) -> Iterator[pa.RecordBatch]:
 
 
 def write(path: Path, parts: Iterator[pa.Table]) -> None:
-    """A data set of one split."""
+    """Write a data set of one split."""
     rows = path / "rows" / "rows.arrow"
     rows.parent.mkdir(parents=True)
     first = next(parts)

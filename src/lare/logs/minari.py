@@ -1,4 +1,4 @@
-"""Minari data sets. r_hat takes the place of the rewards; the old ones are in `infos["paid"]`, whose first entry is the reset's."""
+"""Minari data sets. r_hat replaces the rewards; the old ones are in `infos["paid"]`, whose first entry belongs to the reset."""
 
 import warnings
 from collections.abc import Iterable, Iterator
@@ -26,11 +26,11 @@ COPIED = (
     *("author", "author_email", "code_permalink", "algorithm_name", "requirements", "eval_env_spec"),
     *("ref_min_score", "ref_max_score", "num_episodes_average_score"),
 )
-"""Of the metadata of a data set."""
+"""Keys of a data set's metadata that are copied."""
 
 
 class MinariLogs:
-    """A data set of one agent, of any spaces that lie in rows."""
+    """A data set of one agent, with any spaces that can be written as rows of numbers."""
 
     def __init__(self, dataset: Any, hints: Hints):
         self.dataset: MinariDataset = dataset
@@ -44,7 +44,7 @@ class MinariLogs:
         self.form = Form(observation, layout_of(dataset.action_space, f"the action space of {self.name}"), limit)
 
     def episodes(self) -> Iterator[Logged]:
-        """One at a time, in the order of their numbers."""
+        """Read one episode at a time, in the order of their numbers."""
         indices = self.dataset.episode_indices
         storage = self.dataset.storage
         both = zip(storage.get_episodes(indices), storage.get_episode_metadata(indices), strict=True)
@@ -52,7 +52,7 @@ class MinariLogs:
             name = f"{self.name}, episode {number}"
             try:
                 values, about = next(both)
-            except Exception as error:  # whatever h5py, pyarrow and Minari say of a file that anybody may have written
+            except Exception as error:  # h5py, pyarrow and Minari may raise anything for a file that is not trusted
                 raise LareError(f"{name} cannot be read: {shortened(error)}") from error
             values = {key: value for key, value in values.items() if key != "id"}
             infos = values.get("infos") or {}
@@ -61,20 +61,20 @@ class MinariLogs:
             yield checked(name, values, self.form, {**values, "infos": infos, "seed": about.get("seed")})
 
     def check_out(self, out: str | Path, overwrite: bool) -> None:
-        """An id of Minari's."""
+        """Check the Minari id to write."""
         path = path_of(out)
-        if path.parent.exists():  # a namespace of Minari's that is not there yet is made
+        if path.parent.exists():  # if it does not, `write` creates the namespace
             check_free(path, overwrite)
 
     def write(self, out: str | Path, episodes: Iterable[Paid], overwrite: bool, about: str) -> str | Path:
-        """A data set of another id, in the same format."""
+        """Write a data set with another id, in the same format."""
         path, dataset_id, source = path_of(out), str(out), self.dataset.storage
         namespace, _, _ = parse_dataset_id(dataset_id)
         if namespace is not None and namespace not in list_local_namespaces():
             create_namespace(namespace)
         metadata = source.metadata
         with whole(path, overwrite) as new, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of Minari's: that an environment's spec cannot be kept
+            warnings.simplefilter("ignore")  # Minari warns if the spec of an environment cannot be saved
             new.mkdir()
             storage = MinariStorage.new(
                 new / "data",
@@ -109,7 +109,7 @@ def flat(infos: dict[str, Any]) -> dict[str, Any]:
 
 
 def buffer_of(paid: Paid, data_format: str) -> EpisodeBuffer:
-    """An episode as Minari writes it."""
+    """An episode in the form that Minari writes."""
     kept = paid.episode.kept
     infos = {**kept["infos"], "paid": np.append(0.0, paid.episode.paid)}
     return EpisodeBuffer(
@@ -124,10 +124,10 @@ def buffer_of(paid: Paid, data_format: str) -> EpisodeBuffer:
 
 
 def load(dataset_id: str) -> MinariDataset:
-    """A local data set. Raises `LareError` where there is none: nothing is downloaded."""
+    """A local data set. Raises `LareError` if there is none: nothing is downloaded."""
     try:
         return minari.load_dataset(dataset_id)
-    except Exception as error:  # whatever h5py and Minari say of files that anybody may have written
+    except Exception as error:  # h5py and Minari may raise anything for files that are not trusted
         if not (get_dataset_path(dataset_id) / "data").exists():
             raise LareError(
                 f"there is no {dataset_id}: neither a path nor a local data set of Minari (minari list local; "
@@ -137,16 +137,16 @@ def load(dataset_id: str) -> MinariDataset:
 
 
 def is_local(dataset_id: str) -> bool:
-    """Whether Minari has a data set of that id here."""
+    """Whether there is a local Minari data set with that id."""
     return (get_dataset_path(dataset_id) / "data").is_dir()
 
 
 def path_of(dataset_id: str | Path) -> Path:
-    """Where a data set of that id stands. Raises `LareError` where it is no id."""
+    """The path of the data set with that id. Raises `LareError` if it is not an id."""
     try:
         parse_dataset_id(str(dataset_id))
     except (ValueError, TypeError):
         raise LareError(
-            f"{dataset_id} is no id of Minari's, as cheetah/relabelled-v0: a name, -v and a number"
+            f"{dataset_id} is not a Minari id, such as cheetah/relabelled-v0: a name, -v and a number"
         ) from None
     return get_dataset_path(str(dataset_id))

@@ -1,4 +1,4 @@
-"""A Parquet file, or a directory of them in the order of their names. What is written is one file."""
+"""A Parquet file, or a directory of them in the order of their names. The output is one file."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +16,7 @@ from lare.logs.tables import Format
 
 
 def batches(path: Path) -> Iterator[pa.RecordBatch]:
-    """Some rows at a time, of all files."""
+    """Read some rows at a time, of all files."""
     files, schema = sorted(path.glob("*.parquet")) if path.is_dir() else [path], None
     for file in files:
         try:
@@ -30,7 +30,7 @@ def batches(path: Path) -> Iterator[pa.RecordBatch]:
 
 
 def write(path: Path, parts: Iterator[pa.Table]) -> None:
-    """One file."""
+    """Write one file."""
     first = next(parts)
     with pq.ParquetWriter(path, first.schema) as writer:
         writer.write_table(first)

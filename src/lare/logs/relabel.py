@@ -1,7 +1,7 @@
-"""`relabel`: the same log with r_hat for rewards, and how well returns are predicted that nothing was fitted to.
+"""`relabel`: the same log with r_hat as rewards, and how well the returns of held-out episodes are predicted.
 
-Two passes over the log, neither of which holds it: one shows the episodes to a `CreditAssigner`, one asks it what their steps
-are worth and writes them.
+There are two passes over the log, neither of which holds it in memory. The first shows the episodes to a `CreditAssigner`, the
+second computes their rewards and writes them.
 """
 
 import math
@@ -22,38 +22,39 @@ from lare.plugs.assigner import CreditAssigner
 from lare.tasks.spec import TaskSpec, as_task
 
 PIECE = 8192
-"""Steps that are paid for at a time: `phi` answers for many as fast as for few."""
+"""Steps whose rewards are computed at a time: `phi` takes about as long for many steps as for few."""
 BLOCK = 10
-"""Of so many episodes in a row, a fair share is held out: a log that is sorted is held out evenly."""
+"""The share of held-out episodes is the same in every block of so many, so that it is even in a sorted log."""
 FEWEST = 8
-"""Held-out episodes, below which nothing is said of them."""
+"""With fewer held-out episodes, nothing is said about their returns."""
 LEAST_CAPACITY = 100_000
 UPDATES = 10_000
-"""Of a decoder that descends a gradient."""
+"""Gradient updates of a decoder."""
 
 
 @dataclass(frozen=True)
 class Relabelled:
-    """What was done, and how good it is."""
+    """What `relabel` did, and how well its rewards predict returns."""
 
     out: str | Path
     method: str
     episodes: int
     steps: int
     cut: int
-    """Episodes that were cut off before their end: paid, and not learned from."""
+    """Episodes that were cut off before their end. They get rewards, but are not learned from."""
     held_out: int
-    """Whole episodes that nothing was fitted to."""
+    """Whole episodes that were held out of the fit."""
     return_r2: float
-    """R^2 of the returns of those; NaN where they are fewer than 8, all the same, or r_hat is not in the unit of returns."""
+    """R^2 of the returns of held-out episodes; NaN if these are fewer than 8, if all their returns are the same, or if r_hat is not
+    in the unit of returns."""
     return_correlation: float
-    """Of those returns and their predictions; NaN like that."""
+    """Pearson's correlation of these returns with their predictions; NaN if there are fewer than 8, or one side never varies."""
     explanation: tuple[str, ...]
-    """What returns say of the factors: `CreditAssigner.explanation`."""
+    """What returns say about the factors: `CreditAssigner.explanation`."""
 
     @property
     def words(self) -> list[str]:
-        """All of it, a sentence each."""
+        """The result, as sentences."""
         steps, episodes = (number_of(*one) for one in ((self.steps, "step"), (self.episodes, "episode")))
         said = [f"{self.method} gave rewards to {steps} of {episodes}."]
         if self.cut:
@@ -63,7 +64,7 @@ class Relabelled:
 
 
 def number_of(count: int, name: str) -> str:
-    """Things, counted."""
+    """A number with its noun, in singular or plural."""
     return f"{count:,} {name}{'' if count == 1 else 's'}"
 
 
@@ -72,14 +73,14 @@ def predicted(found: Relabelled) -> list[str]:
     if found.held_out < FEWEST:
         return [
             f"How well unseen returns are predicted is not known: {number_of(found.held_out, 'episode')} held out, and {FEWEST} "
-            "are needed. Hold out a larger share (--hold-out 0.2)."
+            "are needed. Hold out a larger share (--hold-out 0.2, hold_out=0.2 in Python)."
         ]
     of = f"returns of {number_of(found.held_out, 'episode')} held out"
     if math.isnan(found.return_correlation):
-        return [f"The {of}, or what is predicted of them, are all the same: nothing can be said of these rewards."]
+        return [f"The {of}, or their predictions, are all the same: nothing can be said about these rewards."]
     if math.isnan(found.return_r2):
         return [
-            f"The {of}, which nothing was fitted to, go with what is predicted: correlation {found.return_correlation:.2f}."
+            f"The {of}, which nothing was fitted to, and their predictions have a correlation of {found.return_correlation:.2f}."
         ]
     said = [f"The {of}, which nothing was fitted to, are predicted with an R^2 of {found.return_r2:.2f}."]
     if found.return_r2 < 0.1:
@@ -97,25 +98,25 @@ class Tally:
     steps: int = 0
     cut: int = 0
     returns: list[float] = field(default_factory=list)
-    """Of those held out."""
+    """True returns of the held-out episodes."""
     predicted: list[float] = field(default_factory=list)
 
     def r2(self) -> float:
-        """1 - squared errors / variation."""
+        """1 - squared errors / squared deviations from the mean."""
         returns, predicted = np.array(self.returns), np.array(self.predicted)
         spread = np.sum((returns - returns.mean()) ** 2) if len(returns) else 0
         told = len(returns) >= FEWEST and spread > 1e-10 * np.sum(returns**2)
         return float(1 - np.sum((returns - predicted) ** 2) / spread) if told else math.nan
 
     def correlation(self) -> float:
-        """Pearson's."""
+        """Pearson's correlation."""
         returns, predicted = np.array(self.returns), np.array(self.predicted)
         varies = len(returns) >= FEWEST and all(np.ptp(one) > 1e-6 * np.abs(one).max() for one in (returns, predicted))
         return float(np.corrcoef(returns, predicted)[0, 1]) if varies else math.nan
 
 
 Told = Callable[[str, int, int | None], None]
-"""Told which pass it is, episodes so far, and all of them where that is known."""
+"""Called with the name of the pass, the number of episodes so far, and the number of all episodes, if it is known."""
 
 
 def relabel(
@@ -133,23 +134,24 @@ def relabel(
     overwrite: bool = False,
     told: Told = lambda stage, done, count: None,
 ) -> Relabelled:
-    """Give the steps of logged episodes rewards that add up to what the episodes returned.
+    """Give the steps of logged episodes rewards that add up to the episodes' returns.
 
     Args:
         source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
             flat arrays by name, or a list of mappings of arrays (docs/logs.md).
-        out: a path or, for a data set of Minari's, an id. It is written whole or not at all.
-        method: how credit is assigned; unless given, `lare-bayes` with a `phi`, and `bayes` without.
+        out: the path to write, or the id of the new Minari data set. It is written whole or not at all.
+        method: how credit is assigned; the default is `lare-bayes` with a `phi`, and `bayes` without.
         phi: a function that judges the steps; it needs its `task`.
-        task: a name, a path, or a spec: what `phi` was designed for, the time limit, and of how many choices actions are.
-        hold_out: share of the whole episodes that nothing is fitted to, so that they can tell how good the rewards are.
-        settings: of the decoder.
-        updates: of a decoder that descends a gradient.
-        memory: GiB, about, for what the decoder sees of steps. A fit in closed form goes by all episodes, whatever fits into it;
-            other fits go by the last ones that do.
-        seed: of what is held out, and of a decoder's weights.
-        overwrite: what is at `out`.
-        told: is told of the progress.
+        task: a name, a path, or a spec: the task that `phi` was designed for. The time limit and the number of discrete actions are
+            taken from it.
+        hold_out: share of the whole episodes that are kept out of the fit, to measure how well returns are predicted.
+        settings: settings of the decoder.
+        updates: number of gradient updates of the decoder. A closed-form decoder has none.
+        memory: about how many GiB the decoder's inputs may take. A closed-form fit uses all episodes, whatever this limit is; other
+            fits use the last episodes that fit into it.
+        seed: seed of the choice of held-out episodes and of the decoder's initial weights.
+        overwrite: replace `out` if it exists.
+        told: called with the progress.
 
     Raises:
         LareError: the log is damaged or empty, `out` cannot be written or exists, or method, function and task do not go together.
@@ -166,7 +168,7 @@ def relabel(
     try:
         seen = learn(credit, logs, hold_out, seed, updates, told)
         explanation, tally = tuple(credit.explanation()), Tally()
-        about = f"Rewards by lare relabel, {name}; what was paid is in infos['paid'], behind the entry of the reset."
+        about = f"Rewards by lare relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
         written = logs.write(out, pay(credit, logs, hold_out, seed, tally, seen, told), overwrite, about)
     finally:
         credit.close()
@@ -184,7 +186,7 @@ def assigner(
     memory: float,
     seed: int,
 ) -> CreditAssigner:
-    """An assigner whose steps take so much memory, at most."""
+    """An assigner whose steps take about `memory` GiB."""
     if find_method(name).reward is Reward.UNIFORM:
         raise LareError(f"{name} pays all steps of an episode alike, by its return: a log needs no decoder for that")
 
@@ -202,12 +204,12 @@ def assigner(
             forget=False,
         )
 
-    row = 4 * made(1).config.basis.inputs + 16  # features, and what the store knows of each step
+    row = 4 * made(1).config.basis.inputs + 16  # features, and the store's own data of each step
     return made(max(LEAST_CAPACITY, int(memory * 2**30 / row)))
 
 
 def held(hold_out: float, seed: int) -> Iterator[bool]:
-    """Which whole episodes are held out, without end: of each `BLOCK` a share by chance."""
+    """For one whole episode after the other, without end, whether it is held out: in each `BLOCK` a random share."""
     number = 0
     while True:
         share = math.floor((number + 1) * BLOCK * hold_out + 1e-9) - math.floor(number * BLOCK * hold_out + 1e-9)
@@ -219,7 +221,7 @@ def held(hold_out: float, seed: int) -> Iterator[bool]:
 def learn(
     credit: CreditAssigner, logs: Source, hold_out: float, seed: int, updates: int, told: Told
 ) -> tuple[int, int]:
-    """The first pass: fit to the whole episodes that are not held out. Gives how many there were, and their steps."""
+    """The first pass: fit to the whole episodes that are not held out. Returns the numbers of all episodes and of their steps."""
     out, count, steps, last = held(hold_out, seed), 0, 0, None
     for episode in logs.episodes():
         if episode.whole and not next(out):
@@ -248,7 +250,7 @@ def pay(
     seen: tuple[int, int],
     told: Told,
 ) -> Iterator[Paid]:
-    """The second pass: every episode with its rewards, and in `tally` what is predicted of those held out."""
+    """The second pass: every episode with its rewards. The predictions for held-out episodes are added to `tally`."""
     out = held(hold_out, seed)
     for some in pieces(logs.episodes()):
         lengths = [len(episode) for episode in some]
@@ -269,7 +271,7 @@ def pay(
 
 
 def pieces(episodes: Iterator[Logged]) -> Iterator[list[Logged]]:
-    """Some episodes at a time, as soon as they have `PIECE` steps together."""
+    """Lists of successive episodes, each with `PIECE` steps or more in total, except the last list."""
     some, steps = [], 0
     for episode in episodes:
         some.append(episode)

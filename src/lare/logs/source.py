@@ -1,4 +1,4 @@
-"""Where logs come from: a Minari or Hugging Face data set, a directory of .npz files, Parquet, or arrays."""
+"""Sources of logs: a Minari or Hugging Face data set, a directory of .npz files, Parquet, or arrays."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -11,36 +11,36 @@ from lare.tasks.spec import TaskSpec, the_role
 
 @runtime_checkable
 class Source(Protocol):
-    """A log that can be read more than once. It is never held in memory as a whole, unless it was given so."""
+    """A log that can be read more than once. It is not held in memory as a whole, unless it was given as arrays."""
 
     name: str
     """For messages."""
     form: Form
     count: int | None
-    """Of its episodes, where that is known."""
+    """The number of episodes, if it is known."""
 
     def episodes(self) -> Iterator[Logged]:
-        """All of them, in order. Raises `LareError` at the first one that is damaged."""
+        """All episodes, in order. Raises `LareError` at the first one that is damaged."""
         ...
 
     def check_out(self, out: str | Path, overwrite: bool) -> None:
-        """Raise `LareError` where nothing can be written there."""
+        """Raise `LareError` if `out` cannot be written."""
         ...
 
     def write(self, out: str | Path, episodes: Iterable[Paid], overwrite: bool, about: str) -> str | Path:
-        """Write the same log with new rewards, and the old ones as `paid`. Whole or not at all; gives where it is.
+        """Write the same log with new rewards, and the old ones as `paid`, whole or not at all. Returns its path or id.
 
         Args:
             out: a path, or an id.
-            episodes: in order. They are consumed as they are written.
-            overwrite: what is there.
-            about: a sentence on what was done, where there is a place for one.
+            episodes: the episodes in order. They are consumed as they are written.
+            overwrite: replace `out` if it exists.
+            about: a sentence on what was done, for formats that store a description.
         """
         ...
 
 
 def hints_of(task: TaskSpec | None) -> Hints:
-    """Nothing, where there is no task."""
+    """The hints that a task gives; empty without a task."""
     if task is None:
         return Hints({}, None)
     role = the_role(task)
@@ -48,15 +48,15 @@ def hints_of(task: TaskSpec | None) -> Hints:
 
 
 def open_logs(source: Any, task: TaskSpec | None = None) -> Source:
-    """A log by its path, its Minari id, or itself.
+    """Open a log, given by its path, by its Minari id, or as an object.
 
     Args:
         source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
-            flat arrays by name (as D4RL has them), or a list of episodes, each a mapping of arrays.
-        task: says of how many choices whole numbers are, and the time limit.
+            flat arrays by name (as in D4RL), or a list of episodes, each a mapping of arrays.
+        task: gives the time limit, and the number of choices if observations or actions are whole numbers.
 
     Raises:
-        LareError: it is not there, is no log, or its first episode is damaged.
+        LareError: the log does not exist, is not a log, or its first episode is damaged.
     """
     hints = hints_of(task)
     if isinstance(source, Mapping):

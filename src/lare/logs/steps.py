@@ -1,4 +1,4 @@
-"""Steps and episodes of a log that a function is tried on, where there is no environment."""
+"""Steps and episodes of a log, on which a function is checked if there is no environment."""
 
 import itertools
 from pathlib import Path
@@ -12,17 +12,17 @@ from lare.tasks.play import Episode
 from lare.tasks.spec import TaskSpec, as_task
 
 EPISODES = 64
-"""The first ones, from which steps are taken."""
+"""Steps are taken from so many first episodes."""
 
 
 def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = STEPS) -> Steps:
-    """Steps from all over the first episodes of a log: for `steps=` of `design`, `load_function` and `verified`.
+    """Steps that are spread evenly over the first episodes of a log: for `steps=` of `design`, `load_function` and `verified`.
 
     Args:
-        source: as of `relabel`.
-        task: a name, a path, or a spec. It says which observation is judged, that before or that after a step; with `both`, the
-            one after.
-        count: of steps, about. Fewer where the log has fewer.
+        source: as in `relabel`.
+        task: a name, a path, or a spec. It says which observation is judged, the one before or the one after a step; with `both`,
+            the one after is taken.
+        count: about how many steps. A shorter log gives fewer.
 
     Returns:
         Observations (n, observation size) and actions (n, action size).
@@ -41,7 +41,7 @@ def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = STEPS) -
 
 
 def logged_episodes(source: Any, task: TaskSpec, count: int) -> list[Episode]:
-    """The first whole episodes of a log, `count` of them or as many as it has. Raises `LareError` where it cannot be read."""
+    """The first whole episodes of a log, at most `count`. Raises `LareError` if it cannot be read."""
     whole = (episode for episode in open_logs(source, task).episodes() if episode.whole)
     return [
         Episode(

@@ -1,6 +1,6 @@
 """Tables with a row for each step or for each episode: Parquet files (`parquet.py`), Hugging Face data sets (`huggingface.py`).
 
-Rows of steps have a column `episode`, and those of an episode stand together. Rows of episodes have lists for columns.
+Rows of steps have a column `episode`, and the rows of an episode follow each other. Rows of episodes hold lists.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -15,20 +15,20 @@ from lare.logs.episode import KEYS, Hints, Logged, Paid, checked, form_of
 from lare.logs.output import check_free, whole
 
 ROWS = 8192
-"""That are read, and at least as many that are written, at a time."""
+"""Rows that are read at a time, and the fewest that are written at a time."""
 
 
 class Format(NamedTuple):
-    """How tables lie on the disk."""
+    """A format of tables on the disk."""
 
     batches: Callable[[Path], Iterator[pa.RecordBatch]]
-    """Some rows at a time. Raises `LareError` where they cannot be read."""
+    """Reads some rows at a time. Raises `LareError` if they cannot be read."""
     write: Callable[[Path, Iterator[pa.Table]], None]
-    """Write some tables, one behind the other, as a file or a directory."""
+    """Writes some tables, one after the other, as a file or a directory."""
 
 
 class TableLogs:
-    """A table on the disk. Columns that say nothing of credit are kept as they are."""
+    """A table on the disk. Columns that `relabel` does not use are kept unchanged."""
 
     def __init__(self, path: Path, hints: Hints, form: Format):
         self.path, self.name, self.on_disk = path, str(path), form
@@ -43,7 +43,7 @@ class TableLogs:
         return f"{self.name}, episode {episode}"
 
     def tables(self) -> Iterator[tuple[Any, pa.Table]]:
-        """The rows of each episode, and its number."""
+        """The number of each episode, and its rows."""
         batches = (batch for batch in self.on_disk.batches(self.path) if len(batch))
         first = next(batches, None)
         if first is None:
@@ -57,7 +57,7 @@ class TableLogs:
             yield from enumerate(pa.Table.from_batches([row]) for row in rows)
 
     def of_steps(self, batches: Iterator[pa.RecordBatch]) -> Iterator[tuple[Any, pa.Table]]:
-        """The same, where rows are steps."""
+        """`tables` for rows that are steps."""
         parts: list[pa.Table] = []
         known, seen = None, set()
         for batch in batches:
@@ -79,17 +79,17 @@ class TableLogs:
             yield known, pa.concat_tables(parts)
 
     def episodes(self) -> Iterator[Logged]:
-        """In the order of their rows."""
+        """All episodes, in the order of their rows."""
         for number, table in self.tables():
             name = self.name_of(number)
             yield checked(name, values_of(name, table), self.form, table)
 
     def check_out(self, out: str | Path, overwrite: bool) -> None:
-        """A file or a directory."""
+        """Check the file or directory to write."""
         check_free(Path(out), overwrite)
 
     def write(self, out: str | Path, episodes: Iterable[Paid], overwrite: bool, about: str) -> str | Path:
-        """The same table with other rewards."""
+        """Write the same table with new rewards."""
         with whole(Path(out), overwrite) as new:
             self.on_disk.write(
                 new, gathered(relabelled(one.episode.kept, one.r_hat, one.episode.paid) for one in episodes)
@@ -110,10 +110,10 @@ def gathered(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
 
 
 def check_columns(file: Path, schema: pa.Schema) -> None:
-    """Raise `LareError` where rows cannot be told apart by episode, or say nothing of what a step led to."""
+    """Raise `LareError` if the columns give no episode or no next observation of a step."""
     if rows_are_episodes(schema):
         return
-    for name, why in (("episode", "which the step is of"), ("next_observations", "what the step led to")):
+    for name, why in (("episode", "the episode of the step"), ("next_observations", "the observation after the step")):
         if schema.names.count(name) != 1:
             raise LareError(f"{file} must have one column {name}, {why}; its columns are {', '.join(schema.names)}")
     kind = schema.field("episode").type
@@ -122,7 +122,7 @@ def check_columns(file: Path, schema: pa.Schema) -> None:
 
 
 def rows_are_episodes(schema: pa.Schema) -> bool:
-    """Whether a row has lists for an episode's rewards, or for its actions where it has a score."""
+    """Whether a row holds an episode: its rewards, or its actions if there is only a score, are a list."""
     key = "rewards" if "rewards" in schema.names else "actions"
     return "episode" not in schema.names and schema.names.count(key) == 1 and is_list(schema.field(key).type)
 
@@ -133,7 +133,7 @@ def is_list(kind: pa.DataType) -> bool:
 
 
 def values_of(name: str, table: pa.Table) -> dict[str, np.ndarray]:
-    """The columns of an episode as arrays. Where rows are steps, its score is that of the last one."""
+    """The columns of an episode as arrays. If rows are steps, its score is that of the last step."""
     found = {key: array_of(f"{name}: {key}", table.column(key)) for key in KEYS if key in table.column_names}
     if rows_are_episodes(table.schema):
         return {key: values[0] for key, values in found.items()}
@@ -164,7 +164,7 @@ def array_of(where: str, column: pa.ChunkedArray) -> np.ndarray:
 
 
 def relabelled(table: pa.Table, r_hat: np.ndarray, paid: np.ndarray) -> pa.Table:
-    """With other rewards, and the old ones as `paid`."""
+    """The table with new rewards, and the old ones as `paid`."""
     whole_rows = rows_are_episodes(table.schema)
     for name, values in (("rewards", r_hat.astype(np.float32)), ("paid", paid)):
         column = pa.array([values] if whole_rows else values)

@@ -1,1 +1,1 @@
-"""LaRe in training loops that other people wrote: `CreditAssigner`, and what puts it into other libraries."""
+"""LaRe in your own training loop or in another library's: `CreditAssigner`, and its adapters."""

@@ -1,8 +1,8 @@
-"""`CreditAssigner`: proxy rewards for a training loop that somebody else wrote, or for logs of the past.
+"""`CreditAssigner`: proxy rewards for your own training loop, for another library's, or for logged episodes.
 
-Show it every step of every environment, with the rewards that the environment pays. It knows when episodes end and what they
-returned, keeps what the decoder sees of each step, fits the decoder, and says what a step is worth. The loop trains on that, asked
-for anew whenever steps are sampled: rewards that were stored would be those of an older decoder.
+Show it every step of every environment, with the rewards that the environment pays. It stores the decoder's inputs and the
+episodes' returns, fits the decoder, and gives each step a proxy reward. The loop trains on these, and asks for them again whenever
+it samples steps, because stored proxy rewards would be those of an older decoder.
 
     credit = CreditAssigner("lare-bayes", phi, task=task)
     steps = credit.add(observation, action, next_observation, reward, terminated, truncated)   # a row for each environment
@@ -30,11 +30,11 @@ from lare.run.usual import MANY_AGENTS
 from lare.tasks.spec import Judges, TaskSpec, as_task
 
 SAMPLE = 256
-"""Steps, about, that `phi` is tried on when it is read again."""
+"""About how many steps are kept to verify `phi` on, when it is loaded from a file."""
 
 
 class CreditAssigner:
-    """Credit for steps, by any method of the table that assigns some (`lare methods`). Safe to call from several threads."""
+    """Proxy rewards for steps, by any method that assigns credit to steps (`lare methods`). Safe to call from several threads."""
 
     def __init__(
         self,
@@ -54,24 +54,26 @@ class CreditAssigner:
         scale_rewards: bool = False,
         forget: bool = True,
     ):
-        """An assigner that has met nothing yet.
+        """A new assigner, without any steps.
 
         Args:
             method: a row of the table. `dense` and `episodic` assign no credit.
             phi: for the methods that need one, whose names begin with `lare-`, and for `llm-reward`.
-            task: where `phi` was designed for one: a name, a path, or a spec. Gives the spaces and `judges`, unless they are given.
-            observation_space: of a single environment and a single agent, or how many numbers an observation has.
-            action_space: the same of actions. Actions are those that the environment takes, in its units.
-            judges: which observation the factors judge a step by.
-            agents: of a team that shares its return. With several, all arrays have an axis of agents behind that of the steps.
-            max_steps: of the longest episode; needed for many agents.
-            capacity: steps that are kept. What a replay buffer holds must be among them.
-            settings: of the decoder.
-            seed: of its weights, and of what is drawn.
-            fits_per_step: updates of a decoder that descends a gradient, for each step that was added.
+            task: the task that `phi` was designed for: a name, a path, or a spec. Spaces and `judges` that are not given are taken
+                from it.
+            observation_space: the space of a single agent in a single environment, or how many numbers an observation has.
+            action_space: the same for actions. Actions are in the environment's units.
+            judges: which observation of a step the factors judge: the one before it, the one after it, or both.
+            agents: the number of agents of a team, which shares its return. With several, the axis after that of the steps is
+                that of the agents in all arrays.
+            max_steps: the length of the longest episode; needed for many agents.
+            capacity: number of steps that are kept. All steps that a replay buffer can sample must be among them.
+            settings: settings of the decoder.
+            seed: random seed of the decoder's weights and of its batches.
+            fits_per_step: gradient updates of the decoder for each added step. A closed-form decoder has none.
             scale_rewards: divide r_hat by the running root mean square of R/T.
-            forget: whether a fit in closed form may forget episodes whose steps are not kept any more, as a policy changes. The
-                episodes of a log are all worth the same.
+            forget: whether a closed-form fit may forget episodes whose steps are not kept any more. True suits training, in which
+                the policy changes; False suits a log, whose episodes all count the same.
 
         Raises:
             LareError: method, function, task and spaces do not go together.
@@ -103,11 +105,11 @@ class CreditAssigner:
         self.waiting: list[tuple[np.ndarray, ...]] = []
         """Steps that have no features yet: number, before, action, after."""
         self.unseen = 0
-        """How many they are."""
+        """The number of steps in `waiting`."""
         self.sample: list[tuple[np.ndarray, np.ndarray]] = []
-        """The first observations and actions: a `phi` that is read from a file is tried on them again."""
+        """The first observations and actions: a `phi` that is loaded from a file is verified on them again."""
         self.sampled = 0
-        """How many they are."""
+        """The number of steps in `sample`."""
         self.lock = threading.RLock()
 
     def add(
@@ -123,25 +125,26 @@ class CreditAssigner:
         valid: Any = None,
         alive: Any = None,
     ) -> Int[np.ndarray, " steps"]:
-        """Show one step of each of some environments.
+        """Show one step of each of some environments (lanes).
 
-        A lane that has shown no step while `capacity` others came is given up, as by `drop`.
+        A lane that has shown no step while `capacity` steps of other lanes came is given up, as by `drop`.
 
         Args:
-            before: the observations that the steps set out from: (n, ...), of many agents (n, agents, ...). Those that the
-                environment showed: without a wrapper's normalisation, where `phi` was designed for the environment.
-            action: what was done, in the environment's units.
-            after: what the steps led to; at the end of an episode its last observation, not the first of the next one.
-            reward: what the environment paid, (n,). The sum over an episode is its return. Of many agents (n, agents) too: R is
-                the sum of the mean over those that are alive.
-            terminated: (n,), whether the episode is over.
-            truncated: (n,), whether it was cut, by a time limit for instance. It has a return all the same.
-            lanes: which environment each row is of, by anything that can be a key; 0 to n - 1, unless given.
-            valid: (n,), false for a row that is no step, as the reset that a vector environment makes of the call after an end.
-            alive: (n, agents), which agents acted; all, unless given.
+            before: the observations before the steps: (n, ...), for many agents (n, agents, ...). If `phi` was designed for the
+                environment, give the environment's own observations, without a wrapper's normalisation.
+            action: the actions, in the environment's units.
+            after: the observations after the steps; at the end of an episode its last one, not the first of the next episode.
+            reward: the environment's rewards, (n,). Their sum over an episode is its return R. For many agents (n, agents) is
+                possible too: R is then the sum of the mean over those that are alive.
+            terminated: (n,), whether the episode has terminated.
+            truncated: (n,), whether the episode was truncated, for instance by a time limit. Its return is learned from all the
+                same.
+            lanes: the environment of each row, by any hashable key; 0 to n - 1 by default.
+            valid: (n,), false for a row that is not a step, such as the call after an end, in which a vector environment resets.
+            alive: (n, agents), which agents acted; all by default.
 
         Returns:
-            A number for each step, for `rewards_at`; -1 where it is not valid.
+            A number for each step, for `rewards_at`; -1 for a row that is not valid.
 
         Raises:
             LareError: shapes do not fit, a number is not finite, or the steps or an episode are more than `capacity`.
@@ -156,7 +159,7 @@ class CreditAssigner:
             if len(lanes) != count:
                 raise LareError(f"lanes has {len(lanes)} entries, and there are {count} steps")
             rows = np.flatnonzero(known)
-            # Copies, for an environment may write its next step into the same memory.
+            # Copies, because an environment may write its next step into the same memory.
             before, action, after, paid, ended = (part[rows] for part in (before, action, after, paid, ended))
             for values, name in ((before, "before"), (action, "action"), (after, "after"), (paid, "reward")):
                 check_finite(values, rows, name)
@@ -180,7 +183,7 @@ class CreditAssigner:
     def keep(
         self, before: np.ndarray, action: np.ndarray, after: np.ndarray, alive: np.ndarray | None
     ) -> Int[np.ndarray, " steps"]:
-        """Numbers for new steps, which wait for their features from now on."""
+        """Store new steps, which wait for their features from now on. Returns their numbers."""
         numbers = self.store.add(len(before))
         if self.store.alive is None and alive is not None:
             self.store.alive = np.ones((self.store.capacity, self.config.agents), bool)
@@ -194,10 +197,10 @@ class CreditAssigner:
     def add_episode(
         self, before: Any, action: Any, after: Any, reward: Any, *, alive: Any = None
     ) -> Int[np.ndarray, " steps"]:
-        """Show a whole episode that has ended: `reward` is that of each step, (T,), or its score, a single number.
+        """Show a whole episode that has ended. `reward` is that of each step, (T,), or the score, a single number.
 
         Raises:
-            LareError: as `add`; or the episode has no step.
+            LareError: as in `add`, or the episode has no step.
         """
         with self.lock:
             before, action, after = (part.copy() for part in self.config.rows(before, action, after))
@@ -222,9 +225,9 @@ class CreditAssigner:
             return numbers
 
     def end(self, lane: Hashable, score: float | None = None) -> None:
-        """The episode of a lane is over, and returned `score`, or the sum of its rewards.
+        """End the episode of a lane, with `score` as its return, or else the sum of its rewards.
 
-        For a score that comes from elsewhere. Where it comes late, give every episode a lane of its own.
+        Use this if the score is not part of the steps. If it comes late, give every episode its own lane.
 
         Raises:
             LareError: there is no such lane, or the score is not finite.
@@ -234,26 +237,26 @@ class CreditAssigner:
             if run is None:
                 kept = self.store.capacity
                 raise LareError(
-                    f"no episode goes on in lane {lane!r}: it has ended, or is older than {kept} steps (capacity)"
+                    f"no episode is running in lane {lane!r}: it has ended, or is older than {kept} steps (capacity)"
                 )
             if score is not None and not np.isfinite(score):
                 raise LareError(f"score = {score} of lane {lane!r} is not finite")
             self.learner.ended(self.store.end(lane, run.paid if score is None else float(score)))
 
     def drop(self, lane: Hashable) -> None:
-        """The episode of a lane will not end: it is never learned from. Its steps can still be paid."""
+        """Give up the episode of a lane: it is never learned from. Its steps still have proxy rewards."""
         with self.lock:
             self.store.drop(lane)
 
     def flags(self, values: Any, name: str, count: int) -> Bool[np.ndarray, " steps"]:
-        """One for each step."""
+        """Flags as an array, one for each step."""
         flags = np.asarray(values, bool)
         if flags.shape != (count,):
             raise LareError(f"{name} must be one flag for each of {count} steps, and has the shape {flags.shape}")
         return flags
 
     def look(self) -> None:
-        """Give features to the steps that wait for them, and add these to the running statistics."""
+        """Compute the features of the steps that wait for them, and add these to the running statistics."""
         if not self.waiting:
             return
         number, *steps = (np.concatenate(part) for part in zip(*self.waiting, strict=True))
@@ -267,30 +270,30 @@ class CreditAssigner:
             self.store.features[places] = found
             alive = np.ones(found.shape[:-1], bool) if self.store.alive is None else self.store.alive[places]
             self.learner.observe_steps(found, alive)
-        self.waiting.clear()  # not before phi has answered
+        self.waiting.clear()  # only now, because phi may raise an error above
         self.unseen = 0
 
     def catch_up(self) -> None:
-        """What follows from the episodes that have ended, where there are enough new ones."""
+        """Add the episodes that have ended to the scales, and learn from them if there are enough new ones."""
         self.learner.observe_returned()
         if self.learner.is_due:
             self.learn()
 
     def learn(self) -> None:
-        """Tell the decoder of the episodes that have ended."""
+        """Let the decoder learn from the episodes that have ended."""
         self.look()
         self.learner.learn()
 
     def fit(self, updates: int = 500) -> None:
-        """Fit now: so many updates of a decoder that descends a gradient; once in closed form, however many are asked for."""
+        """Fit now: so many gradient updates of the decoder. A closed-form decoder is fitted once, whatever `updates` is."""
         with self.lock:
             self.learn()
             self.learner.fit(updates)
 
     def fit_owed(self) -> None:
-        """Make the updates that the steps added since the last call are worth; nothing where they are still few.
+        """Make the gradient updates for the steps that were added since the last call; none if these steps are few.
 
-        In closed form there is a fit whenever the episodes have grown enough, and nothing is owed.
+        A closed-form decoder is fitted whenever there are enough new episodes, and needs no updates here.
         """
         with self.lock:
             self.catch_up()
@@ -299,9 +302,9 @@ class CreditAssigner:
                 self.learner.fit_owed()
 
     def rewards_at(self, steps: Any) -> Float[np.ndarray, "*shape"]:
-        """r_hat of stored steps, by the newest decoder: an array of the shape of `steps`, of many agents with an axis more.
+        """r_hat of stored steps, by the newest decoder: an array of the shape of `steps`, for many agents with one more axis.
 
-        0 for -1, and for all as long as nothing has been fitted. `ircr` pays 0.5 for an episode that has not ended.
+        0 for the number -1, and for all steps while nothing has been fitted. `ircr` pays 0.5 for an episode that has not ended.
 
         Raises:
             LareError: a step was never stored, or is not stored any more.
@@ -312,7 +315,7 @@ class CreditAssigner:
             flat = steps.ravel()
             known = flat >= 0
             rows = self.store.rows(flat[known])
-            if len(rows) and flat.max() >= self.store.steps - self.unseen:  # one of them waits for its features
+            if len(rows) and flat.max() >= self.store.steps - self.unseen:  # one of the steps waits for its features
                 self.look()
             found = np.zeros((len(flat), *self.config.axis), np.float32)
             alive = None if self.store.alive is None else self.store.alive[rows]
@@ -321,17 +324,19 @@ class CreditAssigner:
             return found.reshape(*steps.shape, *self.config.axis)
 
     def rewards(self, before: Any, action: Any, after: Any, *, length: Any = None) -> Float[np.ndarray, "n *agents"]:
-        """r_hat of any steps, by the newest decoder: (n,), of many agents (n, agents). They are not stored.
+        """r_hat of any steps, by the newest decoder: (n,), for many agents (n, agents). The steps are not stored.
 
-        `length` is T of each step's episode, (n,), where it is known: of a score that is an average over steps, each adds a T-th.
-        Unless given, it is that of the episodes so far, on average.
+        `length` is T of each step's episode, (n,): if a score is an average over steps, r_hat is divided by T. The default is the
+        mean length of the episodes so far.
 
         Raises:
             LareError: the method pays by the return of the step's episode (`ircr`), or shapes do not fit.
         """
         if self.config.method.reward is Reward.UNIFORM:
             name = self.config.method.name
-            raise LareError(f"{name} pays by the return of a step's episode: ask rewards_at, by the numbers of steps")
+            raise LareError(
+                f"{name} pays by the return of a step's episode: call rewards_at, with the numbers of steps"
+            )
         with self.lock:
             self.catch_up()
             found = self.config.features(*self.config.rows(before, action, after))
@@ -343,10 +348,10 @@ class CreditAssigner:
             return payment(self.learner, found, long)
 
     def metrics(self) -> dict[str, float]:
-        """How it goes, without a true reward.
+        """Metrics of the decoder, which need no true rewards.
 
         `credit/return_r2` is R^2 of the last 32 returns, each predicted before it was learned from: NaN while they are fewer than
-        8, or all the same. `credit/loss` is the mean loss of the last updates by a gradient.
+        8, or all the same. `credit/loss` is the mean loss of the last gradient updates.
         """
         with self.lock:
             self.learn()
@@ -359,7 +364,7 @@ class CreditAssigner:
             }
 
     def explanation(self) -> list[str]:
-        """What the stored returns say of the factors, a sentence each: how much they explain, which of them, what may be missing.
+        """What the stored returns say about the factors, in sentences: how much they explain, which of them, what may be missing.
 
         Empty for fewer than 20 episodes, and for a method without a decoder.
         """
@@ -369,14 +374,14 @@ class CreditAssigner:
 
     @property
     def form(self) -> str:
-        """What the score is taken for: `sum` or `average`."""
+        """How the score is modelled: as the `sum` or the `average` over an episode's steps."""
         state = self.learner.state
         return "average" if state is not None and bool(state.average) else "sum"
 
     def save(self, directory: str | Path, episodes: bool = True) -> None:
         """Write everything to a directory: settings, decoder, `phi` and, unless they are left out, steps and episodes.
 
-        An episode that goes on is not kept. Raises `LareError` where it cannot be written.
+        A running episode is not saved. Raises `LareError` if the directory cannot be written.
         """
         from lare.plugs import saving
 
@@ -388,14 +393,14 @@ class CreditAssigner:
         """Read what `save` has written; `phi` is verified again.
 
         Raises:
-            LareError: it is not there, damaged, or of another version.
+            LareError: the directory does not exist, is damaged, or was written by another version.
         """
         from lare.plugs import saving
 
         return saving.load(Path(directory))
 
     def __getstate__(self) -> dict[str, Any]:
-        """What goes to another process, or into a model's file: decoder and `phi`, without steps and episodes."""
+        """The state for another process, or for a model's file: decoder and `phi`, without steps and episodes."""
         from lare.plugs import saving
 
         with self.lock:
@@ -411,13 +416,13 @@ class CreditAssigner:
         saving.restore(self, state["text"], state["arrays"], state["phi"])
 
     def close(self) -> None:
-        """End the worker of `phi`. It starts again when it is needed."""
+        """Stop the worker process of `phi`. It starts again when it is needed."""
         if self.config.phi is not None:
             self.config.phi.close()
 
 
 def numbers_of(steps: Any) -> Int[np.ndarray, "*shape"]:
-    """Numbers of steps. Raises `LareError` where some are none."""
+    """Numbers of steps as an array. Raises `LareError` if one of them is not such a number."""
     found = np.asarray(steps)
     if found.size and (found.dtype.kind not in "iu" or found.min() < -1):
         raise LareError(f"steps must be numbers that `add` has given, or -1, and are {shortened(steps)}")
@@ -425,7 +430,7 @@ def numbers_of(steps: Any) -> Int[np.ndarray, "*shape"]:
 
 
 def check_finite(values: np.ndarray, rows: np.ndarray, name: str) -> None:
-    """Raise `LareError` at the first number that is not, of the rows that have these places in what was given."""
+    """Raise `LareError` for the first number that is not finite; `rows` are the places of the values' rows in the user's array."""
     if not np.isfinite(values).all():
         place = np.argwhere(~np.isfinite(values))[0]
         raise LareError(f"{name} of row {rows[place[0]]} holds {values[tuple(place)]}: a number must be finite")

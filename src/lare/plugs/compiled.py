@@ -1,6 +1,6 @@
-"""The compiled functions behind a `CreditAssigner`, of one team: what `lare.credit` does with batches of steps and episodes.
+"""The compiled functions of a `CreditAssigner`, for one team: those of `lare.credit`, on batches of steps and episodes.
 
-The order is that of `training/episodes.py`: returns are predicted, then added to sums, then fitted to.
+The order is that of `training/episodes.py`: returns are predicted, then added to the sums, then the decoder is fitted to them.
 """
 
 from contextlib import AbstractContextManager
@@ -23,7 +23,7 @@ from lare.normalise import Scale, magnitude, observe_scale
 def observe_steps(
     state: Decomposition, features: Float[Array, "rows *agents features"], mask: Bool[Array, "rows *agents"]
 ) -> Decomposition:
-    """With new steps in the statistics."""
+    """The state with new steps in its statistics."""
     return decomposition.observe_steps(state, features, mask)
 
 
@@ -34,19 +34,19 @@ def observe_returns(
     length: Int[Array, " episodes"],
     mask: Bool[Array, " episodes"],
 ) -> Decomposition:
-    """With finished episodes in the scales."""
+    """The state with finished episodes in its scales."""
     return decomposition.observe_returns(state, mean_reward, length, mask)
 
 
 @jax.jit
 def observe_mean_rewards(scale: Scale, mean_reward: Float[Array, " episodes"], mask: Bool[Array, " episodes"]) -> Scale:
-    """With finished episodes in a scale of R/T."""
+    """The scale of R/T with finished episodes added."""
     return observe_scale(scale, mean_reward, mask)
 
 
 @partial(jax.jit, static_argnames="settings")
 def tell(state: Decomposition, episodes: Episodes, settings: CreditSettings) -> Decomposition:
-    """Predict the returns of new episodes, and add them to the sums where there are any."""
+    """Predict the returns of new episodes, and add the episodes to the sums of a closed-form decoder."""
     new = episodes.mask > 0
     state = returns.predict(state, episodes, new, settings)
     return state if state.closed is None else returns.add_episodes(state, episodes, new)
@@ -54,7 +54,7 @@ def tell(state: Decomposition, episodes: Episodes, settings: CreditSettings) -> 
 
 @jax.jit
 def add(state: Decomposition, episodes: Episodes) -> Decomposition:
-    """Add episodes to the sums, once more."""
+    """Add episodes to the sums again."""
     return returns.add_episodes(state, episodes, episodes.mask > 0)
 
 
@@ -64,13 +64,13 @@ begin_again = jax.jit(returns.begin_again)
 
 @partial(jax.jit, static_argnames=("method", "forms"))
 def fit_in_closed_form(state: Decomposition, method: str, forms: tuple[int, ...]) -> Decomposition:
-    """The decoder that the sums lead to."""
+    """Fit the decoder to the sums."""
     return returns.fit_in_closed_form(state, METHODS[method], forms)
 
 
 @jax.jit
 def is_due(state: Decomposition) -> Bool[Array, ""]:
-    """Whether there are enough new episodes for another fit in closed form."""
+    """Whether there are enough new episodes for another closed-form fit."""
     assert state.closed is not None
     return closed_form.is_due(state.closed)
 
@@ -79,7 +79,7 @@ def is_due(state: Decomposition) -> Bool[Array, ""]:
 def descend(
     state: Decomposition, batches: Episodes, keys: Key[Array, " updates"], method: str, settings: CreditSettings
 ) -> tuple[Decomposition, Float[Array, ""]]:
-    """One update by a gradient for each of some batches; and the mean of their losses."""
+    """One gradient update for each of some batches, and the mean of their losses."""
     fit = METHODS[method].fit
     assert fit is not None
 
@@ -92,11 +92,11 @@ def descend(
 
 
 class Flat(NamedTuple):
-    """A state that is called often: taking it apart for every call would take longer than the call."""
+    """A flattened state: flattening it anew for every call would take longer than the call."""
 
     leaves: list[Array]
     structure: Any
-    """What `jax.tree.flatten` says of it."""
+    """Its tree structure, from `jax.tree.flatten`."""
 
 
 @partial(jax.jit, static_argnames=("structure", "method", "settings"))
@@ -108,7 +108,7 @@ def rewards(
     method: str,
     settings: CreditSettings,
 ) -> Float[Array, "rows *agents"]:
-    """r_hat by the decoder of a flat state; with optimism, where that is set."""
+    """r_hat by the decoder of a flat state, with optimism if the settings ask for it."""
     state: Decomposition = jax.tree.unflatten(structure, leaves)
     optimistic = decomposition.optimistic(METHODS[method], settings)
     found = decomposition.optimistic_rewards if optimistic else decomposition.proxy_rewards
@@ -117,22 +117,22 @@ def rewards(
 
 @jax.jit
 def divided(r_hat: Float[Array, "*batch"], scale: Scale) -> Float[Array, "*batch"]:
-    """In units of the running root mean square of R/T."""
+    """r_hat divided by the running root mean square of R/T."""
     return r_hat / magnitude(scale)
 
 
 def on_host() -> AbstractContextManager:
-    """Decoders of steps are small, and a graphics card may be another library's."""
+    """Compute on the CPU: decoders of steps are small, and another library may use the accelerator."""
     return jax.default_device("cpu")
 
 
 def padding(rows: int) -> int:
-    """So many rows or more: a power of two, so that few shapes are compiled."""
+    """The next power of two from `rows` on, so that few shapes are compiled."""
     return 1 << max(0, rows - 1).bit_length()
 
 
 def padded(rows: np.ndarray, count: int) -> np.ndarray:
-    """With rows of zeros behind them. `numpy.pad` takes ten times as long for a few rows."""
+    """The rows, padded with zeros to `count`. `numpy.pad` takes ten times as long for a few rows."""
     found = np.zeros((count, *rows.shape[1:]), rows.dtype)
     found[: len(rows)] = rows
     return found

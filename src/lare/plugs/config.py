@@ -1,4 +1,4 @@
-"""What a `CreditAssigner` holds fixed: method, function, spaces and settings; and what they make of steps."""
+"""The fixed configuration of a `CreditAssigner`: method, function, spaces and settings; and the features of steps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ from lare.tasks.spec import Judges, TaskSpec
 from lare.tasks.table import env_spec
 
 Space = gymnasium.Space | Layout | int
-"""Of Gymnasium; or how many numbers a row has."""
+"""A space of Gymnasium, a layout, or the number of entries of a row."""
 
 
 @dataclass(frozen=True)
 class CreditConfig:
-    """What is assigned how."""
+    """The configuration of an assigner."""
 
     method: Method
     phi: LatentFunction | None
@@ -43,17 +43,17 @@ class CreditConfig:
 
     @property
     def axis(self) -> tuple[int, ...]:
-        """The axis of agents, where there are many."""
+        """The axis of agents; empty for a single agent."""
         return (self.agents,) if self.agents > 1 else ()
 
     @property
     def factors(self) -> int:
-        """Of a step."""
+        """The number of factors of a step."""
         return self.phi.size_by(self.judges) if self.phi is not None else 0
 
     @property
     def entries(self) -> int:
-        """Size of the raw part of what the decoder sees of a step."""
+        """The number of raw entries in the decoder's input for a step."""
         shown, action = self.observation.size, self.action.size
         match self.method.encoder:
             case None | Encoder.LATENT:
@@ -65,7 +65,7 @@ class CreditConfig:
 
     @property
     def basis(self) -> Basis:
-        """What a decoder in closed form makes of a row."""
+        """The features that a closed-form decoder computes from a row."""
         return Basis(self.factors, self.entries, extended=self.method.decoder is Decoder.ADDITIVE)
 
     @property
@@ -74,7 +74,7 @@ class CreditConfig:
         return forms_of(self.settings, fixed_length=False) if "score" in self.method.settings else (SUM,)
 
     def features(self, before: np.ndarray, action: np.ndarray, after: np.ndarray) -> Float[np.ndarray, "n *agents _"]:
-        """What the decoder sees of some steps, which are rows already."""
+        """The decoder's inputs for some steps, which are rows already."""
         parts = []
         if self.phi is not None:
             one, done, other = (part.reshape(-1, part.shape[-1]) for part in (before, action, after))
@@ -89,7 +89,7 @@ class CreditConfig:
         return np.concatenate(parts, axis=-1) if parts else before[..., :0]
 
     def rows(self, before: Any, action: Any, after: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Steps as rows of numbers. Raises `LareError` where they do not belong together."""
+        """Steps as rows of numbers. Raises `LareError` if their shapes do not fit together."""
         found = {
             "before": self.observation.rows(before, "before"),
             "action": self.action.rows(action, "action"),
@@ -106,7 +106,7 @@ class CreditConfig:
     def team_reward(
         self, reward: Any, alive: Any, count: int
     ) -> tuple[np.ndarray, Bool[np.ndarray, "n agents"] | None]:
-        """What the team was paid for each of some steps, and which agents were alive, where that was said."""
+        """The team's reward for each of some steps, and which agents were alive, if that is given."""
         paid = np.asarray(reward, np.float64)
         there = None if alive is None else np.asarray(alive, bool)
         if there is not None and (there.shape != (count, self.agents) or self.agents == 1):
@@ -120,10 +120,10 @@ class CreditConfig:
 
 
 def layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) -> list[Layout]:
-    """How observations and actions lie in rows.
+    """The layouts of observations and actions.
 
     Raises:
-        LareError: nothing says it, or the task says something else.
+        LareError: there is neither a space nor a task, or the two differ.
     """
     found = []
     for name, space in spaces.items():
@@ -143,16 +143,16 @@ def layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) -> list[L
 
 
 def check(config: CreditConfig) -> None:
-    """Raise `LareError` where method, function and sizes do not go together."""
+    """Raise `LareError` if method, function and sizes do not go together."""
     method, phi, name = config.method, config.phi, config.method.name
     if not isinstance(config.capacity, int) or config.capacity < 1:
         raise LareError(f"capacity = {shortened(config.capacity)}: it is a whole number, 1 or more")
     if not method.has_proxy:
         raise LareError(f"{name} assigns no credit: train on what the environment pays")
     if method.whole_episodes:
-        raise LareError(f"{name} looks at whole episodes at once, not at steps that are sampled: `lare.train` has it")
+        raise LareError(f"{name} looks at whole episodes at once, not at sampled steps: use it with `lare.train`")
     if phi is not None and not isinstance(phi, LatentFunction):
-        raise LareError(f"phi is what lare.design and lare.load_function give; it is {shortened(phi)}")
+        raise LareError(f"phi must be a function from lare.design or lare.load_function, and is {shortened(phi)}")
     if method.latent and phi is None:
         raise LareError(f"{name} needs a phi; bayes, rd and rrdu need none")
     if phi is not None and not method.latent:
@@ -175,7 +175,7 @@ def check(config: CreditConfig) -> None:
         raise LareError(f"scale_rewards divides by the size of returns, and rewards of {name} are not in their unit")
     if method.fit is Fit.EVIDENCE and not method.latent and config.entries > MOST_ENTRIES:
         raise LareError(
-            f"{name} fits a weight to each of at most {MOST_ENTRIES} entries, and there are {config.entries}: rrdu trains a network"
+            f"{name} fits a weight to each of at most {MOST_ENTRIES} entries, and there are {config.entries}: use rrdu, a network"
         )
     drawn, steps = config.settings.drawn_steps, config.settings.steps
     if "drawn_steps" in method.settings and steps < drawn:

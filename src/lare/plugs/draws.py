@@ -1,4 +1,4 @@
-"""Which stored steps an update of a decoder reads: as `data/sampling.py`, from a `Store`, in NumPy."""
+"""The choice of the stored steps that an update of a decoder reads: like `data/sampling.py`, for a `Store`, in NumPy."""
 
 from collections.abc import Iterator, Sequence
 
@@ -15,8 +15,8 @@ def batch(store: Store, fit: Fit, settings: CreditSettings, random: np.random.Ge
     """Steps of episodes for one update, drawn uniformly with replacement.
 
     Args:
-        store: with an episode at least.
-        longest: as many steps as an episode can have; batches with the same are of one shape.
+        store: a store with at least one episode.
+        longest: the largest number of steps of an episode; batches with the same value have the same shape.
     """
 
     def drawn(some: int) -> list[Episode]:
@@ -35,7 +35,7 @@ def batch(store: Store, fit: Fit, settings: CreditSettings, random: np.random.Ge
 
 
 def parts(store: Store, episodes: Sequence[Episode], drawn: int, random: np.random.Generator) -> Episodes:
-    """`drawn` steps of each episode, without replacement; of a shorter one all, and padding."""
+    """`drawn` steps of each episode, without replacement. A shorter episode gives all its steps, and padding."""
     steps = np.zeros((len(episodes), drawn), np.int64)
     belongs = np.zeros((len(episodes), drawn), bool)
     for place, episode in enumerate(episodes):
@@ -48,7 +48,7 @@ def parts(store: Store, episodes: Sequence[Episode], drawn: int, random: np.rand
 
 
 def packed(store: Store, episodes: Sequence[Episode], places: int, rows: int) -> Episodes:
-    """Whole episodes one behind the other, as many as fit, and padding."""
+    """Whole episodes one after the other, as many as fit, and padding."""
     chosen: list[Episode] = []
     used = 0
     for episode in episodes[:places]:
@@ -63,7 +63,7 @@ def packed(store: Store, episodes: Sequence[Episode], places: int, rows: int) ->
 
 
 def padded(store: Store, episodes: Sequence[Episode], longest: int) -> Episodes:
-    """Whole episodes, and the last step of each again until it is as long as the longest can be."""
+    """Whole episodes. The last step of each is repeated until there are `longest`."""
     steps = np.concatenate(
         [np.pad(episode.steps, (0, longest - len(episode.steps)), mode="edge") for episode in episodes]
     )
@@ -77,7 +77,7 @@ def episodes_of(
     number: Int[np.ndarray, " rows"],
     places: int,
 ) -> Episodes:
-    """The features of some steps, with what their episodes returned."""
+    """The features of some steps, with the returns of their episodes."""
     rows, count = steps % store.capacity, len(episodes)
     length, score = np.ones(places, np.int32), np.zeros(places)
     length[:count] = [len(episode.steps) for episode in episodes]
@@ -98,7 +98,7 @@ def episodes_of(
 
 
 def pieces(store: Store, episodes: Sequence[Episode], places: int, rows: int) -> Iterator[Episodes]:
-    """Whole episodes in their order, some at a time: at most so many of them, in so many rows, and padding."""
+    """Whole episodes in their order, some at a time: at most `places` of them, in `rows` rows with padding."""
     start = 0
     while start < len(episodes):
         end, used = start, 0

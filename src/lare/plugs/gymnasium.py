@@ -1,11 +1,11 @@
-"""Gymnasium environments that show every step to a `CreditAssigner`, and pay what it says.
+"""Wrappers of Gymnasium environments that show every step to a `CreditAssigner`, and return its proxy rewards.
 
     envs = VectorCredit(gymnasium.make_vec("HalfCheetah-v4", 8), credit)
     observation, r_hat, terminated, truncated, info = envs.step(action)
     info["true_reward"], info["credit_step"]
 
-Put them on the outside of what ends episodes (`TimeLimit`) and on the inside of what changes observations or rewards
-(`NormalizeObservation`): the assigner is to see the environment's own.
+Apply them outside wrappers that end episodes (`TimeLimit`), and inside wrappers that change observations or rewards
+(`NormalizeObservation`), because the assigner needs the environment's own observations and rewards.
 """
 
 from collections.abc import Mapping
@@ -25,18 +25,18 @@ from lare.plugs.spaces import Rows, check_assigner
 from lare.tasks.episodic import TRUE_REWARD, score_in
 
 CREDIT_STEP = "credit_step"
-"""Where `info` keeps the number of the step, for `CreditAssigner.rewards_at`."""
+"""The key of `info` for the number of the step, for `CreditAssigner.rewards_at`."""
 
 Pay = Literal["proxy", "environment"]
-"""What `step` returns as the reward: r_hat, or what the environment paid."""
+"""The reward that `step` returns: r_hat, or the environment's."""
 
 
 class Credit(gymnasium.Wrapper, RecordConstructorArgs):
     """A single environment that shows every step to an assigner.
 
     `step` returns r_hat by the newest decoder, and `info` has the environment's reward ("true_reward") and the number of the step
-    ("credit_step"). What is stored goes stale: a loop with a replay buffer takes `pay="environment"`, keeps the numbers, and asks
-    `credit.rewards_at` whenever it samples.
+    ("credit_step"). A stored r_hat becomes outdated, so a loop with a replay buffer should use `pay="environment"`, store the
+    numbers, and call `credit.rewards_at` whenever it samples.
 
     `reset` in the middle of an episode gives the episode up: it is never learned from.
     """
@@ -46,14 +46,14 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
 
         Args:
             env: the environment. Its spaces must be those that the assigner was made for.
-            credit: the assigner, which may be that of other environments too.
-            pay: what `step` returns as the reward. With "proxy" the decoder is fitted as steps come in.
-            score: a key of the last step's `info` that holds the score of the episode. The sum of the rewards, unless given.
+            credit: the assigner. Other environments may share it.
+            pay: the reward that `step` returns. With "proxy" the decoder is fitted as steps come in.
+            score: a key of the last step's `info` that holds the score of the episode. The default is the sum of the rewards.
 
         Raises:
             LareError: the spaces are not those of the assigner, or it is one for many agents.
         """
-        # Without a copy: an assigner that nobody else has would learn for nobody.
+        # The assigner is not copied: nothing else would use what the copy learns.
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, credit=credit, pay=pay, score=score)
         gymnasium.Wrapper.__init__(self, env)
         check(credit, pay)
@@ -70,7 +70,7 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        action = deepcopy(action)  # likewise
+        action = deepcopy(action)  # the environment may write into it
         observation, reward, terminated, truncated, info = self.env.step(action)
         ended = bool(terminated or truncated)
         paid = float(reward)
@@ -98,10 +98,10 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
 class VectorCredit(VectorWrapper, RecordConstructorArgs):
     """A vector environment that shows every step of each of its environments to an assigner.
 
-    As `Credit`; `info` has arrays, "true_reward" and "credit_step". Every autoreset mode is followed as `metadata` has it:
+    Like `Credit`; `info` has arrays, "true_reward" and "credit_step". The autoreset mode is taken from `metadata`:
 
-    * NEXT_STEP: the call after an end resets. Its row is no step: number -1, r_hat 0.
-    * SAME_STEP: the end's call resets too. The step led to `final_obs`.
+    * NEXT_STEP: the call after the end of an episode resets. Its row is not a step: number -1, r_hat 0.
+    * SAME_STEP: the call that ends an episode resets, too. The observation after the last step is `final_obs`.
     * DISABLED: the loop resets, by `options["reset_mask"]`.
     """
 
@@ -109,10 +109,10 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         """Wrap a vector environment.
 
         Args:
-            env: the vector environment, of single environments whose spaces the assigner was made for.
+            env: the vector environment. The spaces of its single environments must be those that the assigner was made for.
             credit: the assigner.
-            pay: what `step` returns as the rewards. With "proxy" the decoder is fitted as steps come in.
-            score: a key of the last step's `info` that holds the score of the episode. The sum of the rewards, unless given.
+            pay: the rewards that `step` returns. With "proxy" the decoder is fitted as steps come in.
+            score: a key of the last step's `info` that holds the score of the episode. The default is the sum of the rewards.
 
         Raises:
             LareError: `metadata` has no autoreset mode, the spaces are not those of the assigner, or it is one for many agents.
@@ -130,13 +130,13 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         self.rows = Rows(credit, env.single_observation_space, env.single_action_space)
         self.lanes = [object() for _ in range(env.num_envs)]
         self.ended = np.zeros(env.num_envs, bool)
-        """Which episodes ended with the last step, so that a call to `step` resets them where it is NEXT_STEP."""
+        """Which episodes ended with the last step. In NEXT_STEP mode the next call of `step` resets these environments."""
         self.before: Any = None
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        mask = (options or {}).get("reset_mask")  # which Gymnasium takes out
+        mask = (options or {}).get("reset_mask")  # read first, because Gymnasium removes it from the options
         chosen = np.ones(self.num_envs, bool) if mask is None else np.array(mask, bool)
         observations, infos = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
         for place in np.flatnonzero(chosen):
@@ -179,12 +179,12 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         return observations, rewards, terminated, truncated, infos
 
     def led_to(self, observations: Any, infos: Mapping[str, Any], ended: Bool[np.ndarray, " envs"]) -> Any:
-        """What the steps led to: at an end the episode's own last observation."""
+        """The observations after the steps; at the end of an episode its own last observation."""
         if self.mode != AutoresetMode.SAME_STEP or not ended.any():
             return observations
         if "final_obs" not in infos:
             raise LareError(
-                "an episode has ended in SAME_STEP mode, and infos has no final_obs: what its last step led to"
+                "an episode has ended in SAME_STEP mode, and infos has no final_obs, the observation after its last step"
             )
         space = self.env.single_observation_space
         each = list(iterate(self.env.observation_space, observations))
@@ -193,7 +193,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         return concatenate(space, each, create_empty_array(space, self.num_envs))
 
     def scores(self, infos: Mapping[str, Any], ended: Bool[np.ndarray, " envs"]) -> Float[np.ndarray, " envs"]:
-        """What `info` says that the episodes returned that have ended; 0 for the others."""
+        """The scores in `info` of the episodes that have ended; 0 for the others."""
         assert self.score is not None
         found = np.zeros(self.num_envs)
         last = infos.get("final_info", infos) if self.mode == AutoresetMode.SAME_STEP else infos
@@ -204,7 +204,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         return found
 
     def true_rewards(self, infos: Mapping[str, Any], rewards: Any) -> Float[np.ndarray, " envs"]:
-        """The environments' rewards; where a wrapper inside has replaced those, what it says that they were."""
+        """The environments' rewards. If an inner wrapper has replaced them, the ones that it reports in `infos`."""
         found = np.array(rewards, float)
         for said in (infos, infos.get("final_info", {})):
             mask = said.get(f"_{TRUE_REWARD}")
@@ -214,7 +214,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
 
 
 def check(credit: CreditAssigner, pay: str) -> None:
-    """Raise `LareError` where an assigner cannot pay a single agent, or what is to be paid is not known."""
+    """Raise `LareError` if an assigner is not for a single agent, or `pay` is unknown."""
     check_assigner(credit)
     if credit.config.agents > 1:
         raise LareError(f"Gymnasium environments have one agent, and the assigner has agents = {credit.config.agents}")
@@ -222,18 +222,18 @@ def check(credit: CreditAssigner, pay: str) -> None:
 
 
 def check_pay(pay: str) -> None:
-    """Raise `LareError` where it is not known what is to be paid."""
+    """Raise `LareError` if `pay` is unknown."""
     if pay not in ("proxy", "environment"):
         raise LareError(f"pay = {pay!r}: it is 'proxy' or 'environment'")
 
 
 def batch_of_one(space: gymnasium.Space, element: Any) -> Any:
-    """A batch as vector environments have it."""
+    """A batch of one element, in the form of vector environments."""
     return concatenate(space, [element], create_empty_array(space, 1))
 
 
 def of_place(batch: Any, place: Any) -> Any:
-    """One environment's part of a batch: of an array of objects, or of arrays in a mapping or a tuple."""
+    """One environment's part of a batch, which is an array of objects, or arrays in a mapping or a tuple."""
     if isinstance(batch, Mapping):
         return {name: of_place(part, place) for name, part in batch.items()}
     if isinstance(batch, tuple):

@@ -1,4 +1,4 @@
-"""How a space lies in rows of numbers: every observation and action becomes a row of float32, in Gymnasium's own order."""
+"""Spaces as rows of numbers: every observation and action becomes a row of float32, in Gymnasium's own order."""
 
 import functools
 from typing import Any, Literal
@@ -14,19 +14,19 @@ Kind = Literal["numbers", "choices", "named", "in a row"]
 
 
 class Layout(Checked):
-    """A space, as far as its rows are concerned. As JSON it can be kept."""
+    """How the elements of a space become rows. It can be saved as JSON."""
 
     kind: Kind
     shape: tuple[int, ...] = ()
-    """numbers: of one element."""
+    """For `numbers`: the shape of one element."""
     choices: tuple[int, ...] = ()
-    """choices: how many there are, in each place; a row has a single 1 among as many numbers."""
+    """For `choices`: the number of choices in each place. In a row, each place is a one-hot vector of that length."""
     first: tuple[int, ...] = ()
-    """choices: the number of the first one, in each place."""
+    """For `choices`: the number of the first choice, in each place."""
     names: tuple[str, ...] = ()
-    """named: the keys, in order."""
+    """For `named`: the keys, in order."""
     parts: tuple["Layout", ...] = Field(default=())
-    """named, in a row: the spaces that it is made of."""
+    """For `named` and `in a row`: the spaces that it is made of."""
 
     @functools.cached_property
     def size(self) -> int:
@@ -36,13 +36,13 @@ class Layout(Checked):
         return sum(self.choices) if self.kind == "choices" else sum(part.size for part in self.parts)
 
     def rows(self, values: Any, name: str) -> Float[np.ndarray, "*batch size"]:
-        """A batch of elements as rows; as Gymnasium's vector environments have batches, a mapping of batches for a mapping.
+        """A batch of elements as rows. As in Gymnasium's vector environments, a batch of mappings is a mapping of batches.
 
-        The batch may have several axes, of steps and of agents. Rows that are made already are taken as they are, but for a Box
-        without an axis, where (n, 1) would be read as n times 1 elements.
+        The batch may have several axes, of steps and of agents. Values that are rows already are not changed, except for a Box
+        without an axis, where (n, 1) is read as n times 1 elements.
 
         Raises:
-            LareError: they are no elements of the space.
+            LareError: the values are not elements of the space.
         """
         if self.kind == "named" and isinstance(values, dict):
             missing = [key for key in self.names if key not in values]
@@ -75,33 +75,33 @@ class Layout(Checked):
         return np.concatenate(parts, axis=-1)
 
     def chosen(self, array: Shaped[np.ndarray, "*shape"], name: str) -> Float[np.ndarray, "*batch size"]:
-        """Numbers of choices as rows with a single 1 for each place."""
+        """Numbers of choices as rows, one-hot in each place."""
         single = not self.shape
         if single and array.ndim and array.shape[-1] == self.size and array.dtype.kind == "f":
             return in_float32(array)
         places = array[..., None] if single else array
         if places.shape[-1:] != (len(self.choices),):
             return self.as_they_are(array, name)
-        with np.errstate(invalid="ignore"):  # what is not a number is no choice either
+        with np.errstate(invalid="ignore"):  # NaN is refused below, like any other value that is not a choice
             numbers = places.astype(np.int64) - np.asarray(self.first)
         if np.any((numbers < 0) | (numbers >= np.asarray(self.choices)) | (numbers + np.asarray(self.first) != places)):
-            raise LareError(f"{name} holds a choice that there is not: {shortened(array)}")
+            raise LareError(f"{name} holds a choice that does not exist: {shortened(array)}")
         return np.concatenate(
             [np.eye(count, dtype=np.float32)[numbers[..., place]] for place, count in enumerate(self.choices)], axis=-1
         )
 
     def as_they_are(self, array: Shaped[np.ndarray, "*shape"], name: str) -> Float[np.ndarray, "*batch size"]:
-        """Rows that are made already."""
+        """Values that are rows already."""
         if array.ndim == 0 or array.shape[-1] != self.size:
             raise LareError(f"{name} must be rows of {self.size} numbers, and has the shape {array.shape}")
         return in_float32(array)
 
 
 def array_of(values: Any, name: str) -> Shaped[np.ndarray, "*shape"]:
-    """Numbers as an array. Raises `LareError` where they are none."""
+    """Numbers as an array. Raises `LareError` if the values are not numbers."""
     try:
         array = np.asarray(values)
-    except (TypeError, ValueError, RuntimeError):  # lists of unequal length; what another library will not give away
+    except (TypeError, ValueError, RuntimeError):  # unequal lengths; objects that do not convert
         array = np.empty(0, object)
     if array.dtype.kind not in "biuf":
         raise LareError(f"{name} must be numbers, and is {shortened(values)}")
@@ -109,18 +109,18 @@ def array_of(values: Any, name: str) -> Shaped[np.ndarray, "*shape"]:
 
 
 def in_float32(array: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The same numbers; infinite where they are too large, which the assigner refuses."""
+    """The same numbers in float32. Numbers that are too large become infinite, which the assigner refuses."""
     with np.errstate(over="ignore"):
         return array.astype(np.float32, copy=False)
 
 
 def numbers(size: int) -> Layout:
-    """Rows of numbers."""
+    """The layout of rows of `size` numbers."""
     return Layout(kind="numbers", shape=(size,))
 
 
 def layout_of(space: "spaces.Space | int | Layout", name: str) -> Layout:
-    """Of a Gymnasium space, or of rows of so many numbers.
+    """The layout of a Gymnasium space, or of rows of so many numbers.
 
     Raises:
         LareError: its elements have no fixed size.
@@ -145,4 +145,4 @@ def layout_of(space: "spaces.Space | int | Layout", name: str) -> Layout:
         case spaces.Tuple():
             parts = tuple(layout_of(part, f"{name}[{place}]") for place, part in enumerate(space.spaces))
             return Layout(kind="in a row", parts=parts)
-    raise LareError(f"{name} is {shortened(space)}, whose elements are no rows of numbers of one size")
+    raise LareError(f"{name} is {shortened(space)}, whose elements cannot be written as rows of numbers of one size")

@@ -1,4 +1,4 @@
-"""The decoder of a `CreditAssigner`: what it is told of, when it is fitted, and what returns say of it."""
+"""The decoder of a `CreditAssigner`: the data that it learns from, when it is fitted, and how well it predicts returns."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -18,41 +18,41 @@ from lare.plugs.config import CreditConfig
 from lare.plugs.store import Episode, Store
 
 WAITING = 256
-"""Steps, at most, that wait for `phi` and for the running statistics."""
+"""The most steps that wait for `phi` and for the running statistics."""
 PIECE = 8192
-"""Rows of features that are looked at at a time."""
+"""Rows of features that are processed at a time."""
 CHUNK = 16
-"""Updates of a decoder by a gradient in one call."""
+"""Gradient updates of a decoder in one call."""
 MOST_OWED = 256
-"""Updates that are made up for at once. Before the first episode has ended, steps owe nothing more than this."""
+"""The most updates that are owed at a time. Steps before the end of the first episode cannot add up to more."""
 
 
 class Learner:
-    """A decoder, and how far it has come with the episodes of a store."""
+    """A decoder, and the state of its learning from the episodes of a store."""
 
     def __init__(self, config: CreditConfig, store: Store):
         self.config, self.store = config, store
         self.state = untrained(config)
         """None for a method that has no decoder."""
         self.scale: Scale = new_scale()
-        """Of R/T."""
+        """The scale of R/T."""
         self.unobserved: list[tuple[np.ndarray, np.ndarray]] = []
-        """Features of steps that the running statistics have not met, and which agents acted."""
+        """Features of steps that are not in the running statistics yet, and which agents acted."""
         self.pending: list[Episode] = []
-        """Episodes that the decoder has not been told of."""
+        """Episodes that the decoder has not learned from yet."""
         self.returned: list[tuple[float, int]] = []
-        """R/T and T of episodes that the scales have not met."""
+        """R/T and T of episodes that are not in the scales yet."""
         self.untold = 0
         """Steps of the episodes that are pending."""
         self.told = self.fits = 0
-        """Episodes that it has been told of; updates by a gradient."""
+        """The number of episodes that the decoder has learned from, and the number of its gradient updates."""
         self.owed = 0.0
-        """Updates that the steps so far still ask for."""
+        """Gradient updates that are due for the steps so far, and not made yet."""
         self.loss = float("nan")
-        """The mean of the last updates by a gradient."""
+        """The mean loss of the last gradient updates."""
         self.has_learned = False
         self.flat: tuple[Decomposition | None, Flat | None] = None, None
-        """What pays, and the state that it was made of."""
+        """A state, and its flattened form, which computes rewards."""
 
     @property
     def descends(self) -> bool:
@@ -61,7 +61,7 @@ class Learner:
 
     @property
     def fitted(self) -> bool:
-        """Whether it has learned anything yet."""
+        """Whether it has been fitted yet."""
         if not self.has_learned:  # once it has, there is no need to ask the device again
             if self.state is None or self.config.method.descends:
                 self.has_learned = self.fits > 0
@@ -71,7 +71,7 @@ class Learner:
 
     @property
     def paying(self) -> Flat:
-        """The decoder with what it needs to pay, without what it has learned from."""
+        """The flattened decoder with the parts that compute rewards, without the parts that are only for learning."""
         assert self.state is not None
         of, flat = self.flat
         if of is not self.state or flat is None:
@@ -84,15 +84,15 @@ class Learner:
 
     @property
     def is_due(self) -> bool:
-        """Whether enough new episodes have ended to be told of."""
+        """Whether enough new episodes have ended to learn from them."""
         return len(self.pending) >= max(returns.GROWTH * self.told, 1)
 
     def owe(self, steps: int) -> None:
-        """New steps ask for updates."""
+        """Add the gradient updates that are due for new steps."""
         self.owed = min(self.owed + self.config.fits_per_step * steps, MOST_OWED)
 
     def ended(self, episode: Episode) -> None:
-        """An episode has ended."""
+        """Add an episode that has ended."""
         self.pending.append(episode)
         self.untold += len(episode.steps)
         self.returned.append((episode.score / len(episode.steps), len(episode.steps)))
@@ -108,7 +108,7 @@ class Learner:
             self.observe()
 
     def observe(self) -> None:
-        """Add the steps and episodes that wait for it to the running statistics."""
+        """Add the waiting steps and episodes to the running statistics."""
         self.observe_returned()
         if self.state is None or not self.unobserved:
             return
@@ -121,7 +121,7 @@ class Learner:
                 self.state = compiled.observe_steps(self.state, padded(features[part], rows), padded(alive[part], rows))
 
     def observe_returned(self) -> None:
-        """Add the episodes that have ended to the scales, many at a time as well."""
+        """Add the episodes that have ended to the scales, many at a time."""
         if not self.returned:
             return
         mean, length = np.array(self.returned).T
@@ -135,7 +135,7 @@ class Learner:
             self.scale = compiled.observe_mean_rewards(self.scale, mean, there)
 
     def learn(self) -> None:
-        """Tell the decoder of the episodes that have ended. All steps must have their features."""
+        """Let the decoder learn from the episodes that have ended. All steps must have their features."""
         self.observe()
         new = [episode for episode in self.pending if episode.steps[0] >= self.store.steps - self.store.capacity]
         self.pending.clear()
@@ -157,7 +157,7 @@ class Learner:
                 self.state = compiled.fit_in_closed_form(self.state, self.config.method.name, self.config.forms)
 
     def pieces(self, episodes: Sequence[Episode]) -> Iterator[Episodes]:
-        """Whole episodes, some at a time, in arrays of two shapes: as long as one episode, or as many as are looked at at once."""
+        """Whole episodes, some at a time, in arrays of one of two shapes: for a single episode, or for many."""
         total, longest = sum(len(one.steps) for one in episodes), max(len(one.steps) for one in episodes)
         rows = padding(longest)
         if total > rows:
@@ -165,7 +165,7 @@ class Learner:
         return draws.pieces(self.store, episodes, prediction.LAST, rows)
 
     def fit(self, updates: int) -> None:
-        """Fit now: so many updates of a decoder that descends a gradient; once in closed form, however many are asked for."""
+        """Fit now: so many gradient updates of the decoder. A closed-form decoder is fitted once, whatever `updates` is."""
         if self.state is None or not self.store.episodes:
             return
         if not self.config.method.descends:
@@ -184,7 +184,7 @@ class Learner:
             self.descend(CHUNK)
 
     def descend(self, updates: int) -> None:
-        """Updates by a gradient, of batches that are drawn by their numbers."""
+        """Make gradient updates. The number of an update is the seed of its batch."""
         assert self.state is not None
         assert self.config.method.fit is not None
         random = np.random.default_rng([self.config.seed, self.fits])
@@ -210,7 +210,7 @@ class Learner:
             return float(prediction.r2(self.state.predictions)[0])
 
     def explanation(self) -> list[str]:
-        """What the stored returns say of the factors: `CreditAssigner.explanation`."""
+        """What the stored returns say about the factors: `CreditAssigner.explanation`."""
         basis = replace(self.config.basis, extended=True)
         if self.state is None or not self.store.episodes or not basis.size:
             return []
@@ -227,7 +227,7 @@ class Learner:
         return words(found, returns.form_found(self.state), names, self.entry_names(len(found.left)))
 
     def entry_names(self, entries: int) -> list[str]:
-        """What the entries of [s', a] are called; nothing where the decoder sees other ones."""
+        """Names of the entries of [s', a]; empty if the decoder's input has other entries."""
         if self.config.method.encoder not in (Encoder.NEXT, Encoder.LATENT_AND_NEXT):
             return []
         texts = ("", "") if self.config.task is None else (self.config.task.observation, self.config.task.action)
@@ -235,7 +235,7 @@ class Learner:
 
 
 def untrained(config: CreditConfig) -> Decomposition | None:
-    """A decoder that has learned nothing; None for a method that has none."""
+    """An untrained decoder; None for a method that has none."""
     if config.method.reward is not Reward.PROXY:
         return None
     key, steps = jax.random.key(config.seed), config.max_steps or 1

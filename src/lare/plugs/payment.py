@@ -1,4 +1,4 @@
-"""What a `CreditAssigner` pays for steps, by the decoder as it stands."""
+"""The rewards that a `CreditAssigner` gives to steps, by its current decoder."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,14 +18,14 @@ def payment(
     alive: Bool[np.ndarray, "n *agents"] | None = None,
     rows: Int[np.ndarray, " n"] | None = None,
 ) -> Float[np.ndarray, "n *agents"]:
-    """What the method pays for steps with these features.
+    """The rewards that the method gives to steps with these features.
 
     Args:
-        learner: with the decoder, and the store that `rows` are places in.
-        features: what it sees of the steps.
+        learner: holds the decoder, and the store to which `rows` belong.
+        features: the decoder's inputs for the steps.
         length: T of each step's episode.
-        alive: which agents acted; all, unless given.
-        rows: where the steps are stored, for a method that pays by the return of a step's episode.
+        alive: which agents acted; all by default.
+        rows: the places of the steps in the store, for a method that pays by the return of a step's episode.
     """
     config, shape = learner.config, features.shape[:-1]
     match config.method.reward:
@@ -48,7 +48,7 @@ def payment(
 
 
 def uniform(learner: Learner, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """The mean reward of each step's episode, between the lowest and the highest so far; 0.5 while it goes on."""
+    """The mean reward of each step's episode, scaled to [0, 1] by the lowest and highest so far; 0.5 before the episode ends."""
     store = learner.store
     with on_host():
         share = np.asarray(within_range(learner.scale, jnp.asarray(store.mean_reward[rows])))
@@ -58,7 +58,7 @@ def uniform(learner: Learner, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, 
 def decoded(
     learner: Learner, features: Float[np.ndarray, "n *agents features"], length: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n *agents"]:
-    """What the decoder says."""
+    """The decoder's rewards."""
     config, size, flat = learner.config, padding(len(features)), learner.paying
     long = padded(length, size)
     long[len(length) :] = 1

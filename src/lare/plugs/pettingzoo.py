@@ -1,4 +1,4 @@
-"""PettingZoo environments that show every step of a team to a `CreditAssigner`, and pay each agent what it says."""
+"""A wrapper of PettingZoo environments that shows every step of a team to a `CreditAssigner`, and returns each agent's r_hat."""
 
 from copy import deepcopy
 from typing import Any
@@ -19,11 +19,12 @@ except ModuleNotFoundError as error:
 
 
 class CreditParallel(BaseParallelWrapper):
-    """A ParallelEnv whose agents are one team, and an axis of the assigner's arrays, in the order of `possible_agents`.
+    """A ParallelEnv whose agents are one team. In the assigner's arrays the agents are in the order of `possible_agents`.
 
-    `step` returns r_hat for each agent that acted. Its `info` has what the environment paid it ("true_reward") and the number of
-    the step ("credit_step"), for `credit.rewards_at`, which gives the r_hat of all agents. The return of an episode is the sum of
-    the mean reward of those who act. An agent that leaves counts until its last step. The episode ends when all have left.
+    `step` returns r_hat for each agent that acted. The agent's `info` has its reward from the environment ("true_reward") and the
+    number of the step ("credit_step"), for `credit.rewards_at`, which returns the r_hat of all agents. The return of an episode is
+    the sum over the steps of the mean reward of the agents that act. An agent that leaves counts until its last step. The episode
+    ends when all agents have left.
 
     `reset` in the middle of an episode gives the episode up: it is never learned from.
     """
@@ -34,10 +35,10 @@ class CreditParallel(BaseParallelWrapper):
         Args:
             env: the environment, whose agents all have the same spaces.
             credit: an assigner with `agents=len(env.possible_agents)`, made for the spaces of one agent.
-            pay: what `step` returns as the rewards: r_hat, or what the environment paid.
+            pay: the rewards that `step` returns: r_hat, or the environment's.
 
         Raises:
-            LareError: there are other agents or spaces than the assigner was made for.
+            LareError: the number of agents or the spaces are not those that the assigner was made for.
         """
         super().__init__(env)
         check_pay(pay)
@@ -51,10 +52,10 @@ class CreditParallel(BaseParallelWrapper):
         self.lane = object()
         """A key that no other environment of the assigner has."""
         self.before = np.zeros((len(self.team), self.shown.size), np.float32)
-        """What each agent observed last; zeros of one that has not come yet."""
+        """The last observation of each agent; zeros for an agent that has not appeared yet."""
 
     def layout(self, name: str) -> Any:
-        """How observations or actions of every agent lie in rows."""
+        """The layout of every agent's observations or actions."""
         found = [layout_of(getattr(self.env, f"{name}_space")(agent), f"{name}_space") for agent in self.team]
         for agent, one in zip(self.team, found, strict=True):
             if one != found[0]:
@@ -76,7 +77,7 @@ class CreditParallel(BaseParallelWrapper):
         return observations, infos
 
     def seen(self, observations: dict) -> Float[np.ndarray, "agents observation"]:
-        """What each agent observes; of one that has left, what it observed last."""
+        """The observation of each agent; for an agent that has left, its last one."""
         rows = self.before.copy()
         for place, agent in enumerate(self.team):
             if agent in observations:
@@ -115,7 +116,7 @@ class CreditParallel(BaseParallelWrapper):
         return observations, rewards, terminated, truncated, infos
 
     def acting(self, actions: dict) -> tuple[Bool[np.ndarray, " agents"], Float[np.ndarray, "agents action"]]:
-        """Which agents act, and what they do; zeros of those who do not."""
+        """Which agents act, and their actions; zeros for the others."""
         alive = np.array([agent in actions for agent in self.team])
         rows = np.zeros((len(self.team), self.taken.size), np.float32)
         for place in np.flatnonzero(alive):

@@ -1,9 +1,9 @@
-"""A `CreditAssigner` on the disk, and on its way to another process. No pickle.
+"""Save a `CreditAssigner` to the disk, or send it to another process. No pickle.
 
 DIRECTORY/
-  assigner.json   what it was made with, and counts
-  state.npz       decoder and statistics; steps and episodes, where they are kept
-  phi.py, .json   the function, and what it was tried on in `state.npz`
+  assigner.json   the arguments that it was made with, and counts
+  state.npz       decoder and statistics; steps and episodes, if they are saved; the steps on which phi is verified
+  phi.py, .json   the function
 """
 
 import json
@@ -20,7 +20,7 @@ from lare.errors import LareError, shortened
 from lare.files import write_atomically
 from lare.foreign import read_json, read_text
 from lare.latent.function import LatentFunction
-from lare.latent.function import load as load_function
+from lare.latent.saved import load as load_function
 from lare.plugs.assigner import CreditAssigner
 from lare.plugs.layout import Layout
 from lare.plugs.store import Episode, Store
@@ -30,11 +30,11 @@ from lare.tasks.spec import TaskSpec
 FORMAT = 1
 TEXT, ARRAYS, FUNCTION = "assigner.json", "state.npz", "phi.py"
 TRIED = ("tried/observation", "tried/action")
-"""What `phi` is tried on when it is read again: there may be no environment."""
+"""The steps on which `phi` is verified when it is loaded, because there may be no environment."""
 
 
 def text_of(credit: CreditAssigner) -> dict[str, Any]:
-    """What it was made with, and what it counts, as JSON."""
+    """The arguments that it was made with, and its counts, as JSON."""
     return {
         "format": FORMAT,
         "method": credit.config.method.name,
@@ -57,13 +57,13 @@ def text_of(credit: CreditAssigner) -> dict[str, Any]:
 
 
 def leaves(credit: CreditAssigner) -> dict[str, Any]:
-    """The decoder and the statistics, by their places."""
+    """The arrays of the decoder and the statistics, by their paths."""
     found, _ = jax.tree_util.tree_flatten_with_path((credit.learner.state, credit.learner.scale))
     return {f"learned{jax.tree_util.keystr(path)}": leaf for path, leaf in found}
 
 
 def arrays_of(credit: CreditAssigner, episodes: bool) -> dict[str, np.ndarray]:
-    """What it has learned and, where `episodes` is true, what it has met."""
+    """The learned state and, if `episodes` is true, the stored steps and episodes."""
     credit.learn()
     arrays = {name: np.asarray(leaf) for name, leaf in leaves(credit).items()}
     store = credit.store
@@ -84,7 +84,7 @@ def arrays_of(credit: CreditAssigner, episodes: bool) -> dict[str, np.ndarray]:
 
 
 def save(credit: CreditAssigner, directory: Path, episodes: bool) -> None:
-    """Write a directory; what was there of an earlier one is replaced, each file as a whole."""
+    """Write a directory. Files of an earlier save are replaced, each as a whole."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -98,7 +98,7 @@ def save(credit: CreditAssigner, directory: Path, episodes: bool) -> None:
 
 
 def load(directory: Path) -> CreditAssigner:
-    """Read such a directory."""
+    """Read a directory that `save` has written."""
     path = directory / TEXT
     try:
         text = read_json(read_text(path))
@@ -118,7 +118,7 @@ def load(directory: Path) -> CreditAssigner:
 def restore(
     credit: CreditAssigner, text: dict[str, Any], arrays: dict[str, np.ndarray], phi: LatentFunction | None
 ) -> None:
-    """Make an assigner what another one was."""
+    """Give an assigner the state of a saved one."""
     observation, action = Layout(**text["observation"]), Layout(**text["action"])
     task = None if text["task"] is None else TaskSpec(**text["task"])
     credit.__init__(
@@ -148,7 +148,7 @@ def restore(
 
 
 def restore_steps(store: Store, arrays: dict[str, np.ndarray]) -> None:
-    """What an assigner had met."""
+    """Restore the stored steps and episodes."""
     store.steps = int(arrays["steps"])
     there = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
     for name in ("features", "length", "mean_reward"):

@@ -1,11 +1,11 @@
-"""Stable-Baselines3, sb3-contrib and SBX: replay buffers and a callback that pay r_hat.
+"""Stable-Baselines3, sb3-contrib and SBX: replay buffers and a callback that replace rewards by r_hat.
 
     from lare.plugs.sb3 import CreditCallback, CreditReplayBuffer
 
     TD3("MlpPolicy", env, replay_buffer_class=CreditReplayBuffer, replay_buffer_kwargs={"credit": credit})   # or SAC, DQN, TQC, ...
     PPO("MlpPolicy", env).learn(1_000_000, callback=CreditCallback(credit))                              # or A2C, TRPO, ...
 
-The environment goes on paying what it pays, so that the returns that are logged and evaluated are the true ones.
+The environment's rewards are unchanged, so that the returns that are logged and evaluated are the true ones.
 """
 
 import re
@@ -37,11 +37,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 OF_HER = frozenset({"n_sampled_goal", "goal_selection_strategy", "copy_info_dict"})
-"""Settings that only `HerReplayBuffer` has."""
+"""Arguments that only `HerReplayBuffer` has."""
 
 
 class CreditReplayBuffer(ReplayBuffer):
-    """A replay buffer that pays what the newest decoder says, at the time when steps are sampled.
+    """A replay buffer that samples steps with r_hat as their rewards, by the newest decoder.
 
     It shows every step to the assigner, with actions in the environment's units and, under VecNormalize, with the observations and
     rewards before they were normalised. r_hat is not divided by VecNormalize's scale, which is that of the environment's rewards.
@@ -56,13 +56,13 @@ class CreditReplayBuffer(ReplayBuffer):
         credit: CreditAssigner | None = None,
         **kwargs: Any,
     ):
-        """An empty buffer. The algorithm makes it; what is not named here is for Stable-Baselines3's buffer.
+        """An empty buffer. The algorithm creates it; other arguments are those of Stable-Baselines3's buffer.
 
         Args:
-            buffer_size: steps, of all environments together.
-            observation_space: of one environment.
-            action_space: of one environment.
-            credit: from `replay_buffer_kwargs`. Its capacity is at least `buffer_size`.
+            buffer_size: number of steps of all environments together.
+            observation_space: the space of one environment.
+            action_space: the space of one environment.
+            credit: the assigner, from `replay_buffer_kwargs`. Its capacity must be at least `buffer_size`.
 
         Raises:
             LareError: there is no assigner; it is too small or has other spaces; or another class of buffer is needed.
@@ -81,14 +81,16 @@ class CreditReplayBuffer(ReplayBuffer):
         self.recorder = Recorder(credit, observation_space, action_space)
         rows = self.buffer_size * self.n_envs
         if credit.store.capacity < rows:
-            raise LareError(f"the assigner keeps {credit.store.capacity} steps and the buffer {rows}: capacity={rows}")
+            raise LareError(
+                f"the assigner keeps {credit.store.capacity} steps and the buffer {rows}: give the assigner capacity={rows}"
+            )
         self.steps = np.full((self.buffer_size, self.n_envs), -1)
         """The assigner's number of each row; -1 where there is no step yet."""
         self.rewards = Rewards(credit, self.steps)  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def credit(self) -> CreditAssigner:
-        """The assigner. After loading it is another object than the one that was given."""
+        """The assigner. After the buffer was loaded, it is not the object that was given."""
         return self.recorder.credit
 
     def add(
@@ -100,7 +102,7 @@ class CreditReplayBuffer(ReplayBuffer):
         done: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """One step of each environment, as Stable-Baselines3 has it: Box actions between -1 and 1, nothing normalised."""
+        """Add one step of each environment, as Stable-Baselines3 gives it: Box actions between -1 and 1, nothing normalised."""
         taken = action.reshape(self.n_envs, *(self.action_space.shape or ()))
         if isinstance(self.action_space, spaces.Box):
             low, high = self.action_space.low, self.action_space.high
@@ -109,7 +111,7 @@ class CreditReplayBuffer(ReplayBuffer):
         super().add(obs, next_obs, action, reward, done, infos)
 
     def sample(self, batch_size: int, env: Any = None) -> Any:
-        """Rows at random, with r_hat. Before that the decoder makes the updates that are due."""
+        """Sample random rows, with r_hat. The decoder's updates that are due are made first."""
         self.credit.fit_owed()
         return super().sample(batch_size, env)
 
@@ -133,29 +135,29 @@ class CreditReplayBuffer(ReplayBuffer):
 
 
 class CreditDictReplayBuffer(CreditReplayBuffer, DictReplayBuffer):
-    """The same for observations of a Dict space."""
+    """`CreditReplayBuffer` for observations of a Dict space."""
 
 
 class CreditNStepReplayBuffer(CreditReplayBuffer, NStepReplayBuffer):
-    """The same for returns of n steps: `replay_buffer_kwargs={"credit": credit, "n_steps": 3, "gamma": 0.99}`.
+    """`CreditReplayBuffer` for returns of n steps: `replay_buffer_kwargs={"credit": credit, "n_steps": 3, "gamma": 0.99}`.
 
-    Every one of the n steps is paid by the newest decoder. An algorithm's own `n_steps` makes no difference to it.
+    Each of the n steps has r_hat by the newest decoder. An algorithm's own argument `n_steps` does not change the buffer.
     """
 
 
 class CreditCallback(BaseCallback):
-    """Pays r_hat to an algorithm that learns from rollouts: `model.learn(steps, callback=CreditCallback(credit))`.
+    """Gives r_hat to an algorithm that learns from rollouts: `model.learn(steps, callback=CreditCallback(credit))`.
 
-    It shows every step to the assigner. Once a rollout is whole, it fits the decoder and pays, before advantages are computed. What
-    the algorithm adds where a time limit cuts an episode, gamma V(s'), stays. Callbacks behind it in a list see rewards of 0.
+    It shows every step to the assigner. When a rollout is complete, it fits the decoder and sets the rewards, before advantages are
+    computed. The gamma V(s') that the algorithm adds at a time limit is kept. Later callbacks in a list see rewards of 0.
     """
 
     def __init__(self, credit: CreditAssigner, updates: int = 500, verbose: int = 0):
         """A callback for `learn`.
 
         Args:
-            credit: the assigner. Its capacity is at least the steps of a rollout, of all environments.
-            updates: of a decoder that descends a gradient, after each rollout. A decoder in closed form is fitted once.
+            credit: the assigner. Its capacity must be at least the number of steps of a rollout, over all environments.
+            updates: gradient updates of the decoder after each rollout. A closed-form decoder is fitted once.
             verbose: as in every callback of Stable-Baselines3.
         """
         super().__init__(verbose)
@@ -175,7 +177,7 @@ class CreditCallback(BaseCallback):
         rows = buffer.buffer_size * buffer.n_envs
         if self.credit.store.capacity < rows:
             raise LareError(
-                f"the assigner keeps {self.credit.store.capacity} steps and a rollout has {rows}: capacity={rows}"
+                f"the assigner keeps {self.credit.store.capacity} steps and a rollout has {rows}: give the assigner capacity={rows}"
             )
         self.recorder = Recorder(self.credit, self.model.observation_space, self.model.action_space)
         self.steps = []
@@ -188,7 +190,7 @@ class CreditCallback(BaseCallback):
         vars(self.model.rollout_buffer).pop("compute_returns_and_advantage", None)  # pyright: ignore[reportAttributeAccessIssue]
 
     def shown(self, observations: Any) -> Any:
-        """Observations as the environment has shown them last."""
+        """The environment's last observations, before any normalisation."""
         normal = self.model.get_vec_normalize_env()
         return deepcopy(observations) if normal is None else normal.get_original_obs()
 
@@ -206,15 +208,15 @@ class CreditCallback(BaseCallback):
                 ((after[key], last[key]) for key in after) if isinstance(after, dict) else ((after, last),)
             ):
                 part[place] = end
-        taken = found.get("clipped_actions", found["actions"])  # MaskablePPO has nothing to clip
+        taken = found.get("clipped_actions", found["actions"])  # MaskablePPO does not clip actions
         self.steps.append(self.recorder.add(id(self.model), self.before, taken, after, paid, found["dones"]))
         self.before = shown
-        # The algorithm puts this very array into its buffer, and adds gamma V(s') to it where a time limit has cut.
+        # The algorithm puts this array itself into its buffer, and adds gamma V(s') to it at time limits.
         found["rewards"][:] = 0
         return True
 
     def pay(self, last_values: Any, dones: np.ndarray) -> None:
-        """What `rollout_buffer.compute_returns_and_advantage` is, as long as the model learns."""
+        """Takes the place of `rollout_buffer.compute_returns_and_advantage` while the model learns."""
         buffer: Any = self.model.rollout_buffer  # pyright: ignore[reportAttributeAccessIssue]
         steps, self.steps = self.steps, []
         if len(steps) != buffer.buffer_size:
@@ -230,7 +232,7 @@ class CreditCallback(BaseCallback):
 
 
 class Rewards:
-    """Where Stable-Baselines3 looks for the rewards of a buffer: those of any rows, by the newest decoder. None are stored."""
+    """Takes the place of a buffer's array of rewards. Reading rows computes r_hat by the newest decoder; nothing is stored."""
 
     def __init__(self, credit: CreditAssigner, steps: Int[np.ndarray, "rows environments"]):
         self.credit, self.steps = credit, steps
@@ -239,17 +241,17 @@ class Rewards:
         return self.credit.rewards_at(self.steps[place])
 
     def __setitem__(self, place: Any, value: Any) -> None:
-        """What the environment pays is forgotten: the assigner knows it."""
+        """Ignore the environment's rewards, because the assigner has them."""
 
 
 class Recorder:
     """Shows the steps of a model's environments to an assigner."""
 
     def __init__(self, credit: CreditAssigner, observation_space: spaces.Space, action_space: spaces.Space):
-        """Of any spaces whose rows are as long as the assigner's.
+        """A recorder for any spaces whose rows are as long as the assigner's.
 
         Raises:
-            LareError: they are not.
+            LareError: the rows have another length.
         """
         check_assigner(credit)
         self.credit = credit
@@ -267,9 +269,9 @@ class Recorder:
     def add(
         self, owner: int, before: Any, action: Any, after: Any, reward: Any, done: Any
     ) -> Int[np.ndarray, " environments"]:
-        """One step of each environment; its number."""
+        """Show one step of each environment; returns their numbers."""
         config = self.credit.config
-        if config.observation != self.observation:  # a task's are rows of numbers, whatever the environment's are
+        if config.observation != self.observation:  # spaces from a task are rows of numbers
             before, after = self.observation.rows(before, "before"), self.observation.rows(after, "after")
         if config.action != self.action:
             action = self.action.rows(action, "action")
@@ -277,6 +279,6 @@ class Recorder:
         return self.credit.add(before, action, after, reward, done, np.zeros_like(done), lanes=lanes)
 
     def drop(self, owner: int, environments: int) -> None:
-        """Every environment was reset in the middle of its episode."""
+        """Give up the running episode of every environment, which was reset in the middle."""
         for place in range(environments):
             self.credit.drop((owner, place))

@@ -1,4 +1,4 @@
-"""Whether an environment and an assigner speak of the same observations and actions, and how the one's become the other's."""
+"""Checks that an environment and an assigner have the same observations and actions, and converts between their forms."""
 
 from typing import Any
 
@@ -10,16 +10,16 @@ from lare.plugs.layout import layout_of
 
 
 def check_assigner(credit: object) -> None:
-    """Raise `LareError` where something else was given for an assigner."""
+    """Raise `LareError` if `credit` is not an assigner."""
     if not isinstance(credit, CreditAssigner):
         raise LareError(f"credit must be a CreditAssigner, and is {shortened(credit)}")
 
 
 class Rows:
-    """Observations and actions of an environment, as its assigner takes them.
+    """Observations and actions of an environment, in the form that its assigner takes.
 
-    They are handed on as they are where both have the same spaces. Where the assigner knows only how many numbers there are, from
-    a task file for instance, they become rows of numbers.
+    If both have the same spaces, values are passed on unchanged. If the assigner knows only how many numbers there are, for
+    instance from a task file, values become rows of numbers.
 
     Raises:
         LareError: the assigner was made for other sizes.

@@ -1,8 +1,8 @@
-"""What a `CreditAssigner` has met: features of steps by their number, and which episodes they make up. NumPy, on the host.
+"""The memory of a `CreditAssigner`: features of steps by number, and the episodes of these steps. NumPy, on the host.
 
-Steps of many lanes come in between each other. A step has a number, from 0 for ever, and stands in the ring at its number
-modulo the capacity; an episode is the numbers of its steps. When the ring is full, the oldest steps go, and the episodes that
-they are of.
+Steps of many lanes arrive interleaved. The numbers of steps count up from 0 without end, and a step is stored in a ring buffer at
+its number modulo the capacity. An episode is stored as the numbers of its steps. When the ring buffer is full, new steps overwrite
+the oldest ones, whose episodes are removed.
 """
 
 import heapq
@@ -18,27 +18,27 @@ from lare.errors import LareError
 
 
 class Episode(NamedTuple):
-    """One that has ended."""
+    """An episode that has ended."""
 
     steps: Int[np.ndarray, " steps"]
-    """Their numbers."""
+    """The numbers of its steps."""
     score: float
-    """R, what the episode returned."""
+    """Its return R."""
 
 
 @dataclass
 class Running:
-    """One that goes on."""
+    """A running episode."""
 
     steps: list[int] = field(default_factory=list)
     paid: float = 0.0
     """The sum of its rewards so far."""
     last: Float[np.ndarray, "*agents observation"] | None = None
-    """What its last step led to."""
+    """The observation after its last step."""
 
     @property
     def newest(self) -> int:
-        """The number of its last step; of one that has none, a number that is never reached."""
+        """The number of its last step; before the first step, a number that is never reached."""
         return self.steps[-1] if self.steps else sys.maxsize
 
 
@@ -48,33 +48,33 @@ class Store:
     def __init__(self, capacity: int, row: tuple[int, ...]):
         self.capacity = capacity
         self.features = np.zeros((capacity, *row), np.float32)
-        """What the decoder sees of a step: [capacity *agents features]."""
+        """The decoder's inputs for each step: [capacity *agents features]."""
         self.alive: Bool[np.ndarray, "capacity agents"] | None = None
-        """Which agents acted; all of them where None."""
+        """Which agents acted. None: all of them."""
         self.length = np.zeros(capacity, np.int32)
-        """Steps of each step's episode; 0 as long as it has not ended."""
+        """The length of each step's episode; 0 before it has ended."""
         self.mean_reward = np.zeros(capacity, np.float32)
-        """R/T of its episode."""
+        """R/T of each step's episode."""
         self.steps = 0
-        """That were ever added."""
+        """The number of steps that were ever added."""
         self.episodes: dict[int, Episode] = {}
-        """Those of which all steps are there, by their number."""
+        """The episodes of which all steps are stored, by number."""
         self.ended = 0
-        """Episodes that have ever ended."""
+        """The number of episodes that have ever ended."""
         self.ended_steps = 0
-        """Their steps."""
+        """The number of steps of these episodes."""
         self.oldest: list[tuple[int, int]] = []
         """A heap of the stored episodes: first step, and number."""
         self.running: dict[Hashable, Running] = {}
-        """By lane; those that have stood still the longest first."""
+        """The running episodes by lane. The lane whose last step is the oldest comes first."""
         self.dropped = 0
         """Episodes that were given up."""
 
     def add(self, count: int) -> Int[np.ndarray, " count"]:
-        """Numbers for new steps. The oldest episodes go if their places are needed, and lanes that have stood still for so long.
+        """Numbers for new steps. Episodes and lanes whose steps are all too old to be stored are removed.
 
         Raises:
-            LareError: they are more than can be stored.
+            LareError: there are more steps than can be stored.
         """
         if count > self.capacity:
             raise LareError(
@@ -90,15 +90,15 @@ class Store:
         return numbers
 
     def end(self, lane: Hashable, score: float) -> Episode:
-        """The running episode of a lane ends, and returned so much.
+        """End the running episode of a lane, with `score` as its return.
 
         Raises:
-            LareError: it is longer than all that can be stored.
+            LareError: its first steps are not stored any more.
         """
         return self.put_new(np.array(self.running.pop(lane).steps, np.int64), score)
 
     def put_new(self, steps: Int[np.ndarray, " steps"], score: float) -> Episode:
-        """Keep an episode that has just ended. Raises `LareError` like `end`."""
+        """Store an episode that has just ended. Raises `LareError` like `end`."""
         episode = Episode(steps, score)
         if self.steps - steps[0] > self.capacity:
             raise LareError(
@@ -114,25 +114,25 @@ class Store:
         return episode
 
     def put(self, number: int, episode: Episode) -> None:
-        """Keep an episode under its number."""
+        """Store an episode under its number."""
         self.episodes[number] = episode
         heapq.heappush(self.oldest, (int(episode.steps[0]), number))
 
     def running_of(self, lane: Hashable, before: Float[np.ndarray, "*agents observation"]) -> Running:
-        """The running episode of a lane, which the next step sets out from `before`.
+        """The running episode of a lane, for a next step that begins at the observation `before`.
 
-        Where it set out from elsewhere, the environment was reset in between: the episode that went on is given up, and a new
-        one begins.
+        If its last step led to a different observation, the environment was reset in between: the running episode is given up, and
+        a new one begins.
         """
         run = self.running.get(lane)
         if run is not None and run.last is not None and not np.array_equal(run.last, before):
             self.drop(lane)
         run = self.running.pop(lane, None) or Running()
-        self.running[lane] = run  # behind all others
+        self.running[lane] = run  # now the last of all lanes
         return run
 
     def drop(self, lane: Hashable) -> None:
-        """The running episode of a lane will not end. Its steps stay, and are never learned from."""
+        """Give up the running episode of a lane. Its steps stay stored, and are never learned from."""
         run = self.running.pop(lane, None)
         self.dropped += bool(run and run.steps)
 
@@ -140,7 +140,7 @@ class Store:
         """The places of stored steps.
 
         Raises:
-            LareError: one of them is not there, or not there any more.
+            LareError: a step was never stored, or is not stored any more.
         """
         if steps.size and (steps.max() >= self.steps or steps.min() < max(0, self.steps - self.capacity)):
             wrong = steps.max() if steps.max() >= self.steps else steps.min()
@@ -149,10 +149,10 @@ class Store:
         return steps % self.capacity
 
     def lengths(self, rows: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
-        """T of each step's episode; of one that has not ended, the mean of those that have."""
+        """T of each step's episode; if that has not ended, the mean length of the episodes that have."""
         return np.where(self.length[rows] > 0, self.length[rows], self.usual_length)
 
     @property
     def usual_length(self) -> int:
-        """Steps of an episode, on average."""
+        """The mean length of the episodes that have ended."""
         return max(1, self.ended_steps // max(1, self.ended))

@@ -1,10 +1,10 @@
-"""A replay buffer of TorchRL that pays what a `CreditAssigner` says.
+"""A transform for TorchRL's replay buffers, which samples steps with r_hat of a `CreditAssigner` as their rewards.
 
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000_000), batch_size=256, transform=CreditTransform(credit))
     buffer.extend(collected)   # shows the steps to the assigner
     buffer.sample()            # ("next", "reward") is r_hat, by the newest decoder
 
-The environment's rewards stay in what was collected, and never enter the buffer.
+The environment's rewards stay in the collected data, and are not stored in the buffer.
 """
 
 from typing import Any
@@ -24,28 +24,28 @@ except ModuleNotFoundError as error:
     raise needs_extra("lare.plugs.torchrl", "torchrl") from error
 
 CREDIT_STEP = "credit_step"
-"""Where the buffer keeps the numbers of steps."""
+"""The buffer's key for the numbers of steps."""
 REWARD = ("next", "reward")
 TRAJECTORY = ("collector", "traj_ids")
-"""Where TorchRL's collectors say which trajectory a step is of."""
+"""The key under which TorchRL's collectors store the trajectory of a step."""
 
 
 class CreditTransform(Transform):
-    """Shows steps to an assigner as they go into a replay buffer, and pays r_hat for those that are sampled.
+    """Shows steps to an assigner as they go into a replay buffer, and sets the rewards of sampled steps to r_hat.
 
-    The buffer keeps the number of each step ("credit_step") and a reward of 0: the environment's stays nowhere. An episode ends
-    where ("next", "done"), "terminated" or "truncated" says so. Steps belong to the trajectory that a collector names. Without one,
-    the last dimension of the batch is time, and what follows in the next batch goes on where this one ended.
+    The buffer stores the number of each step ("credit_step") and a reward of 0 instead of the environment's. An episode ends
+    where ("next", "done"), "terminated" or "truncated" is true. A collector names the trajectory of each step. Without a collector,
+    the last dimension of the batch is time, and the next batch continues the episodes of this one.
 
-    It may be called from several threads. Every sample fits the decoder as far as the steps so far ask for.
+    It may be called from several threads. Before every sample, the decoder's updates that are due are made.
     """
 
     def __init__(self, credit: CreditAssigner, observation: Any = None, action: Any = "action"):
         """A transform for one replay buffer.
 
         Args:
-            credit: the assigner. It must keep as many steps as the buffer at least (`capacity`).
-            observation: the key of the observation: "observation", or one key for each part of a Dict space, unless given.
+            credit: the assigner. It must keep at least as many steps as the buffer (`capacity`).
+            observation: the key of the observation. The default is "observation", or one key for each part of a Dict space.
             action: the key of the action.
 
         Raises:
@@ -65,7 +65,7 @@ class CreditTransform(Transform):
         """A key that no other transform of the assigner has."""
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Show new steps, and keep their numbers in the place of their rewards."""
+        """Show new steps to the assigner, and store their numbers instead of their rewards."""
         if REWARD not in tensordict.keys(include_nested=True):
             raise LareError(
                 'CreditTransform belongs to a replay buffer of whole steps, with ("next", "reward"): '
@@ -94,7 +94,7 @@ class CreditTransform(Transform):
         return [(self.lanes, -1 - place // time) for place in range(tensordict.numel())]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Pay steps that were sampled."""
+        """Set the rewards of sampled steps to r_hat."""
         steps, reward = tensordict.get(CREDIT_STEP, None), tensordict.get(REWARD)
         if steps is None:
             raise LareError(f"the sample has no {CREDIT_STEP!r}: it went into the buffer without this transform")
@@ -105,20 +105,20 @@ class CreditTransform(Transform):
 
 
 def flat(tensordict: TensorDictBase, key: Any) -> np.ndarray:
-    """The values under a key, with one axis of steps in the place of the batch's."""
+    """The values under a key, with the axes of the batch merged into one axis of steps."""
     values = tensordict.get(key).detach().cpu().numpy()
     return values.reshape(-1, *values.shape[tensordict.batch_dims :])
 
 
 def flags(tensordict: TensorDictBase, key: str) -> np.ndarray:
-    """One for each step; false where nothing is said."""
+    """The flags under a key, one for each step; false if there is no such key."""
     if key not in tensordict.keys():  # noqa: SIM118
         return np.zeros(tensordict.numel(), bool)
     return flat(tensordict, key).reshape(-1)
 
 
 def batch_of(tensordict: TensorDictBase, key: Any, layout: Layout) -> Any:
-    """Observations or actions as the assigner takes them. TorchRL has choices as rows of flags or as numbers."""
+    """Observations or actions in the form that the assigner takes. In TorchRL, choices are one-hot rows of flags, or numbers."""
     if isinstance(key, dict):
         parts = zip(layout.names, layout.parts, strict=True)
         return {name: batch_of(tensordict, key[name], part) for name, part in parts}

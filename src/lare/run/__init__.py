@@ -1,1 +1,1 @@
-"""A run: its settings, and what it leaves on the disk."""
+"""A run: its settings, and its files on the disk."""

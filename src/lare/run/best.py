@@ -2,7 +2,8 @@
 
     checkpoint/best.npz     the arrays that are needed to act; score and step of each seed
 
-The best of many evaluations looks better than it is: `lare evaluate --best` plays it from starts that none of them has used.
+The best of many evaluations overestimates its policy. So `lare evaluate --best` plays it from initial states that none of them
+has used.
 """
 
 from collections.abc import Sequence
@@ -21,23 +22,23 @@ FILE = "best.npz"
 
 
 class Best(NamedTuple):
-    """Of each seed."""
+    """The best evaluation of each seed."""
 
     score: Float[np.ndarray, " seeds"]
     """The mean return of its best evaluation; -inf before the first."""
     step: Int[np.ndarray, " seeds"]
     """The environment step of that evaluation."""
     actor: Any
-    """The arrays that are needed to act as it did. None before the first evaluation."""
+    """The arrays that are needed to act as in that evaluation. None before the first one."""
 
 
 def none_yet(seeds: int) -> Best:
-    """Before the first evaluation."""
+    """The state before the first evaluation."""
     return Best(np.full(seeds, -np.inf), np.zeros(seeds, np.int64), None)
 
 
 def better_of(best: Best, score: Float[np.ndarray, " seeds"], step: int, actor: Any) -> Best:
-    """Each seed's newest policy where its evaluation beats all earlier ones, else the policy as it was. NaN beats nothing."""
+    """For each seed, the newest policy if its evaluation is better than all earlier ones, else the old one. NaN is never better."""
     better = np.asarray(score) > best.score
     if best.actor is None:
         kept = jax.tree.map(np.asarray, actor)
@@ -51,7 +52,7 @@ def better_of(best: Best, score: Float[np.ndarray, " seeds"], step: int, actor: 
 
 
 def save(directory: Path, best: Best) -> None:
-    """Write it into a checkpoint's directory. Raises `LareError` where it cannot be written."""
+    """Write it into a checkpoint's directory. Raises `LareError` if it cannot be written."""
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(best).items()}
     directory.mkdir(exist_ok=True)
     write_atomically(directory / FILE, lambda file: np.savez(file, allow_pickle=False, **arrays))
@@ -61,12 +62,12 @@ def load(directory: Path, shapes: Any, seeds: Sequence[int]) -> Best:
     """Read it from a checkpoint's directory.
 
     Args:
-        directory: of the checkpoint.
+        directory: the directory of the checkpoint.
         shapes: an actor, whose leaves may be only shapes.
-        seeds: of the run.
+        seeds: the seeds of the run.
 
     Raises:
-        LareError: there is none, or it is of another structure.
+        LareError: there is no such file, or it has another structure.
     """
     path = directory / FILE
     if not path.is_file():

@@ -1,11 +1,11 @@
-"""A checkpoint that a kill at any moment leaves whole, at a cost that does not grow with the replay.
+"""Checkpoints that stay valid if the process is killed at any moment, at a cost that does not grow with the replay.
 
     checkpoint/
-      rows-0.npz, rows-1.npz, ...   the replay's rows, as they came: each is written once
-      state.npz                     everything else, and which of the row files count
+      rows-0.npz, rows-1.npz, ...   the replay's rows, in the order in which they came; each is written once
+      state.npz                     everything else, and the list of the row files in use
 
-A row file is only ever added; `state.npz` is written beside the old one and renamed onto it. Whatever the moment, the
-`state.npz` that is there speaks of row files that are whole. No pickle anywhere.
+Row files are only added. A new `state.npz` is written beside the old one, and then replaces it. So `state.npz` always lists
+complete row files. No pickle anywhere.
 """
 
 import contextlib
@@ -28,10 +28,10 @@ from lare.foreign import read_json
 STATE = "state.npz"
 
 REPLAY = ".replay."
-"""The part of the state that holds what was met."""
+"""The part of the state that holds the replay."""
 
 BY_ROW = f"{REPLAY}columns"
-"""The part of it that is saved by row."""
+"""The part of the replay that is saved by row."""
 
 DAMAGED = (
     *(
@@ -46,17 +46,17 @@ DAMAGED = (
     ),
     *(TypeError, IndexError, AttributeError, OverflowError, MemoryError, SyntaxError),
 )
-"""What reading a file may raise that is not whole, or holds something else than it should."""
+"""Errors that may be raised by reading a file that is damaged, or holds something else."""
 
 LARGEST_COUNT = 2**53
-"""Of what a checkpoint counts."""
+"""The largest count in a checkpoint."""
 
 
 @runtime_checkable
 class WithReplay(Protocol):
     """Any training state with a replay: `replay.columns` are arrays of [seeds envs rows ...], which are saved by row.
 
-    `replay.next_row` is the number of rows ever written; they stand at their number modulo the capacity.
+    `replay.next_row` is the number of rows ever written. Each row is stored at its number modulo the capacity.
     """
 
     @property
@@ -71,7 +71,7 @@ Filled = TypeVar("Filled")
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """The arrays of a file, which takes no more room than its size says. NumPy would leave one that is not whole open."""
+    """The arrays of a file, which must not be compressed. A damaged file is closed too, unlike by `numpy.load` alone."""
     with path.open("rb") as file, np.load(file, allow_pickle=False) as saved:
         if not isinstance(saved, np.lib.npyio.NpzFile):
             raise ValueError("it holds a single array")
@@ -80,7 +80,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def check_stored(file: Any) -> None:
-    """Raise `ValueError` where an archive holds something packed: a few bytes unpack to gigabytes."""
+    """Raise `ValueError` if an archive has a packed entry, because a few bytes can unpack to gigabytes."""
     with zipfile.ZipFile(file) as archive:
         for entry in archive.infolist():
             if entry.compress_type != zipfile.ZIP_STORED:
@@ -88,16 +88,16 @@ def check_stored(file: Any) -> None:
 
 
 def counted(value: Any) -> Any:
-    """Numbers that count something, in lists as they come. Raises `ValueError` where one is none."""
+    """A count, or nested lists of counts, unchanged. Raises `ValueError` for anything else."""
     if isinstance(value, list):
         return [counted(one) for one in value]
     if type(value) is not int or not 0 <= value <= LARGEST_COUNT:
-        raise ValueError(f"{shortened(value)} counts nothing")
+        raise ValueError(f"{shortened(value)} is not a count")
     return value
 
 
 def read_host(text: Any) -> dict[str, Any]:
-    """What was to be remembered beside the arrays. Raises `ValueError` where it cannot be that."""
+    """The other data of a checkpoint, from JSON. Raises `ValueError` if they are not valid."""
     host = read_json(str(text))
     if not isinstance(host, dict):
         raise ValueError("host is no object")
@@ -109,12 +109,12 @@ def read_host(text: Any) -> dict[str, Any]:
 
 
 def read_segments(text: Any) -> list[dict[str, Any]]:
-    """Which row files count. Raises `ValueError` as `read_host`."""
+    """The list of the row files in use. Raises `ValueError` like `read_host`."""
     return [{name: counted(one[name]) for name in ("number", "start", "count")} for one in read_json(str(text))]
 
 
 def named_leaves(learner: Any) -> dict[str, Any]:
-    """Every array of the state by its place, but for those that are saved by row."""
+    """Every array of the state by its path, except the arrays that are saved by row."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(learner)
     named = {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
     return {name: leaf for name, leaf in named.items() if not name.startswith(BY_ROW)}
@@ -136,9 +136,9 @@ def save(
     """Write a checkpoint.
 
     Args:
-        host: what else is to be remembered, as JSON.
-        arrays: the same, as arrays.
-        anew: whether rows that were saved before have changed: all of them are saved again.
+        host: other data to save, as JSON.
+        arrays: other data to save, as arrays.
+        anew: whether rows that were saved before have changed, so that all rows are saved again.
     """
     directory.mkdir(exist_ok=True)
     for left in directory.glob("*.new"):  # by a process that was killed while it wrote
@@ -152,8 +152,8 @@ def save(
     number = segments[-1]["number"] + 1 if segments else 0
     if anew:
         start, segments, old = np.maximum(end - rows + 1, 0), [], segments
-    # The frontier row is saved again: it held only the newest observation when it was saved before. And where an
-    # episode has just been dropped, the end has come back.
+    # The last saved row is saved again, because it held only the newest observation then. And if an episode has just
+    # been dropped, `end` is smaller than before.
     start = np.minimum(start, end)
     count = end - start + 1
     width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations
@@ -166,7 +166,7 @@ def save(
     state |= {"host": np.array(json.dumps(host)), "segments": np.array(json.dumps(alive))}
     write_atomically(directory / STATE, lambda file: np.savez(file, allow_pickle=False, **state))
     for one in old + segments:
-        if one not in alive:  # which are not always the newest: a segment from before a drop may reach further
+        if one not in alive:  # not always the oldest ones: a segment from before a drop may reach further
             (directory / f"rows-{one['number']}.npz").unlink(missing_ok=True)
 
 
@@ -178,10 +178,10 @@ def capacity(learner: WithReplay) -> int:
 def load(directory: Path, template: Some) -> tuple[Some, dict[str, Any], dict[str, np.ndarray]]:
     """Read a checkpoint into a learner of the structure of `template` (whose leaves may be only shapes).
 
-    Returns it, and `host` and `arrays` as saved.
+    Returns the learner, and `host` and `arrays` as saved.
 
     Raises:
-        LareError: there is none, or it is of another structure.
+        LareError: there is no checkpoint, or it has another structure.
     """
     path = directory / STATE
     if not path.is_file():
@@ -197,7 +197,7 @@ def load(directory: Path, template: Some) -> tuple[Some, dict[str, Any], dict[st
 
 
 def saved_host(directory: Path) -> dict[str, Any] | None:
-    """The `host` of the last checkpoint; None where there is none that can be read."""
+    """The `host` of the last checkpoint; None if there is none that can be read."""
     try:
         with opened(directory / STATE) as saved:
             return read_host(saved["host"])
@@ -223,15 +223,15 @@ def fill(template: Filled, state: Mapping[str, np.ndarray]) -> Filled:
             raise ValueError(f"{name} has shape {array.shape}, not {leaf.shape}")
         if array.dtype != leaf.dtype:
             raise ValueError(f"{name} holds {array.dtype}, not {leaf.dtype}")
-        filled.append(array if isinstance(leaf, np.ndarray) else jnp.asarray(array))
+        filled.append(array if isinstance(leaf, np.ndarray) else jax.device_put(array))
     return jax.tree.unflatten(structure, filled)
 
 
 def grown(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """An array of a replay that was smaller, with zeros behind; any other as it is.
+    """An array of a smaller replay, padded with zeros at the end; any other array unchanged.
 
-    A run that is to go on for longer may have a larger replay. The smaller one had room for every step, so that nothing in it
-    stands anywhere else than it would in the larger.
+    A run that was extended may have a larger replay. The smaller one had room for every step, so that its rows have the same
+    places in the larger one.
     """
     seeds_envs, rows, rest = array.shape[:2], array.shape[2:3], array.shape[3:]
     if not rows or (seeds_envs, rest) != (shape[:2], shape[3:]) or rows > shape[2:3]:
@@ -249,9 +249,9 @@ def with_rows(learner: Some, directory: Path, segments: list[dict[str, Any]]) ->
                 values = saved[name]
             counts = np.asarray(segment["count"])
             for place in np.ndindex(counts.shape):
-                # Of a stretch longer than the buffer only the end is left, as it was when it was written.
+                # Of a segment longer than the buffer only the end is left, as in the buffer itself.
                 first, count = int(np.asarray(segment["start"])[place]), int(counts[place])
                 where = np.arange(first, first + count)[-rows:]
                 buffer[(*place, where % rows)] = values[place][:count][-rows:]
-        columns[name] = jnp.asarray(buffer)
+        columns[name] = jax.device_put(buffer)
     return learner._replace(replay=learner.replay._replace(columns=columns))

@@ -13,16 +13,16 @@ from lare.tasks.table import env_spec
 
 
 def decide(settings: Settings, task: TaskSpec) -> ResolvedSettings:
-    """Fill in what was left open, by the task, and check the whole.
+    """Fill in the settings that are None, by the task, and check all settings.
 
     Raises:
-        LareError: method, algorithm and task do not go together, or the steps are no whole number of iterations.
+        LareError: method, algorithm and task do not go together, or the steps are not a multiple of an iteration's.
     """
     if task.team is not None:
         raise LareError(f"{task.name} is one team of {task.environment}: train the task that has both")
     env = env_spec(task)
     resolved = resolve(settings, env)
-    if resolved.judges == task.judges:  # what the task says anyway makes no other run
+    if resolved.judges == task.judges:  # the task's own value makes no difference
         resolved = resolved.model_copy(update={"judges": None})
     if resolved.credit.score == "auto" and task.score is not None:
         credit = resolved.credit.model_copy(update={"score": task.score})
@@ -34,7 +34,7 @@ def decide(settings: Settings, task: TaskSpec) -> ResolvedSettings:
 
 
 def check_algorithm(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> None:
-    """Raise `LareError` where an algorithm cannot train on a task."""
+    """Raise `LareError` if an algorithm cannot train on a task."""
     row = ALGORITHMS[resolved.algorithm]
     many = env.agents > 1
     if not (row.many_agents if many else row.one_agent):
@@ -45,13 +45,13 @@ def check_algorithm(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) ->
     if len(env.teams) > 1 and not row.many_teams:
         raise LareError(f"{row.name} trains one team, and {task.name} has {len(env.teams)}: ippo trains several")
     if env.discrete and not row.discrete:
-        raise LareError(f"{row.name} acts by numbers within bounds, and {task.name} offers a choice: ppo can choose")
+        raise LareError(f"{row.name} needs continuous actions, and those of {task.name} are discrete: use ppo")
     if not env.discrete and not row.continuous:
-        raise LareError(f"{row.name} chooses among actions, and those of {task.name} are numbers within bounds")
+        raise LareError(f"{row.name} needs discrete actions, and those of {task.name} are continuous")
 
 
 def check_method(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> None:
-    """Raise `LareError` where a method cannot assign credit in a task."""
+    """Raise `LareError` if a method cannot assign credit in a task."""
     method, many = find_method(resolved.method), env.agents > 1
     if method.reward is Reward.DESIGNED and resolved.judged_by(task) == "both":
         raise LareError(f"{method.name} is one reward a step: it judges the observation before or after, not both")
@@ -67,18 +67,18 @@ def check_method(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> No
         raise LareError(f"{method.name} assigns credit among agents, and {task.name} is judged from the global state")
     if method.whole_episodes and not (env.fixed_length and resolved.rollout_steps % env.max_steps == 0):
         raise LareError(
-            f"{method.name} looks at whole episodes of one length: those of {task.name} must have a fixed one, and rollout_steps "
-            "be a multiple of it"
+            f"{method.name} looks at whole episodes of one length: episodes of {task.name} must have a fixed length, and "
+            "rollout_steps must be a multiple of it"
         )
     check_credit(resolved, method, task, env)
     if resolved.reflect_every is not None and method.encoder is not Encoder.LATENT_AND_NEXT:
         raise LareError(
-            f"reflect_every is for lare-bayes, whose decoder is right at once when phi changes; the method is {method.name}"
+            f"reflect_every is for lare-bayes, whose decoder is fitted at once when phi changes; the method is {method.name}"
         )
 
 
 def check_credit(resolved: ResolvedSettings, method: Method, task: TaskSpec, env: EnvSpec) -> None:
-    """Raise `LareError` where a decoder cannot be what is asked for."""
+    """Raise `LareError` if the settings of a decoder are impossible for the task."""
     credit = resolved.credit
     if "drawn_steps" in method.settings and not env.fixed_length and credit.steps < credit.drawn_steps:
         raise LareError(
@@ -96,11 +96,12 @@ def check_credit(resolved: ResolvedSettings, method: Method, task: TaskSpec, env
 
 
 def check_room(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> None:
-    """Raise `LareError` where the replay could not hold what an iteration stores, or a run is too short."""
+    """Raise `LareError` if the replay could not hold the steps of an iteration, or if a run is too short."""
     longest = env.max_steps
     if 2 * resolved.steps < longest:
         raise LareError(
-            f"steps = {resolved.steps} are too few: an episode of {task.name} takes up to {longest}, and a run at least half of one"
+            f"steps = {resolved.steps} are too few: an episode of {task.name} takes up to {longest}, "
+            "and a run at least half of that"
         )
     needed = room(resolved.rollout_steps, longest) * resolved.environments
     if resolved.rereads and resolved.capacity < needed:

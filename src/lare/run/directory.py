@@ -1,11 +1,11 @@
-"""The run directory: what a run leaves on the disk, and reading it again.
+"""The run directory: the files of a run, and functions that read them.
 
-config.json          every setting, versions and commit, the spec's and the function's hash
-latent_function.py   phi, and .json: replies, checks; where teams learn, latent_function_TEAM.py; latent_function-STEP.py is one
-                     that took its place at that step
-metrics.jsonl        one JSON object a line, for each seed and evaluation
+config.json          every setting, versions and commit, the hashes of the spec and of the function
+latent_function.py   phi, with its replies and checks in .json. With several teams, one latent_function_TEAM.py for each.
+                     latent_function-STEP.py replaced it at that step
+metrics.jsonl        one JSON object in each line, for each seed and evaluation
 checkpoint/          see checkpoint.py
-failed_batch.npz     what the latent function was given, if it failed
+failed_batch.npz     the input of the latent function, if it failed
 """
 
 import contextlib
@@ -27,7 +27,9 @@ from jaxtyping import Float
 from lare.errors import Checked, LareError, shortened
 from lare.files import write_atomically
 from lare.foreign import read_json, read_text
-from lare.latent.function import LatentFunction, LatentRewardError, load, per_role, read_source
+from lare.latent.evaluator import LatentRewardError
+from lare.latent.function import LatentFunction, per_role
+from lare.latent.saved import load, read_source
 from lare.run.checkpoint import STATE, saved_host
 from lare.run.formats import FORMAT, migrated
 from lare.run.settings import ResolvedSettings
@@ -44,10 +46,10 @@ VERSIONS = ("jax", "optax", "gymnasium", "mujoco", "numpy")
 
 
 LARGEST_CONFIG, LARGEST_METRICS = 8 << 20, 512 << 20
-"""Bytes of these files."""
+"""The largest sizes of these files in bytes."""
 
 LARGEST_STEP = 2**53
-"""Of the whole numbers in metrics.jsonl; beyond it a float is another number."""
+"""The largest whole number in metrics.jsonl. A larger one may change when it becomes a float."""
 
 
 class Config(Checked):
@@ -62,13 +64,13 @@ class Config(Checked):
     longest_episode: int
     """The environment's time limit."""
     function_sha256: tuple[str, ...]
-    """Of the latent functions in use: one for each team, none for a method that needs none."""
+    """Hashes of the latent functions in use: one for each team; empty for a method that needs none."""
     isolation: str | None
-    """What stands around the latent function while training."""
+    """How the latent function is isolated during training."""
     versions: dict[str, str]
     machine: str
     ended_at: tuple[int, ...] = ()
-    """The steps that it was to make before it was extended, each time that it was."""
+    """The number of steps of the run before each time that it was extended."""
 
 
 def describe(task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction]) -> Config:
@@ -88,12 +90,12 @@ def describe(task: TaskSpec, settings: ResolvedSettings, functions: Sequence[Lat
 
 
 def isolation(task: TaskSpec, function: LatentFunction) -> str:
-    """What stands around a task's latent functions on this machine."""
+    """How a task's latent functions are isolated on this machine."""
     return function.evaluator(task.observation_size, task.action_size).isolation
 
 
 def function_file(task: TaskSpec, role: TaskSpec, since: int = 0) -> str:
-    """Where the latent function of a role is kept that is in use since some step."""
+    """The file of the latent function of a role that has been in use since the step `since`."""
     of_role = "" if role is task else f"_{role.team}"
     return f"latent_function{of_role}-{since}.py" if since else f"latent_function{of_role}.py"
 
@@ -109,13 +111,13 @@ class Run:
     directory: Path
     config: Config
     functions: tuple[LatentFunction, ...]
-    """One for each role of the task; none for a method that needs none."""
+    """One for each role of the task; empty for a method that needs none."""
     since: int = 0
-    """The step from which they have been in use."""
+    """The step from which the functions have been in use."""
 
     @property
     def function(self) -> LatentFunction | None:
-        """The only one, or the first."""
+        """The only function, or the first; None if there is none."""
         return self.functions[0] if self.functions else None
 
     @property
@@ -128,11 +130,11 @@ class Run:
 
     @property
     def judges(self) -> Judges:
-        """Which observation the factors judge a step by."""
+        """Which observation of a step the factors judge."""
         return self.config.settings.judged_by(self.config.task)
 
     def place_of(self, seed: int | None) -> int:
-        """The place of a seed among those of the run; of None, the first. Raises `LareError` where there is no such seed."""
+        """The index of a seed among those of the run; 0 for None. Raises `LareError` if there is no such seed."""
         if seed is None:
             return 0
         if seed not in self.seeds:
@@ -140,7 +142,7 @@ class Run:
         return self.seeds.index(seed)
 
     def has_checkpoint(self) -> bool:
-        """Whether it came as far as its first checkpoint."""
+        """Whether there is a checkpoint."""
         return (self.checkpoint / STATE).exists()
 
     def metrics(self) -> list[dict[str, Any]]:
@@ -148,7 +150,7 @@ class Run:
         return read_metrics(self.directory)
 
     def append(self, lines: Sequence[dict[str, Any]]) -> int:
-        """Add lines to metrics.jsonl; returns how long the file is then."""
+        """Add lines to metrics.jsonl; returns the new size of the file."""
         path = self.directory / METRICS
         try:
             with path.open("a", encoding="utf-8") as file:
@@ -164,10 +166,10 @@ class Run:
     def factors(
         self, function: LatentFunction, before: np.ndarray, action: np.ndarray, after: np.ndarray
     ) -> Float[np.ndarray, "batch factors"]:
-        """The factors z of some steps, by the observations that are judged.
+        """The factors z of some steps, from the observations that are judged.
 
         Raises:
-            LareError: the function failed; what it was given is kept in the run directory.
+            LareError: the function failed; its input is saved in the run directory.
         """
         try:
             return function.of_steps(before, action, after, self.judges)
@@ -176,26 +178,26 @@ class Run:
             raise LareError(f"{error}; it was given the batch in {place}; the last checkpoint is whole") from error
 
     def keep_functions(self) -> None:
-        """Write the functions that are in use, each to its file. Raises `LareError` where they cannot be written."""
+        """Write the functions that are in use, each to its file. Raises `LareError` if they cannot be written."""
         for function, role in per_role(self.functions, self.config.task):
             function.save(self.directory / function_file(self.config.task, role, self.since))
 
     def keep_batch(self, observation: np.ndarray, action: np.ndarray) -> Path:
-        """Put the batch that a latent function failed with beside the run, to be looked at."""
+        """Save the batch on which a latent function failed in the run directory, so that the user can inspect it."""
         path = self.directory / FAILED_BATCH
         write_atomically(path, lambda file: np.savez(file, allow_pickle=False, observation=observation, action=action))
         return path
 
     def extended(self, steps: int) -> "Run":
-        """The run with more steps to make; config.json says so from now on.
+        """The run with a larger number of steps, which is written to config.json.
 
         Raises:
-            LareError: they are not more, or no whole number of iterations.
+            LareError: the number is smaller than before, or not a multiple of an iteration's steps.
         """
         config = self.config
         if steps < config.settings.steps:
             raise LareError(
-                f"steps = {steps}: the run makes {config.settings.steps} anyway, and it can only be made longer"
+                f"steps = {steps}: the run has {config.settings.steps} already, and this number can only be increased"
             )
         if steps == config.settings.steps:
             return self
@@ -206,7 +208,7 @@ class Run:
         return replace(self, config=longer)
 
     def truncate(self, length: int) -> None:
-        """Take back the lines that were written after a checkpoint; they come again.
+        """Remove the lines that were written after a checkpoint; resumed training writes them again.
 
         Raises:
             LareError: lines from before it are missing.
@@ -215,17 +217,18 @@ class Run:
         size = path.stat().st_size if path.exists() else 0
         if size < length:
             raise LareError(
-                f"{path} has {size} bytes, and the checkpoint comes after {length}: was the run copied while it was training?"
+                f"{path} has {size} bytes, and the checkpoint needs {length}: was the run copied while it was training?"
             )
         if size > length:
             os.truncate(path, length)
 
 
 def create(directory: Path, task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction]) -> Run:
-    """A new run directory. Raises `LareError` where there is something of that name."""
+    """Create a new run directory. Raises `LareError` if the path exists."""
     config = describe(task, settings, functions)
     taken = LareError(
-        f"{directory} exists, and a run never overwrites another: choose another --out, or go on with --resume"
+        f"{directory} exists, and a run never overwrites another: choose another directory, or continue "
+        "the run with --resume (lare.resume)"
     )
     if directory.exists() or directory.is_symlink():
         raise taken
@@ -238,7 +241,7 @@ def create(directory: Path, task: TaskSpec, settings: ResolvedSettings, function
         write_atomically(new / CONFIG, lambda file: file.write(text.encode()))
         new.rename(directory)
     except OSError as error:
-        if directory.exists():  # since a moment ago
+        if directory.exists():  # another process has just made it
             raise taken from None
         raise LareError(f"the run directory {directory} cannot be made: {error.strerror}") from error
     finally:
@@ -247,7 +250,7 @@ def create(directory: Path, task: TaskSpec, settings: ResolvedSettings, function
 
 
 def default_directory(task: TaskSpec, settings: ResolvedSettings) -> Path:
-    """runs/TASK-METHOD-ALGORITHM-sSEED, with a number behind it as long as that is taken."""
+    """runs/TASK-METHOD-ALGORITHM-sSEED, with a number appended if that exists."""
     name = f"{task.name}-{settings.method}-{settings.algorithm}-s{settings.seed}"
     number = 1
     while (directory := Path("runs") / (name if number == 1 else f"{name}-{number}")).exists():
@@ -256,7 +259,7 @@ def default_directory(task: TaskSpec, settings: ResolvedSettings) -> Path:
 
 
 def read_config(directory: Path) -> Config:
-    """What a run depends on. Raises `LareError` where there is no run, or no sense in it."""
+    """The configuration of a run. Raises `LareError` if there is no run, or its configuration is not valid."""
     path = directory / CONFIG
     if not path.is_file():
         raise LareError(f"{directory} is not a run: there is no {CONFIG} in it")
@@ -270,7 +273,7 @@ def read_config(directory: Path) -> Config:
 
 
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
-    """Every complete line of a run's metrics.jsonl, in order. Raises `LareError` where one makes no sense, or none can be read."""
+    """Every complete line of a run's metrics.jsonl, in order. Raises `LareError` if a line is not valid, or cannot be read."""
     path = directory / METRICS
     found = []
     for place, line in enumerate(whole_lines(path), start=1):
@@ -284,12 +287,12 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
 
 
 def whole_lines(path: Path) -> list[str]:
-    """Lines that have their end; none where there is no such file."""
+    """The complete lines of a file; empty if there is no such file."""
     return read_text(path, LARGEST_METRICS).split("\n")[:-1] if path.exists() else []
 
 
 def is_evaluation(line: Any) -> bool:
-    """Whether it is a line of metrics.jsonl: numbers by name, and what they were measured of."""
+    """Whether it is a line of metrics.jsonl: a step, a seed, and numbers by name."""
     return (
         isinstance(line, dict)
         and all(type(line.get(name)) is int and 0 <= line[name] <= LARGEST_STEP for name in ("step", "seed"))
@@ -299,7 +302,7 @@ def is_evaluation(line: Any) -> bool:
 
 
 def read_measured(directory: Path) -> Run:
-    """A run of which only what it measured is wanted: its functions are left alone. Raises `LareError` as `read_config`."""
+    """A run for its metrics alone, without its functions. Raises `LareError` like `read_config`."""
     return Run(directory, read_config(directory), ())
 
 
@@ -307,7 +310,7 @@ def open_run(directory: str | Path) -> Run:
     """Read a run directory; its latent function is verified again before anything executes it.
 
     Raises:
-        LareError: it is not a run, its files are not what they should be, or its environment is a file that nobody named.
+        LareError: it is not a run, its files are not valid, or its environment is in a file that the user does not trust.
     """
     directory = Path(directory)
     config = read_config(directory)
@@ -326,17 +329,17 @@ def open_run(directory: str | Path) -> Run:
 
 
 def as_run(given: Run | str | Path) -> Run:
-    """A run by itself, or by its directory. Raises `LareError` as `open_run`, and where it is neither."""
+    """A run, given itself or its directory. Raises `LareError` like `open_run`, and if it is neither."""
     if isinstance(given, Run):
         return given
     if isinstance(given, (str, Path)):
         return open_run(given)
-    raise LareError(f"a run is its directory, or what lare.train and lare.open_run give; it is {shortened(given)}")
+    raise LareError(f"a run must be a directory, or come from lare.train or lare.open_run, and is {shortened(given)}")
 
 
 @contextlib.contextmanager
 def locked(run: Run) -> Iterator[None]:
-    """Keep a second process from training in the same directory, where the system has file locks."""
+    """Keep a second process from training in the same directory, if the system has file locks."""
     try:
         import fcntl
     except ImportError:
@@ -347,6 +350,6 @@ def locked(run: Run) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise Busy(f"another process is training in {run.directory}") from None
-        except OSError:  # some network file systems lock nothing
+        except OSError:  # some network file systems have no locks
             pass
         yield

@@ -1,7 +1,7 @@
-"""config.json of earlier versions, as this version reads it.
+"""Reading config.json of earlier versions.
 
-Where a setting gets another name or meaning, `FORMAT` is raised, and a row of `MIGRATIONS` says what became of the old one. So
-runs that were measured before can still be drawn and compared. Their checkpoints are not migrated.
+When a setting gets another name or meaning, `FORMAT` is increased, and a new row of `MIGRATIONS` converts the old form. So reports
+and comparisons of old runs are still possible. Their checkpoints are not migrated.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,7 +10,7 @@ from typing import Any
 from lare.errors import LareError
 
 FORMAT = 3
-"""Of config.json and of the checkpoint. What stands in them changed with every number."""
+"""The format of config.json and of the checkpoint. It is increased whenever their contents change."""
 
 
 def from_2(values: dict[str, Any]) -> dict[str, Any]:
@@ -19,11 +19,11 @@ def from_2(values: dict[str, Any]) -> dict[str, Any]:
 
 
 MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {2: from_2}
-"""From a format to the next one."""
+"""Functions that convert a format to the next one."""
 
 
 def migrated(values: dict[str, Any]) -> dict[str, Any]:
-    """What this version would have written. Raises `LareError` where the format is newer, or too old."""
+    """The values in the current format. Raises `LareError` if their format is newer, or too old."""
     number = values.get("format")
     while isinstance(number, int) and number in MIGRATIONS:
         values = MIGRATIONS[number](values) | {"format": number + 1}
@@ -31,6 +31,6 @@ def migrated(values: dict[str, Any]) -> dict[str, Any]:
     if number != FORMAT:
         raise LareError(
             f"the run is of another version of LaRe ({values.get('lare', 'unknown')}), whose files this one does not read: "
-            "use that version, or train it anew"
+            "use that version, or train it again"
         )
     return values

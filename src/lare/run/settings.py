@@ -1,4 +1,4 @@
-"""Every setting of a run: what a user gives, and with everything decided."""
+"""The settings of a run: as a user gives them, and with every open value decided."""
 
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -17,11 +17,11 @@ from lare.tasks.spec import Judges, TaskSpec
 LARGEST_SEED = 2**31 - 1
 
 MOST_SEEDS = 1000
-"""In one process."""
+"""The most seeds in one process."""
 
 
 def optional(field: FieldInfo) -> tuple[Any, Any]:
-    """A field that may also be None, which it is unless given."""
+    """A field that may also be None, which is its default."""
     kind: Any = Annotated[(field.annotation, *field.metadata)] if field.metadata else field.annotation
     return kind | None, Field(None, description=field.description)
 
@@ -32,56 +32,58 @@ if TYPE_CHECKING:
     CreditOptions = CreditSettings
 else:
     CreditOptions = create_model("CreditOptions", __base__=Checked, __module__=__name__, **OPTIONS)
-    CreditOptions.__doc__ = "How the decoder is fitted. What is None is decided by the algorithm."
+    CreditOptions.__doc__ = "How the decoder is fitted. If a setting is None, the algorithm decides it."
 
 Count = Annotated[int, Field(ge=1)]
 
 
 class Settings(Checked):
-    """What `lare train` and `lare.train` are given. What is None is decided by the task and the algorithm."""
+    """The settings of `lare train` and `lare.train`. If a setting is None, the task and the algorithm decide it."""
 
     method: str | None = None
-    """How credit is assigned (see `lare methods`); lare-bayes unless given, with qmix and vdn lare-rd."""
+    """How credit is assigned (see `lare methods`). By default lare-bayes, and lare-rd with qmix and vdn."""
     algorithm: Name | None = None
-    """The reinforcement learning algorithm: for a single agent ppo where actions are a choice, else td3; for many qmix where there
-    are a global state and action masks, else ippo."""
+    """The reinforcement learning algorithm. By default, for a single agent: ppo if actions are discrete, else td3. For many agents:
+    qmix if there are a global state and action masks, else ippo."""
     steps: Count | None = None
-    """Environment steps of each seed (all agents act in one): 1,000,000 for a single agent, about 2,000,000 for many."""
+    """Environment steps of each seed (in one step, all agents act). By default 1,000,000 for a single agent, and about 2,000,000
+    for many."""
     seeds: Count = 1
     """How many seeds to train, in lockstep in one process."""
     seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 0
-    """The first seed; the others follow it."""
+    """The first seed; the others are the numbers after it."""
     judges: Judges | None = None
-    """Which observation the factors judge a step by; what the task says, unless given."""
+    """Which observation of a step the factors judge: the one before it, the one after it, or both. By default, as the task says."""
     draw: Annotated[int, Field(ge=0)] = 0
     """Which recorded reply of the language model to take phi from (0 to 4); independent of the seed."""
     candidates: Count = CANDIDATES
-    """How many candidates phi is made of; 1: without self-prompting. The shipped recordings hold 1 and 5."""
+    """How many candidates phi is combined from; with 1, there is no self-prompting. The shipped recordings have 1 and 5."""
     environments: Count | None = None
-    """Copies of the environment that each seed collects from: 1 on the host, where more step in processes of their own; in JAX 82
-    for ippo, 8 for qmix."""
+    """Copies of the environment for each seed. By default 1 on the host, where several copies run in worker processes; in JAX, 82
+    for ippo and 8 for qmix."""
     rollout_steps: Count | None = None
-    """Steps of each copy in an iteration, which collects, stores, fits and updates: 50 for what consumes transitions or sequences,
-    2000 over all copies for ppo, an episode for ippo on particle tasks."""
+    """Steps of each copy in an iteration, which collects, stores, fits and updates. By default 50 for algorithms that consume
+    transitions or sequences, 2000 over all copies for ppo, and an episode for ippo on particle tasks."""
     fit_every: Count | None = None
-    """ppo and ippo, and every algorithm with diaster: iterations for each time that the decoder is fitted; 10 for ippo, else 1."""
+    """For ppo and ippo, and for every algorithm with diaster: iterations between two fits of the decoder. By default 10 for ippo,
+    else 1."""
     fit_updates: Count | None = None
-    """For the same algorithms: gradient steps of the decoder each time; 500 for ppo, 50 for ippo, one for 50 environment steps with
-    diaster."""
+    """For the same algorithms: gradient steps of the decoder in each fit. By default 500 for ppo and 50 for ippo; with diaster, one
+    for every 50 environment steps."""
     first_fit: Literal["held-out", "published"] | None = None
-    """ippo: how long the decoder's first fit goes on. held-out: until the error on held-out episodes stops falling. published:
-    fit_updates, as every later one. held-out, unless given."""
+    """For ippo: how long the decoder's first fit lasts. held-out (the default): until the error on held-out episodes stops falling.
+    published: fit_updates, as in every later fit."""
     evaluate_every: Count | None = None
-    """Environment steps between two evaluations; a checkpoint is written at each: 5000 for td3, ddpg and sac, about 10,000 for
-    qmix, 10 iterations for ippo, 5 for ppo."""
+    """Environment steps between two evaluations; a checkpoint is written at each. By default 5000 for td3, ddpg and sac, about
+    10,000 for qmix, 10 iterations for ippo, and 5 iterations for ppo."""
     evaluation_episodes: Count | None = None
-    """Episodes in one evaluation: 10; 50 for ippo and 32 for qmix in JAX."""
+    """Episodes in one evaluation. By default 10; in JAX, 50 for ippo and 32 for qmix."""
     reflect_every: Count | None = None
-    """lare-bayes: environment steps between two reflections, in which a language model sees what the stored returns say of its
-    function; one that tells them better takes its place. Never, unless given."""
+    """For lare-bayes: environment steps between two reflections. In each, a language model sees how well its function explains the
+    stored returns, and a new function that explains them better replaces the old one. By default there are no reflections."""
     capacity: Annotated[int, Field(ge=4)] | None = None
-    """Rows that the replay of a seed holds; an episode of T steps takes T + 1: 1,000,000; 15,000 of the longest episodes for ippo,
-    5000 for qmix."""
+    """Rows in the replay of a seed; an episode of T steps takes T + 1. By default 1,000,000; 15,000 of the longest episodes for
+    ippo, and 5000 for qmix."""
     scale_rewards: bool = False
     """Divide the rewards that the algorithm sees by the running root mean square of R/T. It changes nothing for ppo and ippo."""
     td3: TD3Settings = TD3Settings()
@@ -101,7 +103,7 @@ class Settings(Checked):
     @field_validator("credit", mode="before")
     @classmethod
     def options(cls, credit: Any) -> Any:
-        """`CreditSettings` give what was set in them."""
+        """Of a `CreditSettings`, take only the values that were set."""
         return credit.model_dump(include=credit.model_fields_set) if isinstance(credit, CreditSettings) else credit
 
     @model_validator(mode="after")
@@ -109,12 +111,12 @@ class Settings(Checked):
         if self.seeds > MOST_SEEDS:
             raise ValueError(f"seeds = {self.seeds}: at most {MOST_SEEDS} train in one process")
         if self.seed + self.seeds - 1 > LARGEST_SEED:
-            raise ValueError(f"seed = {self.seed} and {self.seeds - 1} that follow it: the largest is {LARGEST_SEED}")
+            raise ValueError(f"seed = {self.seed} with seeds = {self.seeds}: the largest seed is {LARGEST_SEED}")
         return self
 
 
 class ResolvedSettings(Checked):
-    """Settings with everything decided: what a run goes by. The names are those of `Settings`."""
+    """The settings that a run uses, with every open value decided. The names are those of `Settings`."""
 
     method: str
     algorithm: Name
@@ -135,13 +137,13 @@ class ResolvedSettings(Checked):
     reflect_every: Count | None = None
     first_fit: Literal["held-out", "published"] = "published"
     hyperparameters: AlgorithmSettings
-    """Of the algorithm."""
+    """The hyperparameters of the algorithm."""
     credit: CreditSettings
 
     @model_validator(mode="before")
     @classmethod
     def hyperparameters_of_the_algorithm(cls, values: Any) -> Any:
-        """Read as those of the algorithm that is named, whose keys others may share."""
+        """Read them as those of the named algorithm, because other algorithms may have the same keys."""
         given = values.get("hyperparameters") if isinstance(values, Mapping) else None
         if not isinstance(given, Mapping) or values.get("algorithm") not in ALGORITHMS:
             return values
@@ -168,7 +170,7 @@ class ResolvedSettings(Checked):
 
     @property
     def described_iteration(self) -> str:
-        """What an iteration's steps are, for a message."""
+        """The steps of an iteration, for a message."""
         if self.environments == 1:
             return f"rollout_steps = {self.rollout_steps}"
         return f"{self.iteration_steps} (rollout_steps = {self.rollout_steps} of environments = {self.environments})"
@@ -180,23 +182,23 @@ class ResolvedSettings(Checked):
 
     @property
     def rereads(self) -> bool:
-        """Whether steps are read again when the policy has learned from them."""
+        """Whether steps are read again after the policy has learned from them."""
         return ALGORITHMS[self.algorithm].consumes is not Consumes.ROLLOUTS or find_method(self.method).fit is not None
 
     def judged_by(self, task: TaskSpec) -> Judges:
-        """Which observation the factors judge a step by."""
+        """Which observation of a step the factors judge."""
         return self.judges or task.judges
 
     def rows(self, longest: int) -> int:
-        """Rows of each environment to make room for, where an episode has up to `longest` steps."""
-        from lare.data.replay import room  # here: the command line reads this file, and needs no JAX for it
+        """The number of rows of each environment, if an episode has up to `longest` steps."""
+        from lare.data.replay import room  # imported here, so that the command line does not import JAX with this file
 
         needed = room(self.rollout_steps, longest)
         wanted = self.capacity // self.environments if self.rereads else needed + RECENT // self.environments
         return min(wanted, max(needed, 2 * self.steps // self.environments + 2))
 
     def in_force(self, task: TaskSpec) -> dict[str, Any]:
-        """All that matters to the run, by dotted names as on the command line."""
+        """All settings that make a difference to the run, by dotted names as on the command line."""
         values = self.model_dump()
         if self.judges is None:
             values["judges"] = "as the task says"
@@ -227,7 +229,7 @@ class ResolvedSettings(Checked):
 
 
 def set_in_vain(settings: Settings, resolved: ResolvedSettings, task: TaskSpec) -> dict[str, str]:
-    """What was set and makes no difference to this task, algorithm and method: by its dotted name, what is to be said of it."""
+    """Messages, by dotted names, about settings that were set but make no difference to this task, algorithm and method."""
     usual, found = dict(dotted(Settings().model_dump())), {}
     known = resolved.in_force(task)
     others = [name for name in ALGORITHMS if name != resolved.algorithm]
@@ -246,12 +248,12 @@ def set_in_vain(settings: Settings, resolved: ResolvedSettings, task: TaskSpec) 
 
 
 def among(name: str, groups: list[str]) -> bool:
-    """Whether a dotted name is one of these, or of what is in one of them."""
+    """Whether a dotted name is one of these groups, or lies in one of them."""
     return any(f"{name}.".startswith(f"{group}.") for group in groups)
 
 
 def dotted(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Settings within settings, in a row."""
+    """Nested settings, flattened: dotted names and values."""
     for name, value in settings.items():
         if isinstance(value, Mapping):
             yield from dotted(value, f"{prefix}{name}.")

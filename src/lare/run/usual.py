@@ -1,4 +1,4 @@
-"""What a run is like where nothing is said: by task, method and algorithm."""
+"""The default settings of a run, by task, method and algorithm."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,11 +19,11 @@ MANY_AGENTS = CreditSettings(
     bottleneck=4,
     divergence=1e-3,
 )
-"""Of many agents. The numbers are the published code's, but for VIB's divergence."""
+"""The default settings of decoders for many agents. The numbers are the published code's, except VIB's divergence."""
 
 
 Usual = Callable[[EnvSpec, int], dict[str, Any]]
-"""From an environment and the number of its copies that was asked for (0: none was) to what is usual."""
+"""From an environment and the requested number of its copies (0: no request) to default settings."""
 
 
 def transitions(env: EnvSpec, copies: int) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def ppo(env: EnvSpec, copies: int) -> dict[str, Any]:
 
 
 def ippo(env: EnvSpec, copies: int) -> dict[str, Any]:
-    """In JAX as published for particle tasks: 82 episodes of 25 steps between two updates."""
+    """In JAX, as published for particle tasks: 82 episodes of 25 steps between two updates."""
     copies = copies or (82 if env.in_jax else 1)
     return {
         "environments": copies,
@@ -60,7 +60,7 @@ def ippo(env: EnvSpec, copies: int) -> dict[str, Any]:
 
 
 def sequences(env: EnvSpec, copies: int) -> dict[str, Any]:
-    """qmix, vdn. Credit as the paper has it: in closed form it has not been measured with them."""
+    """qmix, vdn. The method is the paper's, because closed-form credit has not been measured with these algorithms."""
     return {
         "method": "lare-rd",
         "environments": copies or (8 if env.in_jax else 1),
@@ -82,18 +82,18 @@ USUAL: dict[Name, Usual] = {
     "qmix": sequences,
     "vdn": sequences,
 }
-"""What a run is like where nothing is said, by algorithm."""
+"""The default settings of a run, by algorithm."""
 
 
 def usual_algorithm(env: EnvSpec) -> Name:
-    """What trains on a task where nothing is said."""
+    """The default algorithm for an environment."""
     if env.agents == 1:
         return "ppo" if env.discrete else "td3"
     return "qmix" if env.state_size and env.masks_actions and len(env.teams) == 1 else "ippo"
 
 
 def resolve(settings: Settings, env: EnvSpec) -> ResolvedSettings:
-    """Fill in what was left open. Raises `LareError` where the steps are no whole number of iterations."""
+    """Fill in the settings that are None. Raises `LareError` if the steps are not a multiple of an iteration's."""
     algorithm = settings.algorithm or usual_algorithm(env)
     given = {name: value for name, value in settings if value is not None and name not in (*ALGORITHMS, "credit")}
     values = {

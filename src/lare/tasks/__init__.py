@@ -1,1 +1,1 @@
-"""What is to be solved: environments, and the texts that describe them to a language model."""
+"""Tasks: environments, and the texts that describe them to a language model."""

@@ -1,4 +1,4 @@
-"""Agents of any spaces, side by side: observations as rows of one width, choices and bounds filled up, teams in a row."""
+"""Agents with different spaces in common arrays: observations, choices and bounds are padded, and teams are contiguous."""
 
 import itertools
 import re
@@ -17,20 +17,20 @@ from lare.tasks.env import Team
 from lare.tasks.spec import TaskSpec
 
 MASK = "action_mask"
-"""Where PettingZoo's environments say which choices there are: beside the observation, or in `info`."""
+"""The key of PettingZoo's mask of available actions. It is in the observation's dictionary, or in `info`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Agent:
-    """What one agent observes and does."""
+    """One agent and its spaces."""
 
     name: Any
-    """What its environment calls it, a string as a rule."""
+    """The environment's name for the agent, usually a string."""
     observation: gymnasium.Space
-    """Without the mask."""
+    """The observation space, without the mask."""
     action: Discrete | Box
     masked: bool
-    """Whether the mask stands beside the observation."""
+    """Whether the mask is in the observation's dictionary."""
     observation_size: int = field(init=False)
     action_size: int = field(init=False)
 
@@ -43,7 +43,7 @@ class Agent:
         return isinstance(self.action, Discrete)
 
     def taken(self, row: Float[np.ndarray, " action"]) -> Any:
-        """The action that a row stands for, as the environment counts or shapes it."""
+        """The action that a row encodes, in the form that the environment expects."""
         own = row[: self.action_size]
         if isinstance(self.action, Discrete):
             return int(self.action.start) + int(np.argmax(own))
@@ -52,7 +52,7 @@ class Agent:
 
 
 def agent(name: Any, observation: gymnasium.Space, action: gymnasium.Space) -> Agent:
-    """An agent by its spaces. Raises `LareError` where they are no rows of numbers."""
+    """An agent with these spaces. Raises `LareError` if they cannot be represented as rows of numbers."""
     parts = observation.spaces if isinstance(observation, Dict) else {}
     masked = set(parts) == {"observation", MASK}
     seen = parts["observation"] if masked else observation
@@ -63,36 +63,36 @@ def agent(name: Any, observation: gymnasium.Space, action: gymnasium.Space) -> A
     if isinstance(action, Box) and not action.is_bounded():
         raise LareError(f"the actions of {name} have no bounds: {shortened(action)}")
     if isinstance(action, Box) and masked:
-        raise LareError(f"{name} has an action mask, but its actions are no choices: {shortened(action)}")
+        raise LareError(f"{name} has an action mask, but its actions are not discrete: {shortened(action)}")
     return Agent(name, seen, action, masked)
 
 
 def check_alike(agents: Sequence[Agent]) -> None:
-    """Raise `LareError` where some choose and others do not."""
+    """Raise `LareError` if some agents have discrete actions and others do not."""
     for one in agents[1:]:
         if one.discrete != agents[0].discrete:
             first, second = shortened(agents[0].action), shortened(one.action)
             raise LareError(
                 f"the actions of {agents[0].name} are {first} and those of {one.name} {second}: "
-                "all agents must choose (Discrete), or none (Box)"
+                "all agents must have a Discrete space, or all a Box"
             )
 
 
 def unlike(agents: Sequence[Agent]) -> bool:
-    """Whether the agents' spaces differ. Then each row ends with the agent's number, as a row with a single 1."""
+    """Whether the agents' spaces differ. If they do, each observation ends with the agent's number, one-hot encoded."""
     first = agents[0]
     return any((one.observation, one.action) != (first.observation, first.action) for one in agents[1:])
 
 
 def width(agents: Sequence[Agent]) -> int:
-    """Entries of every observation."""
+    """The number of entries of every observation."""
     return max(one.observation_size for one in agents) + unlike(agents) * len(agents)
 
 
 def rows(
     agents: Sequence[Agent], size: int, numbered: bool, seen: Mapping[int, Float[np.ndarray, " _"]]
 ) -> Float[np.ndarray, "agents {size}"]:
-    """Observations by the agents' places, of a `width` and perhaps `unlike`; zeros where there is none."""
+    """Observations in the order of the agents: `size` is `width`, `numbered` is `unlike`. Zeros for agents without observation."""
     padded = np.zeros((len(agents), size), np.float32)
     for place, row in seen.items():
         padded[place, : len(row)] = row
@@ -102,13 +102,13 @@ def rows(
 
 
 def choices(agents: Sequence[Agent]) -> Bool[np.ndarray, "agents action"]:
-    """Which choices each agent has where nothing is masked; all true where actions are not chosen."""
+    """Which choices each agent has without a mask. All are true for continuous actions."""
     most = max(one.action_size for one in agents)
     return np.array([[not one.discrete or choice < one.action_size for choice in range(most)] for one in agents])
 
 
 def bounds(agents: Sequence[Agent]) -> tuple[Float[np.ndarray, "agents _"], Float[np.ndarray, "agents _"]]:
-    """The least and the most of every action, 0 where an agent has none; without entries for choices."""
+    """The lower and upper bounds of every action; 0 for entries that an agent does not have. Empty for discrete actions."""
     most = 0 if agents[0].discrete else max(one.action_size for one in agents)
     low, high = (np.zeros((len(agents), most), np.float32) for _ in range(2))
     for place, one in enumerate(agents):
@@ -119,7 +119,7 @@ def bounds(agents: Sequence[Agent]) -> tuple[Float[np.ndarray, "agents _"], Floa
 
 
 def flat(space: gymnasium.Space, value: Any) -> Float[np.ndarray, " _"]:
-    """A value of a space as a row of its own, in Gymnasium's order. Raises `ValueError` with what is wrong."""
+    """A value of a space as a new row, in Gymnasium's order. Raises `ValueError` with a description of the problem."""
     if isinstance(space, Box):
         return finite(value, space.shape).ravel()
     if isinstance(space, Dict):
@@ -136,12 +136,12 @@ def flat(space: gymnasium.Space, value: Any) -> Float[np.ndarray, " _"]:
 
 
 def finite(value: Any, shape: tuple[int, ...] | None) -> Float[np.ndarray, "..."]:
-    """Numbers of their own, in a shape if one is given. Raises `ValueError` with what is wrong."""
+    """A new array of finite numbers, of the given shape if there is one. Raises `ValueError` with a description of the problem."""
     try:
         with np.errstate(over="ignore"):
             array = np.array(value, np.float32)  # a copy: the environment may write the next ones into the same memory
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"is {shortened(value)}, which are no numbers") from None
+        raise ValueError(f"is {shortened(value)}, which is not an array of numbers") from None
     if shape is not None and array.shape != shape:
         raise ValueError(f"has the shape {array.shape}, not {shape}")
     if not np.isfinite(array).all():
@@ -154,7 +154,7 @@ def joined(parts: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, " _"]:
 
 
 def mask(value: Any, size: int) -> Bool[np.ndarray, " {size}"]:
-    """Which choices there are. Raises `ValueError` with what is wrong."""
+    """Which choices are available. Raises `ValueError` with a description of the problem."""
     array = finite(value, None)
     if array.shape != (size,):
         raise ValueError(f"has the shape {array.shape}, and there are {size} choices")
@@ -166,13 +166,13 @@ def mask(value: Any, size: int) -> Bool[np.ndarray, " {size}"]:
 
 
 def kind(name: Any) -> str:
-    """What an agent is called without its number: `prey` of `prey_0`."""
+    """An agent's name without its number: `prey` for `prey_0`."""
     return re.sub(r"_?\d+$", "", str(name)) or str(name)
 
 
 def by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tuple[Team, ...]]:
-    """The agents, team by team, and the teams. Raises `LareError` where one is in none of them, or in several."""
-    if task.team is not None:  # it speaks of one team, whose function is verified
+    """The agents, team by team, and the teams. Raises `LareError` if an agent is in no team, or in several."""
+    if task.team is not None:  # the spec of a single team, used to verify its function
         own = [name for name in names if speaks_of(task, name)]
         others = [name for name in names if name not in own]
         if not own:
@@ -200,7 +200,7 @@ def nobody(task: TaskSpec, team: str, names: Sequence[Any], said: str) -> str:
 
 
 def in_order(members: Mapping[str, Sequence[Any]]) -> tuple[Team, ...]:
-    """Teams one behind the other."""
+    """The teams, which occupy consecutive places."""
     ends = list(itertools.accumulate(map(len, members.values()), initial=0))
     return tuple(Team(name, *ends[place : place + 2]) for place, name in enumerate(members))
 

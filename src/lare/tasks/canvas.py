@@ -1,4 +1,4 @@
-"""A square picture without a window: what the tasks' drawings share."""
+"""A square figure without a window, which the drawings of all tasks use."""
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,7 +15,7 @@ def blank() -> tuple[Figure, Axes]:
 
 
 def pixels(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:
-    """The picture as numbers."""
+    """The figure as an array of pixels."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

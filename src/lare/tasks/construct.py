@@ -1,4 +1,4 @@
-"""Making a PettingZoo environment by its name, and its time limit."""
+"""Makes a PettingZoo environment from its name, and finds its time limit."""
 
 import importlib
 import warnings
@@ -12,14 +12,14 @@ from lare.tasks.environment import fault
 from lare.tasks.spec import PETTINGZOO
 
 PARALLEL = ("possible_agents", "observation_space", "action_space", "reset", "step")
-"""What a ParallelEnv has."""
+"""The attributes of a ParallelEnv."""
 
 LIMITS = ("max_cycles", "max_episode_steps")
-"""What a time limit is called, where an environment or its arguments tell it."""
+"""The names of a time limit, as an attribute or as an argument of an environment."""
 
 
 def construct(name: str, arguments: Mapping[str, Any]) -> Any:
-    """The ParallelEnv that `pettingzoo/MODULE:NAME` makes of the arguments."""
+    """The ParallelEnv that `pettingzoo/MODULE:NAME` makes from the arguments."""
     module, colon, maker = name.removeprefix(PETTINGZOO).partition(":")
     if not (module and colon and maker):
         raise LareError(
@@ -27,7 +27,7 @@ def construct(name: str, arguments: Mapping[str, Any]) -> Any:
             f"like {PETTINGZOO}mpe2.simple_spread_v3:parallel_env"
         )
     failed = f"environment {name!r} cannot be made"
-    with warnings.catch_warnings():  # how it is called is in the spec, for its reader to change
+    with warnings.catch_warnings():  # the user has chosen the environment's name in the spec
         warnings.filterwarnings("ignore", message="The old environment creation API", category=DeprecationWarning)
         try:
             found = importlib.import_module(module)
@@ -37,7 +37,7 @@ def construct(name: str, arguments: Mapping[str, Any]) -> Any:
             raise LareError(f"{failed}: {module} has no {maker!r}{instead(found, maker)}")
         call = getattr(found, maker)
         if not callable(call):
-            raise LareError(f"{failed}: {maker} of {module} is {shortened(call)}, which makes nothing")
+            raise LareError(f"{failed}: {maker} of {module} is {shortened(call)}, which cannot be called")
         try:
             made = call(**arguments)
         except (Exception, SystemExit) as error:
@@ -59,14 +59,14 @@ def hint_at(error: BaseException) -> str:
 
 
 def instead(module: Any, name: str) -> str:
-    """What a module has in place of a name that it has not."""
+    """A hint at the names that a module has instead of a missing one."""
     there = [one for one, value in vars(module).items() if callable(value) and not one.startswith("_")]
     hint = did_you_mean(name, there)
     return hint or (f"; it has {', '.join(there[:8])}" if there else "")
 
 
 def limit_of(environment: Any, arguments: Mapping[str, Any]) -> int | None:
-    """The time limit that an environment has of itself, as far as it or its arguments tell."""
+    """An environment's own time limit, if the environment or its arguments contain it."""
     raw = getattr(environment, "unwrapped", environment)
     told = [arguments.get(name) for name in LIMITS]
     told += [getattr(place, name, None) for place in (environment, raw, getattr(raw, "env", None)) for name in LIMITS]

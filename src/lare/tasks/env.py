@@ -1,7 +1,7 @@
-"""What an environment is to this package: any number of agents in teams, in JAX or on the host.
+"""The interface of environments in this package: any number of agents in teams, in JAX or on the host.
 
-A Gymnasium environment has one team of one agent. Every array of a step has an axis for the agents, also where there is one.
-A family of environments is one module that makes a `JaxEnv` or a `HostEnv` of a task (see `table.py`).
+A Gymnasium environment has one team of one agent. Every array of a step has an axis for the agents, even for a single agent.
+A family of environments is one module that makes a `JaxEnv` or a `HostEnv` from a task (see `table.py`).
 """
 
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 Numbers = Any
-"""Arrays of JAX in compiled code, of NumPy on the host. (What steps on the host need not wait for JAX to be imported.)"""
+"""JAX arrays in compiled code, NumPy arrays on the host. The type is `Any`, so that this module need not import JAX."""
 
 
 @dataclass(frozen=True)
@@ -34,23 +34,23 @@ class Team:
 
 @dataclass(frozen=True, eq=False)
 class EnvSpec:
-    """Sizes and bounds: all that training must know of an environment before its first step."""
+    """The sizes and bounds that training needs before the first step of an environment."""
 
     teams: tuple[Team, ...]
-    """All agents, in order."""
+    """The teams of all agents, in order."""
     observation_size: int
-    """Of each agent; the rows of agents that observe less are padded with zeros."""
+    """The size of each agent's observation. Shorter observations are padded with zeros."""
     action_size: int
-    """Numbers of an action, or choices."""
+    """The size of a continuous action, or the number of choices."""
     discrete: bool
-    """Whether an action is a choice: a row with a single 1."""
+    """Whether an action is a choice, encoded one-hot."""
     max_steps: int
     """The most steps that an episode can have."""
     state_size: int = 0
-    """Of the global state; 0 where there is none."""
+    """The size of the global state; 0 if there is none."""
     low: Float[np.ndarray, "agents action"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     high: Float[np.ndarray, "agents action"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    """Bounds of continuous actions, in the environment's units; without entries for choices."""
+    """The bounds of continuous actions, in the environment's units. Empty for discrete actions."""
     fixed_length: bool = False
     """Whether every episode has `max_steps` steps and no agent leaves before the end."""
     agents_leave: bool = False
@@ -58,9 +58,9 @@ class EnvSpec:
     masks_actions: bool = False
     """Whether an action may be unavailable at a step."""
     in_jax: bool = False
-    """Whether it is made of pure functions, so that many copies cost little."""
+    """Whether it is a `JaxEnv`, of which many copies are cheap."""
     measures: tuple[str, ...] = ()
-    """Names of what is reported of an episode's last step beside the return."""
+    """The names of the values of an episode's last step that are reported in addition to the return."""
 
     @property
     def agents(self) -> int:
@@ -68,31 +68,31 @@ class EnvSpec:
 
 
 class Timestep(NamedTuple):
-    """What an environment shows after `reset` or `step`. `*batch` is empty for one environment."""
+    """The result of `reset` or `step`. `*batch` is empty for a single environment."""
 
     observation: Float[Numbers, "*batch agents observation"]
     """An agent that has left observes zeros."""
     state: Float[Numbers, "*batch state"]
     available: Bool[Numbers, "*batch agents action"]
-    """Which choices each agent has now: at least one, also of an agent that has left. All true for continuous actions."""
+    """The available choices of each agent: at least one, even for an agent that has left. All true for continuous actions."""
     alive: Bool[Numbers, "*batch agents"]
     """Which agents act now."""
     reward: Float[Numbers, "*batch agents"]
-    """What the step that led here paid each agent that was alive before it, else 0; 0 after `reset`."""
+    """The reward of this step for each agent that was alive before it; 0 for other agents, and after `reset`."""
     terminated: Bool[Numbers, "*batch"]
-    """Whether the episode has come to an end of its own."""
+    """Whether the episode has ended in a terminal state."""
     truncated: Bool[Numbers, "*batch"]
-    """Whether the time is over."""
+    """Whether the time limit is reached."""
     measures: dict[str, Float[Numbers, "*batch"]]
-    """By the names of `EnvSpec.measures`; they count at the last step."""
+    """Values by the names of `EnvSpec.measures`. They are only valid at the last step of an episode."""
 
 
 def team_mean(
     values: Float[Numbers, "*batch agents"], alive: Bool[Numbers, "*batch agents"], team: Team
 ) -> Float[Numbers, "*batch"]:
-    """The mean over a team's agents that are alive; 0 where none is.
+    """The mean over a team's agents that are alive; 0 if none is.
 
-    This is the one place that says what a team earns by a step. Its return R is the sum of that over the episode.
+    This function alone defines the reward of a team for a step. The team's return R is the sum of these rewards over the episode.
     """
     return alive_mean(values[..., team.agents], alive[..., team.agents])
 
@@ -100,21 +100,21 @@ def team_mean(
 def alive_mean(
     values: Float[Numbers, "*batch agents"], alive: Bool[Numbers, "*batch agents"]
 ) -> Float[Numbers, "*batch"]:
-    """The mean over the agents that are alive; 0 where none is."""
+    """The mean over the agents that are alive; 0 if none is."""
     return (values * alive).sum(axis=-1) / array_module(values).maximum(alive.sum(axis=-1), 1)
 
 
 def in_units(action: Float[Numbers, "*batch agents action"], spec: EnvSpec) -> Float[Numbers, "*batch agents action"]:
-    """From [-1, 1] (beyond it is the bound) to the environment's units; a row with a single 1 where the largest number is."""
+    """Scale a continuous action from [-1, 1], after clipping, to the environment's units. Encode a discrete one by its argmax."""
     numpy = array_module(action)
     if spec.discrete:
         return numpy.eye(spec.action_size, dtype=np.float32)[numpy.argmax(action, axis=-1)]
     scaled = spec.low + (numpy.clip(action, -1, 1) + 1) / 2 * (spec.high - spec.low)
-    return numpy.clip(scaled, spec.low, spec.high)  # rounding may have led beyond the bounds
+    return numpy.clip(scaled, spec.low, spec.high)  # rounding may exceed the bounds
 
 
 def array_module(array: Any) -> Any:
-    """NumPy for arrays of NumPy, `jax.numpy` for others."""
+    """`numpy` for NumPy arrays, `jax.numpy` for others."""
     if isinstance(array, np.ndarray):
         return np
     import jax.numpy
@@ -127,12 +127,12 @@ State = TypeVar("State")
 
 @runtime_checkable
 class JaxEnv(Protocol[State]):
-    """An environment of pure functions, which may be compiled and mapped over keys, states and actions."""
+    """An environment of pure functions, which can be compiled and mapped over keys, states and actions."""
 
     spec: EnvSpec
 
     def reset(self, key: Any) -> tuple[State, Timestep]:
-        """A first state."""
+        """The first state and step of an episode."""
         ...
 
     def step(self, state: State, action: Float[Numbers, "agents action"], key: Any) -> tuple[State, Timestep]:
@@ -140,13 +140,13 @@ class JaxEnv(Protocol[State]):
         ...
 
     def frames(self, states: State, credit: Float[np.ndarray, "steps agents"] | None = None) -> list[np.ndarray]:
-        """An episode's states (leading axis: steps) as pictures (height, width, 3); with everybody's credit, if it is given."""
+        """An episode's states (leading axis: steps) as pictures (height, width, 3), with each agent's credit if it is given."""
         ...
 
 
 @runtime_checkable
 class HostEnv(Protocol):
-    """An environment that steps in Python. What it raises is a `LareError` of one line."""
+    """An environment that steps in Python. Its errors are `LareError`s of one line."""
 
     spec: EnvSpec
 
@@ -163,5 +163,5 @@ class HostEnv(Protocol):
         ...
 
     def close(self) -> None:
-        """Give back what the environment holds."""
+        """Release the resources of the environment."""
         ...

@@ -1,4 +1,4 @@
-"""Gymnasium environments, made so that what goes wrong is said in one line."""
+"""Makes Gymnasium environments whose failures are errors of one line."""
 
 import contextlib
 import functools
@@ -19,17 +19,16 @@ hidden.register()
 
 
 class EnvironmentFault(LareError):
-    """An environment gave something that cannot be trained on."""
+    """An environment returned something that cannot be used for training."""
 
     place: int | None = None
-    """Of the environment, where there are several side by side."""
+    """The index of the environment, if several run side by side."""
 
 
 class Guarded(gymnasium.Wrapper, RecordConstructorArgs):
-    """An environment is foreign code: whatever its `reset` and `step` raise is a `LareError` of one line.
+    """Turns whatever `reset` and `step` of an environment raise, which is foreign code, into a `LareError` of one line.
 
-    So is `sys.exit`, by which a window that is closed ends some programs: a run that has not come to its end must not look as if
-    it had.
+    This includes `sys.exit`, which some programs call when a window is closed. Otherwise an interrupted run would look finished.
     """
 
     def __init__(self, env: gymnasium.Env, name: str):
@@ -47,7 +46,7 @@ class Guarded(gymnasium.Wrapper, RecordConstructorArgs):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
-            terminated, truncated = bool(terminated), bool(truncated)  # an array of several is neither
+            terminated, truncated = bool(terminated), bool(truncated)  # fails for an array of several
         except (Exception, SystemExit) as error:
             raise fault(f"environment {self.name!r} failed in step", error) from error
         paid = number(reward, f"environment {self.name!r} gave the reward")
@@ -60,7 +59,7 @@ class Guarded(gymnasium.Wrapper, RecordConstructorArgs):
 
 
 def number(value: Any, what: str) -> float:
-    """A number that came out of foreign code. Raises `LareError` where it is none."""
+    """A number from foreign code. Raises `LareError` if the value is not a number."""
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
@@ -68,7 +67,7 @@ def number(value: Any, what: str) -> float:
 
 
 def fault(what: str, error: BaseException, hint: str = "") -> LareError:
-    """What went wrong in foreign code, in a line. One that says so itself is left as it is."""
+    """An error of foreign code as a `LareError` of one line. A `LareError` is returned unchanged."""
     if isinstance(error, LareError):
         return error
     logging.getLogger(__name__).debug("%s", what, exc_info=error)
@@ -77,23 +76,23 @@ def fault(what: str, error: BaseException, hint: str = "") -> LareError:
 
 
 def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) -> gymnasium.Env:
-    """`gymnasium.make`, with rows for observations and actions, and every failure a `LareError`.
+    """`gymnasium.make`, with observations and actions as rows of numbers, and with every failure as a `LareError`.
 
-    Versions are the user's choice (v4 and v5 scores are never mixed), so Gymnasium's advice to upgrade is left out.
+    The user chooses the version (scores of v4 and v5 cannot be compared), so Gymnasium's advice to upgrade is suppressed.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
         try:
             made = gymnasium.make(environment, max_episode_steps=max_episode_steps, **kwargs)
-            # Outermost: rows are made of what the environment gave, which may not be what its spaces say.
+            # The outermost wrapper: making rows may fail too, if the environment's values do not match its spaces.
             return Guarded(as_rows(made), environment)
-        except (Exception, SystemExit) as error:  # anything may come out of its constructor
+        except (Exception, SystemExit) as error:  # its constructor may raise anything
             hint, library = "", os.environ.get("MUJOCO_GL")
             if library and isinstance(error, AttributeError):
                 hint = f" (is MUJOCO_GL={library} installed?)"
             if isinstance(error, gymnasium.error.NameNotFound) and ":" not in environment:
-                hint = f" (one of your own is MODULE:{environment}, where MODULE registers it)"
+                hint = f" (for an environment of your own, write MODULE:{environment}, where MODULE registers it)"
             if isinstance(error, ModuleNotFoundError):
                 hint = " (a module in this folder is found with PYTHONPATH=.)"
             raise fault(f"environment {environment!r} cannot be made", error, hint) from error
@@ -101,13 +100,13 @@ def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) 
 
 @functools.cache
 def limit_of(environment: str) -> int | None:
-    """The time limit that an environment has of itself. Made once: a run asks more than once."""
+    """An environment's own time limit. Cached, because a run needs it several times and the environment must be made for it."""
     with contextlib.closing(make(environment)) as made:
         return made.spec and made.spec.max_episode_steps
 
 
 def measured(info: dict, name: str) -> float:
-    """What the last step's `info` says of a measure of the task. Raises `LareError` where it says nothing."""
+    """The value of a measure of the task in the last step's `info`. Raises `LareError` if it is missing."""
     if name not in info:
         keys = ", ".join(sorted(map(str, info)))
         raise LareError(f"the task measures {name!r}, but the last step's info has only {keys or 'nothing'}")

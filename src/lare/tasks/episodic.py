@@ -1,4 +1,4 @@
-"""The episodic setting: nothing is paid until the episode ends, and then everything at once."""
+"""The episodic setting: the whole return of an episode is paid at its last step, and nothing before."""
 
 import math
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from lare.errors import LareError, shortened
 
 TRUE_REWARD = "true_reward"
-"""Where `info` keeps the reward of the step."""
+"""The key of `info` for the true reward of the step."""
 
 
 class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
@@ -44,7 +44,7 @@ class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One step. Raises `LareError` where the last step's `info` has no score, and one is to be paid."""
+        """One step. Raises `LareError` if a score must be paid, and the last step's `info` has none."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.so_far += float(reward)
         paid = 0.0
@@ -57,14 +57,14 @@ def score_in(info: Mapping[str, Any], key: str) -> float:
     """The score of an episode, from the `info` of its last step.
 
     Raises:
-        LareError: it is not there, or no finite number.
+        LareError: it is missing or is not a finite number.
     """
     if key not in info:
         raise LareError(f"the info of the last step has no {key!r}: it has {', '.join(map(repr, info)) or 'nothing'}")
     try:
         score = float(info[key])
     except (TypeError, ValueError):
-        raise LareError(f"info[{key!r}] of the last step is {shortened(info[key])}, which is no score") from None
+        raise LareError(f"info[{key!r}] of the last step is {shortened(info[key])}, which is not a number") from None
     if not math.isfinite(score):
         raise LareError(f"info[{key!r}] of the last step is {score}: a score must be finite")
     return score

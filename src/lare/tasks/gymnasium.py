@@ -14,10 +14,10 @@ from lare.tasks.spec import TaskSpec
 
 
 class GymnasiumEnv:
-    """A `HostEnv` of a Gymnasium environment, with everything that it gives checked.
+    """A Gymnasium environment as a `HostEnv`. All values that the environment returns are checked.
 
     Raises:
-        LareError: the environment is not what the task says, or has no time limit.
+        LareError: the environment does not match the task, or has no time limit.
     """
 
     def __init__(self, task: TaskSpec, **kwargs: Any):
@@ -40,7 +40,7 @@ class GymnasiumEnv:
         return self.timestep(*self.environment.step(action[0]))
 
     def timestep(self, observation: Any, reward: Any, terminated: Any, truncated: Any, info: dict) -> Timestep:
-        """What the environment gave, checked."""
+        """Check the values that the environment returned, and convert them."""
         row = checked(observation, "observation", self.environment.observation_space.shape)
         paid = checked(reward, "reward", ())
         names = self.spec.measures
@@ -65,7 +65,7 @@ class GymnasiumEnv:
 
 
 def spec_of(task: TaskSpec, observations: Any, actions: Any) -> EnvSpec:
-    """Sizes and bounds. Raises `LareError` where they are not what the task says."""
+    """Sizes and bounds of the environment. Raises `LareError` if the spaces or the time limit cannot be used."""
     for key, space in (("observation", observations), ("action", actions)):
         if not isinstance(space, Box) or len(space.shape) != 1:
             raise LareError(
@@ -93,7 +93,7 @@ def spec_of(task: TaskSpec, observations: Any, actions: Any) -> EnvSpec:
 
 
 def checked(value: object, what: str, shape: tuple[int, ...] | None) -> np.ndarray:
-    """What an environment gave, as an array of its own. Raises `EnvironmentFault` where nothing can be learned from it."""
+    """A value from the environment, copied to an array. Raises `EnvironmentFault` if it cannot be used for training."""
     try:
         with np.errstate(over="ignore"):  # infinity is refused below
             array = np.array(value, np.float32)  # a copy: the environment may write the next one into the same memory

@@ -1,15 +1,15 @@
-"""MuJoCo tasks whose score no text tells: the bodies of HalfCheetah-v4 and Walker2d-v4, paid for something else.
+"""MuJoCo tasks whose score differs from their description: HalfCheetah-v4 and Walker2d-v4 with other rewards.
 
-What a language model reads is the text of the usual task, and so its recorded replies are those of the usual task. With v the
-speed that the step led to (entry 8 of the observation), a the action, and theta the angle of the front (left) foot (entry 7), a
-step pays:
+The language model reads the description of the original task, so the recorded replies of the original task are used. With v the
+speed after the step (entry 8 of the observation), a the action, and theta the angle of the front (left) foot (entry 7), the
+reward of a step is:
 
     Target        exp(-(v - v0)^2) - 0.02 |a|^2        a target speed
-    Threshold     1[v > v0] - 0.02 |a|^2               faster than that is fast enough, slower is worth nothing
-    Saturating    tanh(v) - 0.05 |a|^2                 faster is better, but less and less
-    Foot          v - 0.1 |a|^2 + theta                an entry that no factor sees
+    Threshold     1[v > v0] - 0.02 |a|^2               a minimum speed
+    Saturating    tanh(v) - 0.05 |a|^2                 faster is better, with a diminishing gain
+    Foot          v - 0.1 |a|^2 + theta                an entry that no factor depends on
 
-v0 is 2 m/s for HalfCheetah and 1 m/s for Walker2d. Episodes begin and end as usual.
+v0 is 2 m/s for HalfCheetah and 1 m/s for Walker2d. Episodes start and end as in the original task.
 """
 
 from collections.abc import Callable
@@ -22,10 +22,10 @@ from gymnasium.utils import RecordConstructorArgs
 
 FOOT, SPEED = 7, 8
 BODIES = {"HalfCheetah": 2.0, "Walker2d": 1.0}
-"""v0 (m/s), by body."""
+"""v0 (m/s) of each body."""
 
 Score = Callable[[np.ndarray, float, float], float]
-"""From the observation after a step, |a|^2 and v0 to what the step pays."""
+"""A function from the observation after a step, |a|^2 and v0 to the reward of the step."""
 
 SCORES: dict[str, Score] = {
     "Target": lambda after, effort, v0: np.exp(-((after[SPEED] - v0) ** 2)) - 0.02 * effort,
@@ -36,7 +36,7 @@ SCORES: dict[str, Score] = {
 
 
 class HiddenScore(gymnasium.Wrapper, RecordConstructorArgs):
-    """Pays for something that the task's text does not tell."""
+    """Replaces the reward by a score that the task's text does not describe."""
 
     def __init__(self, env: gymnasium.Env, score: str, v0: float):
         RecordConstructorArgs.__init__(self, score=score, v0=v0)
@@ -50,7 +50,7 @@ class HiddenScore(gymnasium.Wrapper, RecordConstructorArgs):
 
 
 def register() -> None:
-    """Make the environments known to Gymnasium; a second call changes nothing."""
+    """Register the environments with Gymnasium. Further calls change nothing."""
     for body, v0 in BODIES.items():
         usual = gymnasium.registry[f"{body}-v4"]
         for score in SCORES:

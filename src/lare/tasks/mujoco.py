@@ -1,4 +1,4 @@
-"""Tasks of our own on Gymnasium's MuJoCo environments."""
+"""Additional tasks on Gymnasium's MuJoCo environments."""
 
 from typing import Any
 
@@ -10,10 +10,10 @@ SPARSE_HALF_CHEETAH = "lare/HalfCheetahSparse-v4"
 
 
 class PaysForDistance(gymnasium.Wrapper, RecordConstructorArgs):
-    """Pays 1 at the end of an episode that has travelled further than `distance` metres, and else nothing.
+    """Pays 1 at the end of an episode that has travelled further than `distance` metres, and otherwise nothing.
 
-    The fully sparse task of the LaRe paper, appendix F.6: I(final travel distance > 500). The published code asks for a
-    summed forward reward above 1000 instead, which at 0.05 s a step are 50 m.
+    This is the fully sparse task of the LaRe paper, appendix F.6: I(final travel distance > 500). The published code requires a
+    summed forward reward above 1000 instead, which corresponds to 50 m at 0.05 s a step.
     """
 
     def __init__(self, env: gymnasium.Env, distance: float = 500.0):
@@ -28,10 +28,10 @@ class PaysForDistance(gymnasium.Wrapper, RecordConstructorArgs):
 
 
 def register() -> None:
-    """Make the environments known to Gymnasium; a second call changes nothing."""
+    """Register the environments with Gymnasium. Further calls change nothing."""
     if SPARSE_HALF_CHEETAH not in gymnasium.registry:
         usual = gymnasium.registry["HalfCheetah-v4"]
-        # As a wrapper of Gymnasium's, it lies around the time limit, whichever is asked for: it waits for the end.
+        # Gymnasium applies additional wrappers outside the time limit, so that this one sees the end of the episode.
         pays = WrapperSpec("PaysForDistance", f"{__name__}:PaysForDistance", {"distance": 500.0})
         gymnasium.register(
             SPARSE_HALF_CHEETAH,

@@ -1,4 +1,4 @@
-"""A first spec of any environment: sizes from its spaces, texts from its documentation, rewards left out."""
+"""Drafts a spec for any environment: sizes from its spaces, texts from its documentation, without the rewards."""
 
 import inspect
 import re
@@ -20,18 +20,18 @@ LEAKS = re.compile(
     r"|\b(average|cumulative|discounted|episodic?|expected|mean|the|total) returns?\b(?! to\b)",
     re.IGNORECASE,
 )
-"""What a language model must not read: it is to find out what matters, not to copy it."""
+"""Words about rewards, which the language model must not read: it must find out what matters, not copy the reward."""
 
 SHORTEST_SENTENCE = 8
-"""Words that are worth keeping on their own."""
+"""The start of a sentence is only kept if it has at least this many words."""
 
 SENTENCE = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
 FIGURE = re.compile(r"^```\{.*?^```|<[^<>\n]+>", re.MULTILINE | re.DOTALL)
 NOISE = re.compile(r"^!\[|^:?-{3,}|^```|^\s*$")
-SCORE = '# score = "average" # a mark, or a mean over the steps; "sum": it grows with their number. Without it, training finds out'
+SCORE = '# score = "average" # a mean over the steps, or a grade; "sum": a sum over the steps. If unset, training determines it'
 ELSEWHERE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.IGNORECASE)
-"""What says nothing without a page around it."""
+"""References to figures, which are useless outside the original page."""
 
 
 WANTED = {
@@ -43,26 +43,26 @@ WANTED = {
 
 @dataclass(frozen=True)
 class Draft:
-    """A spec to be read by a person before it is used."""
+    """A draft of a spec, which a person must read before it is used."""
 
     name: str
-    """Of the task; a good one for the file too."""
+    """The name of the task, which is also suitable as a file name."""
     toml: str
     missing: tuple[str, ...]
-    """Keys that have to be filled in."""
+    """The keys that must be filled in."""
     left_out: int
-    """Sentences and rows that spoke of rewards."""
+    """The number of sentences and table rows that were left out because they mention rewards."""
     teams: dict[str, str] = field(default_factory=dict)
-    """Specs of teams, by the names of the files that the spec says they are in."""
+    """The specs of the teams, by the file names that the spec refers to."""
     of_logs: bool = False
-    """Whether it speaks of logs, and of no environment."""
+    """Whether the task has only logs and no environment."""
 
 
 def draft(environment_id: str) -> Draft:
-    """Write down what an environment says of itself.
+    """Draft a spec from an environment's documentation and spaces.
 
     Raises:
-        LareError: it cannot be made, or its spaces are not numbers.
+        LareError: the environment cannot be made, or its spaces cannot be represented as rows of numbers.
     """
     if environment_id.startswith(PETTINGZOO):
         from lare.tasks.new_agents import draft_of_agents
@@ -98,7 +98,7 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
         "action": f"{entries(action_size)}{chosen(environment.action_space)}{bounds(environment.action_space)}.",
     }
     missing = tuple(key for key in texts if not texts[key])
-    # An id without a version means the latest one, which may be another one tomorrow.
+    # An id without a version means the latest version, which may change later.
     module, colon, _ = environment_id.rpartition(":")
     full_id = f"{module}{colon}{environment.spec.id}" if environment.spec else environment_id
     name = re.sub(r"[^\w.\-]+", "-", environment_id.rpartition(":")[2])
@@ -120,13 +120,13 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
 def warning(left_out: int) -> list[str]:
     return [
         "# A first draft, from the documentation of the environment. Read it before you use it: a language model will",
-        "# know nothing but these texts. Whatever spoke of rewards was left out on purpose, so that the reward does not",
-        f"# leak into the request ({left_out} sentences or rows); say what the goal is, not how it is paid.",
+        "# know only these texts. Whatever mentions rewards was left out on purpose, so that the request does not reveal the",
+        f"# reward ({left_out} sentences or rows). Describe the goal, not how it is rewarded.",
     ]
 
 
 def bodies(texts: Mapping[str, str], heads: Mapping[str, str]) -> list[str]:
-    """The texts of a spec, what is missing marked."""
+    """The texts of a spec. Missing texts are marked."""
     return [
         f"\n{key} = "
         + quoted("\n".join(part for part in (heads.get(key), text or f"{FILL_IN}: {WANTED[key]}") if part))
@@ -136,12 +136,12 @@ def bodies(texts: Mapping[str, str], heads: Mapping[str, str]) -> list[str]:
 
 def documented(environment: gymnasium.Env) -> dict[str, str]:
     """The sections of an environment's documentation."""
-    # Not inspect.getdoc: that of a base class says nothing about this environment.
+    # Not inspect.getdoc: it would return the docstring of a base class, which does not describe this environment.
     return sections_of(type(environment).__doc__ or "")
 
 
 def sections_of(documentation: str) -> dict[str, str]:
-    """The sections of a text, by their headings in small letters; "" is what comes first."""
+    """The sections of a text, by their headings in lower case; "" is the text before the first heading."""
     text = FIGURE.sub("", inspect.cleandoc(documentation))
     parts = HEADING.split(text)
     sections = {"": parts[0]}
@@ -151,7 +151,7 @@ def sections_of(documentation: str) -> dict[str, str]:
 
 
 def plain(text: str) -> list[str]:
-    """Lines of text and rows of tables, without their typesetting."""
+    """Lines of text and rows of tables, without markup."""
     lines: list[str] = []
     paragraph: list[str] = []
     for line in [*text.splitlines(), ""]:
@@ -175,7 +175,7 @@ def plain(text: str) -> list[str]:
 
 
 def row(line: str) -> str:
-    """A row of a table: its first cell, a colon, and the others. Empty where it is only a rule."""
+    """A row of a table: its first cell, a colon, and the other cells. Empty if the row is only a separator."""
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     cells = [cell for cell in cells if cell]
     if not cells or all(re.fullmatch(r":?-+:?", cell) for cell in cells):
@@ -184,13 +184,13 @@ def row(line: str) -> str:
 
 
 def without_rewards(lines: list[str]) -> tuple[str, int]:
-    """What is left of the lines when nothing in them speaks of rewards, and how many did."""
+    """The lines without everything that mentions rewards, and the number of lines that did."""
     kept = [without_clause(line) for line in lines]
     return "\n".join(line for line in kept if line), sum(line != was for line, was in zip(kept, lines, strict=True))
 
 
 def without_clause(line: str) -> str:
-    """A line up to the clause that speaks of rewards, if what is before it makes a sentence; else nothing."""
+    """A line up to the clause that mentions rewards, if the part before it is long enough for a sentence; else nothing."""
     found = LEAKS.search(line)
     if found is None:
         return line
@@ -199,7 +199,7 @@ def without_clause(line: str) -> str:
 
 
 def ending(sections: dict[str, str]) -> str:
-    """How an episode ends, where the documentation says so without speaking of rewards."""
+    """How an episode ends, if the documentation describes this without mentioning rewards."""
     for title in ("episode end", "episode termination"):
         kept, _ = without_rewards(plain(sections.get(title, "")))
         if kept:
@@ -234,7 +234,7 @@ def bounds(space: gymnasium.Space) -> str:
 
 
 def quoted(text: str) -> str:
-    """A text as TOML's string of several lines."""
+    """A text as a multi-line string in TOML."""
     escaped = text.replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
     escaped = re.sub(r"[\x00-\x08\x0b-\x1f\x7f]", lambda letter: f"\\u{ord(letter[0]):04x}", escaped)
     return f'"""\n{escaped}\n"""'

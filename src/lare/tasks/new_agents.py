@@ -1,4 +1,4 @@
-"""A first spec of a PettingZoo environment, and one for each of its teams where agents are of several kinds."""
+"""Drafts a spec for a PettingZoo environment and, if its agents are of several kinds, one for each team."""
 
 import inspect
 import json
@@ -29,14 +29,14 @@ from lare.tasks.pettingzoo import ParallelHost
 from lare.tasks.spec import PETTINGZOO, TaskSpec
 
 MAKERS = ("parallel_env", "env", "raw_env")
-"""Names by which an environment is made; the module's says more."""
+"""Common names of functions that make environments. For these, the draft is named after the module."""
 
 BESIDE = re.compile(r"^(This environment is part of|Please read that page)|\bobservations?( space)?: |\baction space: ")
-"""What belongs to other keys, or to nobody."""
+"""Lines that belong to other keys, or to none."""
 
 
 def draft_of_agents(environment_id: str) -> Draft:
-    """Write down what a PettingZoo environment says of itself. Raises `LareError` where it cannot be made."""
+    """Draft a spec from a PettingZoo environment's documentation and spaces. Raises `LareError` if it cannot be made."""
     environment = construct(environment_id, {})
     limit = limit_of(environment, {})
     kinds = list(dict.fromkeys(kind(name) for name in getattr(environment, "possible_agents", None) or ()))
@@ -59,8 +59,8 @@ def draft_of_agents(environment_id: str) -> Draft:
         own = {"description": texts["description"], "observation": "See the teams.", "action": "See the teams."}
         heads: dict[str, str] = {}
         head = [
-            "# Agents of each kind are a team, which learns for itself. If all of them are one team, leave this line out, and",
-            "# say below what the files of the teams say of observations and actions.",
+            "# The agents of each kind are a team, which learns on its own. If all agents are one team, remove this line and",
+            "# describe observations and actions below, as the files of the teams do.",
             f"teams = {json.dumps(list(specs))}",
         ]
     else:
@@ -74,8 +74,8 @@ def draft_of_agents(environment_id: str) -> Draft:
         *sizes,
         'judges = "after"',
         SCORE,
-        *([] if limit else ["max_episode_steps = 1000 # the environment tells no limit of its own"]),
-        *([f"# arguments = {{ {arguments} }} # unless this says something else"] if arguments else []),
+        *([] if limit else ["max_episode_steps = 1000 # the environment does not state its own limit"]),
+        *([f"# arguments = {{ {arguments} }} # the defaults, unless they are set here"] if arguments else []),
         *bodies(own, heads),
     ]
     missing = tuple(key for key in texts if not texts[key])
@@ -83,18 +83,18 @@ def draft_of_agents(environment_id: str) -> Draft:
 
 
 def stub(name: str, environment: str, **keys: Any) -> TaskSpec:
-    """A spec that only tells which agents there are: its sizes are what the draft is to find out."""
+    """A spec that only names the agents. Its sizes are placeholders, because the draft must determine them first."""
     texts = dict.fromkeys(("description", "observation", "action"), "-")
     return TaskSpec(name=name, environment=environment, observation_size=1, action_size=1, **texts, **keys)
 
 
 def patterns(name: str) -> tuple[str, ...]:
-    """What matches the agents of a kind: one without a number is called like its kind."""
+    """Patterns that match the agents of a kind. An agent without a number has the name of its kind."""
     return (name, f"{name}_[0-9]*", f"{name}[0-9]*")
 
 
 def documented(environment: Any) -> tuple[dict[str, str], int]:
-    """Texts by their keys, and how much was left out. Environments document themselves in their class, or in its module."""
+    """Texts by their keys, and how many lines were left out. The documentation is that of the class or of its module."""
     own = type(environment)
     module = sys.modules.get(own.__module__)
     sections = sections_of(max(vars(own).get("__doc__") or "", getattr(module, "__doc__", None) or "", key=len))
@@ -115,7 +115,7 @@ def documented(environment: Any) -> tuple[dict[str, str], int]:
 
 
 def rows_out(text: str) -> str:
-    """PettingZoo's pages begin with a table of what its own library does with them."""
+    """A text without tables: PettingZoo's pages begin with a table about the library, not about the task."""
     return "\n".join(line for line in text.splitlines() if not line.strip().startswith("|"))
 
 
@@ -148,7 +148,7 @@ def matched(pattern: str, names: Sequence[str]) -> bool:
 
 
 def heads_of(host: ParallelHost, team: Team) -> dict[str, str]:
-    """What the spaces say: of the first agent of a team, and of all beside it."""
+    """Descriptions of the spaces of a team's first agent, with the padding that other agents require."""
     first = host.agents[team.start]
     return {
         "observation": f"{entries(host.spec.observation_size)}{flattened(first.observation)}{padding(host, first)}.",
@@ -173,7 +173,7 @@ def chosen(host: ParallelHost, one: Agent) -> str:
 
 
 def defaults(environment: Any) -> str:
-    """Arguments of the environment's class that TOML can say, as a table."""
+    """The arguments of the environment's class that TOML can represent, as a table."""
     raw = getattr(environment, "unwrapped", environment)
     try:
         parameters = inspect.signature(type(raw).__init__).parameters.values()

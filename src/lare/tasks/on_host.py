@@ -1,4 +1,4 @@
-"""An environment of pure functions as one that steps on the host: to verify a function, or to look at it."""
+"""A `JaxEnv` that steps on the host, to verify a function or to inspect the environment."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from lare.tasks.env import JaxEnv, Timestep
 
 
 class OnHost:
-    """A `HostEnv` of a `JaxEnv`."""
+    """A `JaxEnv` as a `HostEnv`."""
 
     def __init__(self, env: JaxEnv):
         self.env, self.spec = env, env.spec
@@ -30,8 +30,8 @@ class OnHost:
         return jax.tree.map(np.asarray, timestep)
 
     def render(self) -> Any:
-        """Such environments are drawn by their own modules."""
-        raise LareError("an environment of pure functions has no window of its own")
+        """Not available: `JaxEnv.frames` draws such environments."""
+        raise LareError("an environment in JAX cannot be rendered step by step: its frames() draws whole episodes")
 
     def close(self) -> None:
         """There is nothing to close."""

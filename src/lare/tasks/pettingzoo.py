@@ -1,6 +1,6 @@
 """A PettingZoo environment as a `HostEnv`: `pettingzoo/MODULE:NAME`, where NAME makes a ParallelEnv.
 
-Everything that it gives is foreign, and checked. A run must not learn from what is none, nor wait for who has gone.
+All its output comes from foreign code, and is checked. A run must not learn from invalid values or wait for agents that have left.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from lare.tasks.spec import TaskSpec
 
 
 def make(task: TaskSpec, render_mode: str | None = None) -> "ParallelHost":
-    """The task's environment. Raises `LareError` where it cannot be made, or is not what the task says."""
+    """The task's environment. Raises `LareError` if it cannot be made, or does not match the task."""
     shown = {} if render_mode is None else {"render_mode": render_mode}
     environment = construct(task.environment, task.arguments | shown)
     try:
@@ -33,14 +33,14 @@ def make(task: TaskSpec, render_mode: str | None = None) -> "ParallelHost":
 
 
 class StateFault(LareError):
-    """An environment cannot say its state now."""
+    """An environment cannot return its state now."""
 
 
 class ParallelHost:
-    """A ParallelEnv whose agents stand in a row, whoever of them acts.
+    """A ParallelEnv whose agents have fixed places, no matter which of them act.
 
-    An agent that leaves while others stay observes zeros from then on. At an episode's last step nobody leaves: who acted
-    observes what that led to, which a step may be judged by.
+    If an agent leaves while others stay, it observes zeros from then on. At an episode's last step no agent leaves: those that
+    acted still observe the result, because `phi` may judge the step by it.
     """
 
     spec: EnvSpec
@@ -71,7 +71,7 @@ class ParallelHost:
         self.told = False
         self.looking, self.seed, self.steps = True, 0, 0
         self.clear()
-        first = self.reset(0)  # only an episode shows whether there is a state, and whether `info` has masks
+        first = self.reset(0)  # needed to find out whether there is a state, and whether `info` has masks
         self.looking = False
         low, high = rows_of.bounds(self.agents)
         self.spec = EnvSpec(
@@ -83,7 +83,7 @@ class ParallelHost:
             state_size=first.state.shape[-1],
             low=low,
             high=high,
-            agents_leave=True,  # nothing says that they do not
+            agents_leave=True,  # no environment states that they do not
             masks_actions=self.masks,
             measures=task.measures,
         )
@@ -92,7 +92,7 @@ class ParallelHost:
         self.alive = np.zeros(len(self.agents), bool)
         self.present: set[Any] = set()
         self.gone: set[Any] = set()
-        """Who has left, and may not come back."""
+        """The agents that have left. They must not come back."""
 
     def reset(self, seed: int) -> Timestep:
         """The first step of an episode: the same for the same seed."""
@@ -120,10 +120,10 @@ class ParallelHost:
         before, self.present = self.present, self.present_now()
         self.gone |= before - self.present
         for name in (self.present - before) & self.gone:
-            raise LareError(f"environment {self.name!r} has {name} back, which had left, {self.where}")
+            raise LareError(f"environment {self.name!r} brought back {name}, which had left, {self.where}")
         reward = np.zeros(len(self.agents), np.float32)
         for one in acted:
-            if one.name in self.present:  # who has left may be missing everywhere
+            if one.name in self.present:  # an agent that has left may be missing everywhere
                 for what, values in (
                     ("rewards", rewards),
                     ("terminations", terminations),
@@ -151,13 +151,13 @@ class ParallelHost:
         pixels = self.call("render")
         if not isinstance(pixels, np.ndarray) or pixels.ndim != 3 or pixels.shape[2] != 3:
             raise LareError(
-                f"environment {self.name!r} draws {shortened(pixels)}, no pixels (height, width, 3): "
-                "does it know the render mode 'rgb_array'?"
+                f"environment {self.name!r} renders {shortened(pixels)}, not pixels (height, width, 3): "
+                "does it support the render mode 'rgb_array'?"
             )
         return pixels
 
     def close(self) -> None:
-        """Give back what the environment holds."""
+        """Release the resources of the environment."""
         self.call("close")
 
     @property
@@ -165,7 +165,7 @@ class ParallelHost:
         return f"{f'at step {self.steps}' if self.steps else 'at the start'} of the episode of seed {self.seed}"
 
     def call(self, what: str, *arguments: Any, **options: Any) -> Any:
-        """Whatever foreign code raises is a `LareError` of one line."""
+        """Call a method of the environment. Whatever it raises becomes a `LareError` of one line."""
         try:
             return getattr(self.environment, what)(*arguments, **options)
         except (Exception, SystemExit) as error:
@@ -181,7 +181,7 @@ class ParallelHost:
         return self.call("observation_space", name), self.call("action_space", name)
 
     def check_unchanged(self) -> None:
-        """Raise `LareError` where agents or spaces are not those that training was set up for."""
+        """Raise `LareError` if agents or spaces differ from those that training was set up for."""
         if set(names := self.names()) != set(self.declared):
             raise LareError(
                 f"environment {self.name!r} has changed its possible agents from "
@@ -196,7 +196,7 @@ class ParallelHost:
                     )
 
     def parts(self, answer: Any, wanted: tuple[str, ...]) -> list[Mapping[Any, Any]]:
-        """What `reset` or `step` returned: dictionaries by the agents' names."""
+        """Check what `reset` or `step` returned: one dictionary, by the agents' names, for each of `wanted`."""
         if not isinstance(answer, tuple) or len(answer) != len(wanted):
             raise LareError(
                 f"environment {self.name!r} returned {shortened(answer)} {self.where}, not {', '.join(wanted)}"
@@ -228,7 +228,7 @@ class ParallelHost:
             return values[name]
         except KeyError:
             raise LareError(
-                f"environment {self.name!r} gave no {what} for {name} {self.where}, which is among its agents"
+                f"environment {self.name!r} gave no {what} for {name} {self.where}, although it is among its agents"
             ) from None
 
     def paid(self, name: Any, value: Any) -> float:
@@ -242,7 +242,8 @@ class ParallelHost:
             return bool(value)
         except (TypeError, ValueError):
             raise LareError(
-                f"environment {self.name!r} gave {shortened(value)} for the {what} of {name} {self.where}, no truth value"
+                f"environment {self.name!r} gave {shortened(value)} for the {what} of {name} {self.where}, which is not a truth "
+                "value"
             ) from None
 
     def shown(
@@ -255,7 +256,7 @@ class ParallelHost:
         terminated: bool = False,
         truncated: bool = False,
     ) -> Timestep:
-        """A step. `acting` are those that could go on: at an episode's end a mask says nothing."""
+        """A step. `acting` are the agents that can continue: at an episode's end, masks are ignored."""
         seen: dict[int, np.ndarray] = {}
         available = self.full.copy()
         for place, one in enumerate(self.agents):
@@ -287,13 +288,13 @@ class ParallelHost:
             raise LareError(f"environment {self.name!r}: the observation of {one.name} {self.where} {error}") from None
 
     def restrict(self, available: Bool[np.ndarray, " action"], one: Agent, given: Any, info: Any) -> None:
-        """Strike out what the agent's mask does, wherever that stands."""
+        """Apply the agent's mask, from the observation or from `info`, to `available`."""
         told = given[MASK] if one.masked else info.get(MASK) if isinstance(info, Mapping) else None
         if told is None:
             return
         try:
             if not one.discrete:
-                raise ValueError(f"masks no choices, but {shortened(one.action)}")
+                raise ValueError(f"applies to {shortened(one.action)}, which is not discrete")
             available[: one.action_size] = rows_of.mask(told, one.action_size)
         except ValueError as error:
             raise LareError(f"environment {self.name!r}: the action mask of {one.name} {self.where} {error}") from None
@@ -305,7 +306,7 @@ class ParallelHost:
             )
 
     def state(self, observation: Float[np.ndarray, "agents observation"]) -> Float[np.ndarray, " state"]:
-        """The environment's own, if it has one; else all observations, where a step is judged by the state."""
+        """The environment's own state. Without one, all observations if steps are judged by the state, else an empty array."""
         if self.looking:
             self.last_state = self.own_state()
         elif self.last_state is not None:
@@ -324,7 +325,7 @@ class ParallelHost:
             value = self.environment.state()
         except (Exception, SystemExit) as error:
             if self.looking and isinstance(error, NotImplementedError):
-                return None  # PettingZoo's base class says so of those that have none
+                return None  # from PettingZoo's base class: the environment has no state
             raise StateFault(str(fault(f"environment {self.name!r} failed in state {self.where}", error))) from error
         try:
             return rows_of.finite(value, shape)
@@ -332,15 +333,15 @@ class ParallelHost:
             raise LareError(f"environment {self.name!r}: the state {self.where} {error}") from None
 
     def stand_in(self, error: "StateFault") -> None:
-        """Some (multiwalker) have no state any more once an agent has fallen. Where only a critic sees it, the last one will do."""
+        """Keep the previous state if only a critic needs it. Multiwalker, for example, has no state once an agent has fallen."""
         if self.judged_from_state:
             raise error
         if not self.told:
-            logging.getLogger(__name__).warning("%s; the state before it stands for it", error)
+            logging.getLogger(__name__).warning("%s; the previous state is used instead", error)
         self.told = True
 
     def measures(self, infos: Mapping[Any, Any], last: bool) -> dict[str, Float[Numbers, ""]]:
-        """Of the last step, the mean over the agents that tell it."""
+        """The measures of the last step: means over the agents whose `info` has them."""
         return {name: np.array(self.measured(infos, name) if last else 0, np.float32) for name in self.task.measures}
 
     def measured(self, infos: Mapping[Any, Any], name: str) -> float:

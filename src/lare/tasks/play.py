@@ -1,4 +1,4 @@
-"""Episodes of a task as one of its roles is judged: before training, to verify a latent function and to see what it says."""
+"""Plays episodes of a task from the view of one of its roles, to verify and examine latent functions before training."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -12,12 +12,12 @@ from lare.tasks.spec import TaskSpec
 from lare.tasks.table import make_host_env
 
 Policy = Callable[[np.ndarray], np.ndarray]
-"""From one observation of a single agent to one action of the environment."""
+"""A function from one observation of a single agent to one action of the environment."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One whole episode. A step has one row for each agent of the role's team, or a single one where the state is judged."""
+    """One whole episode. A step has one row for each agent of the role's team, or one row in total if the state is judged."""
 
     before: Float[np.ndarray, "steps rows observation"]
     action: Float[np.ndarray, "steps rows action"]
@@ -26,24 +26,24 @@ class Episode:
     alive: Bool[np.ndarray, "steps rows"]
     """Whether a row's agent acted."""
     reward: Float[np.ndarray, "steps rows"]
-    """True; the team's where the state is judged."""
+    """The true reward: each agent's, or the team's if the state is judged."""
     team_reward: Float[np.ndarray, " steps"]
 
     @property
     def total(self) -> float:
-        """R."""
+        """The return R."""
         return float(sum(self.team_reward))
 
 
 def team_of(role: TaskSpec, spec: EnvSpec) -> Team:
-    """The team that a spec speaks of; the first where it names none."""
+    """The team that a spec names; the first team if it names none."""
     return next((team for team in spec.teams if team.name == role.team), spec.teams[0])
 
 
 def rows_of(
     role: TaskSpec, team: Team, shown: Timestep, action: Float[np.ndarray, "*batch agents action"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What a role's function is given of some steps: observations and actions, [*batch rows ...]."""
+    """The inputs of a role's function at some steps: observations and actions, [*batch rows ...]."""
     of_team = action[..., team.agents, :]
     if role.judged_from == "observation":
         return shown.observation[..., team.agents, :], of_team
@@ -58,7 +58,7 @@ def episodes_of(role: TaskSpec, count: int, policy: Policy | None = None, seed: 
 
 
 def episode_of(env: HostEnv, role: TaskSpec, policy: Policy | None, random: np.random.Generator, seed: int) -> Episode:
-    """One of them."""
+    """One episode."""
     team, columns = team_of(role, env.spec), []
     for before, action, after in steps_of(env, policy, random, seed):
         shown, taken = rows_of(role, team, before, action)
@@ -73,7 +73,7 @@ def episode_of(env: HostEnv, role: TaskSpec, policy: Policy | None, random: np.r
 def steps_of(
     env: HostEnv, policy: Policy | None, random: np.random.Generator, seed: int
 ) -> Iterator[tuple[Timestep, np.ndarray, Timestep]]:
-    """The steps of one episode: what each set out from, what was done, what it led to."""
+    """The steps of one episode: for each, the timestep before it, the action, and the timestep after it."""
     timestep, ended = env.reset(seed), False
     while not ended:
         before = timestep
@@ -84,6 +84,6 @@ def steps_of(
 
 
 def random_action(spec: EnvSpec, shown: Timestep, random: np.random.Generator) -> Float[np.ndarray, "agents action"]:
-    """Uniform within the bounds, or over the choices that each agent has."""
+    """A random action: uniform within the bounds, or over the available choices of each agent."""
     drawn = random.uniform(-1, 1, (spec.agents, spec.action_size)).astype(np.float32)
     return in_units(np.where(shown.available, drawn, -np.inf) if spec.discrete else drawn, spec)

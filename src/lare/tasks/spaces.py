@@ -1,4 +1,4 @@
-"""Spaces of every shape as rows of numbers: observations flattened, a choice among n as n numbers."""
+"""Represents all spaces as rows of numbers: observations are flattened, discrete actions are encoded one-hot."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 
 class OneHot(Box):
-    """One of n actions, as a row with a single 1. Other rows stand for the action at their largest number."""
+    """One of n actions, encoded one-hot. Any other row stands for the action at its largest number."""
 
     def __init__(self, n: int, start: int = 0, seed: int | np.random.Generator | None = None):
         super().__init__(0, 1, (n,), np.float32, seed)
@@ -22,19 +22,19 @@ class OneHot(Box):
         return self.chosen(super().sample(*args, **kwargs))
 
     def chosen(self, row: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """The row with a single 1 that a row stands for."""
+        """The one-hot row of the action that a row stands for."""
         return np.eye(len(row), dtype=np.float32)[int(np.argmax(row))]
 
     def number(self, row: Float[np.ndarray, " n"]) -> int:
-        """The action that a row stands for, as the environment counts them."""
+        """The number that the environment gives to the action of a row."""
         return self.start + int(np.argmax(row))
 
 
 class OneHotAction(gymnasium.ActionWrapper, RecordConstructorArgs):
-    """Lets an environment of discrete actions take rows."""
+    """Makes an environment with discrete actions accept one-hot rows."""
 
     def __init__(self, env: gymnasium.Env):
-        RecordConstructorArgs.__init__(self)  # without which Gymnasium could not make the same environment again
+        RecordConstructorArgs.__init__(self)  # required by Gymnasium to make the same environment again
         super().__init__(env)
         assert isinstance(env.action_space, Discrete)
         self.choice = OneHot(int(env.action_space.n), int(env.action_space.start))
@@ -45,7 +45,7 @@ class OneHotAction(gymnasium.ActionWrapper, RecordConstructorArgs):
 
 
 def as_rows(environment: gymnasium.Env) -> gymnasium.Env:
-    """The environment with observations and actions that are rows of numbers, where they can be."""
+    """The environment with observations and actions as rows of numbers, as far as this is possible."""
     if isinstance(environment.action_space, Discrete):
         environment = OneHotAction(environment)
     observations = environment.observation_space

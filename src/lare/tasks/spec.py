@@ -13,37 +13,39 @@ from lare.errors import Checked, LareError, did_you_mean, shortened
 from lare.foreign import LARGEST_SETTINGS, read_text, read_toml
 
 Judges = Literal["before", "after", "both"]
-"""Which observation `phi` judges a step by: that before the action, that which the action led to, or both, one after
-the other with their factors put side by side."""
+"""The observation by which `phi` judges a step: the one before the action, the one after it, or both. For both, `phi` is
+called on each, and the factors are concatenated."""
 
 JudgedFrom = Literal["observation", "state"]
-"""What a step is judged by: each agent's own observation and action, or the global state and all actions side by side."""
+"""The inputs by which a step is judged: each agent's own observation and action, or the global state and all actions, which
+are concatenated."""
 
 SHIPPED = files("lare.tasks") / "specs"
 
 PETTINGZOO = "pettingzoo/"
-"""What the environment of a spec begins with where it is a PettingZoo environment; the rest is MODULE:NAME."""
+"""The prefix of PettingZoo environments in a spec. The rest is MODULE:NAME."""
 
 OF_THE_ENVIRONMENT = ("environment", "arguments", "max_episode_steps", "judged_from", "judges")
-"""Keys that a team has from its task. Its own spec may say them too, to be used alone, but nothing else."""
+"""Keys that a team inherits from its task. The team's own spec may repeat them, so that it can be used alone, but with no other
+values."""
 
 NO_ENVIRONMENT = "none"
-"""Stands for the environment in a spec of logs, whose environment is not at hand."""
+"""The value of `environment` in a spec for logs, whose environment is not available."""
 
 FILL_IN = "FILL IN"
-"""Stands in a new spec where nobody has said something yet."""
+"""The placeholder in a new spec for texts that must still be written."""
 
 
 class TaskSpec(Checked):
-    """What is to be solved."""
+    """A task: an environment and the texts that describe it."""
 
     model_config = ConfigDict(str_strip_whitespace=True)
 
     name: Annotated[str, Field(min_length=1, pattern=r"^[\w.\-]+$")]
-    """What the task is called, in commands and in the names of runs."""
+    """The name of the task in commands and in the names of runs."""
     environment: Annotated[str, Field(min_length=1)]
-    """Gymnasium id, where `module:id` imports the module that registers it first; or the name of another family's environment,
-    as `particles/CN-6`; or `none`, where there are logs only: functions are designed and logs relabelled, and nothing trains."""
+    """A Gymnasium id (`module:id` first imports the module that registers it), or the name of another family's environment, such as
+    `particles/CN-6`, or `none` if there are only logs: functions are then designed and logs relabelled, but nothing is trained."""
     observation_size: Annotated[int, Field(ge=1)]
     action_size: Annotated[int, Field(ge=1)]
     judges: Judges = "after"
@@ -54,38 +56,38 @@ class TaskSpec(Checked):
     action: Annotated[str, Field(min_length=1)]
     """What each entry of the action means."""
     max_episode_steps: Annotated[int | None, Field(ge=1)] = None
-    """Time limit, for an environment that has none of its own; or of the episodes of logs."""
+    """The time limit of an environment that has none of its own, or of the episodes of logs."""
     score: Literal["sum", "average"] | None = None
-    """Whether what an episode returns is a sum over its steps, or an average or a mark, which does not grow with them. Where the
-    task does not say, training finds out which predicts returns better."""
+    """Whether the return of an episode is a sum over its steps, or an average or a grade, which does not grow with the number of
+    steps. If it is not set, training determines which of them predicts returns better."""
     measures: tuple[str, ...] = ()
-    """Keys of the last step's `info` that are averaged and reported beside the return."""
+    """Keys of the last step's `info` whose values are averaged and reported in addition to the return."""
     arguments: dict[str, Any] = Field(default_factory=dict)
-    """Keyword arguments of the environment, where it is made from a module (`pettingzoo/...`); refused elsewhere."""
+    """Keyword arguments of the environment. Only for environments that are made from a module (`pettingzoo/...`)."""
     agents: tuple[str, ...] = ()
-    """Names, or patterns of names like `prey_*`, of the agents that this spec speaks of; all of them, unless given. Only where
-    agents have names (`pettingzoo/...`)."""
+    """The names of the agents that this spec describes, or patterns of names such as `prey_*`; by default all agents. Only for
+    environments whose agents have names (`pettingzoo/...`)."""
     judged_from: JudgedFrom = "observation"
-    """Whether `phi` judges each agent's step by what the agent observes, or the whole team's by the global state."""
+    """Whether `phi` judges each agent's step by the agent's observation, or the whole team's step by the global state."""
     teams: tuple["TaskSpec", ...] = ()
-    """Where several teams learn, each for itself: a spec for each, with texts of its own. In TOML, their names."""
+    """If several teams learn separately: one spec for each team, with its own texts. In TOML, the names of these specs."""
     team: str | None = None
-    """The team that this spec speaks of, where it is one of several of its environment."""
+    """The team that this spec describes, if its environment has several teams."""
 
     @field_validator("arguments")
     @classmethod
     def can_be_kept(cls, arguments: dict[str, Any]) -> dict[str, Any]:
         try:
-            json.dumps(arguments, allow_nan=False)  # as a run keeps its task, and would come back with something else
+            json.dumps(arguments, allow_nan=False)  # a run stores its task as JSON, which would change such values
         except (TypeError, ValueError):
-            raise ValueError("a run cannot keep dates, inf or nan: numbers, strings, lists and tables only") from None
+            raise ValueError("a run cannot store dates, inf or nan: use numbers, strings, lists and tables") from None
         return arguments
 
     @model_validator(mode="after")
     def is_filled_in(self) -> "TaskSpec":
         for key in ("description", "observation", "action"):
             if FILL_IN in getattr(self, key):
-                raise ValueError(f"{key} still says {FILL_IN!r}: say there what a language model must know")
+                raise ValueError(f"{key} still says {FILL_IN!r}: replace it by what a language model must know")
         return self
 
     @model_validator(mode="after")
@@ -93,18 +95,18 @@ class TaskSpec(Checked):
         for role in self.teams:
             if role.environment != self.environment or role.team is None:
                 raise ValueError(
-                    f"{role.name} is no team of {self.environment}: it needs the same environment, and a team"
+                    f"{role.name} is not a team of {self.environment}: its spec needs the same environment, and the key team"
                 )
         return self
 
     @property
     def family(self) -> str:
-        """What stands before the first slash of the environment: see `table.py`."""
+        """The part of `environment` before the first slash: see `table.py`."""
         return self.environment.partition("/")[0] if "/" in self.environment else ""
 
     @property
     def environment_name(self) -> str:
-        """What stands behind it."""
+        """The part of `environment` after the first slash."""
         return self.environment.partition("/")[2]
 
     @property
@@ -114,7 +116,7 @@ class TaskSpec(Checked):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of everything that the spec says."""
+        """SHA-256 of the whole spec."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
 
@@ -124,14 +126,14 @@ def shipped_tasks() -> list[str]:
 
 
 def as_task(given: TaskSpec | str | Path, playable: bool = True) -> TaskSpec:
-    """A task by itself, by its shipped name, or by the path of its file.
+    """A task from a spec, a shipped name, or the path of a file.
 
     Args:
-        given: one of these.
-        playable: whether its environment must be there, and be as the task says.
+        given: the spec, the name or the path.
+        playable: whether the environment must exist and match the task.
 
     Raises:
-        LareError: it is none of these; and as `load_task`.
+        LareError: `given` is none of these; and as for `load_task`.
     """
     if isinstance(given, TaskSpec):
         return given
@@ -147,7 +149,7 @@ def load_task(task: str | Path) -> TaskSpec:
         task: a shipped name (`shipped_tasks()`), or the path of a TOML file.
 
     Raises:
-        LareError: there is no such task, the file is not a spec, or the environment is not what the spec says.
+        LareError: there is no such task, the file is not a spec, or the environment does not match the spec.
 
     >>> load_task("HalfCheetah-v4").action_size
     6
@@ -167,7 +169,7 @@ def read_task(task: str | Path) -> TaskSpec:
 
 
 def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The keys of a spec, those of the spec that it is `like` filled in."""
+    """The keys of a spec. Missing keys are taken from the spec that it is `like`."""
     if task in shipped_tasks():
         text = (SHIPPED / f"{task}.toml").read_text(encoding="utf-8")
     elif is_file(task):
@@ -185,7 +187,7 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
         )
     try:
         values = read_toml(text)
-    except ValueError as error:  # TOMLDecodeError is one; a number without end is another
+    except ValueError as error:  # TOMLDecodeError, or a number with too many digits
         raise LareError(f"task {task!r} is not valid TOML: {error}") from error
     like, teams = values.get("like"), values.get("teams")
 
@@ -193,9 +195,9 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
         return isinstance(name, str) and beside(task, name) not in (*seen, task)
 
     if not (like is None or other(like)):
-        raise LareError(f"task {task!r}: like = {like!r} must be another task, without a circle")
+        raise LareError(f"task {task!r}: like = {like!r} must be another task, without a cycle")
     if not (teams is None or (isinstance(teams, list) and all(map(other, teams)))):
-        raise LareError(f"task {task!r}: teams = {teams!r} must be a list of other tasks, without a circle")
+        raise LareError(f"task {task!r}: teams = {teams!r} must be a list of other tasks, without a cycle")
     if "teams" in values:
         shared = {key: values[key] for key in OF_THE_ENVIRONMENT if key in values}
         values["teams"] = [shared | read_values(beside(task, team), (*seen, task)) for team in values["teams"]]
@@ -204,7 +206,7 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
 
 
 def beside(task: str, named: str) -> str:
-    """A task that another one names. A path is meant from the folder of the file that it stands in."""
+    """A task that the file of `task` names. A path is relative to the folder of this file."""
     near = str(Path(task).parent / named)
     return near if task not in shipped_tasks() and is_file(near) else named
 
@@ -217,7 +219,7 @@ def is_file(name: str) -> bool:
 
 
 def the_role(spec: TaskSpec) -> TaskSpec:
-    """The spec, if it speaks of one role. Raises `LareError` where teams have specs of their own."""
+    """The spec, if it describes a single role. Raises `LareError` if its teams have their own specs."""
     if spec.teams:
         names = ", ".join(role.name for role in spec.roles)
         raise LareError(f"{spec.name} has a latent function for each of its teams: name one of {names} instead")
@@ -225,8 +227,8 @@ def the_role(spec: TaskSpec) -> TaskSpec:
 
 
 def check_against_environment(spec: TaskSpec) -> None:
-    """Make the environment once and compare. Raises `LareError` at the first thing that does not fit."""
-    from lare.tasks.table import check_logs, env_spec  # which knows all families, as this file need not
+    """Make the environment and compare it with the spec. Raises `LareError` at the first mismatch."""
+    from lare.tasks.table import check_logs, env_spec  # imported here, because `table` imports this module
 
     if spec.environment == NO_ENVIRONMENT:
         check_logs(spec)

@@ -1,7 +1,7 @@
-"""SMAC (Samvelyan et al., 2019): battles of StarCraft II itself, one game in a process beside this one.
+"""SMAC (Samvelyan et al., 2019): battles in StarCraft II itself, which runs in a separate process.
 
-The package is `smacv2` (Ellis et al., 2023) or `smac`, from their repositories: what PyPI calls `smac` is something else. The
-game and SMAC's maps come on their own.
+The package is `smacv2` (Ellis et al., 2023) or `smac`, from their repositories: `smac` on PyPI is another project. The game and
+SMAC's maps must be installed separately.
 """
 
 import importlib
@@ -19,25 +19,25 @@ from lare.errors import LareError
 from lare.tasks.env import EnvSpec, Team, Timestep
 
 NAMESPACE = "smac/"
-"""What the environment of such a task's spec begins with; the rest is the map's name."""
+"""The prefix of such environments in a spec. The rest is the map's name."""
 PACKAGES = {"smacv2.env": "smacv2.env", "smac.env.starcraft2": "smac.env"}
-"""Modules that only these packages have, and where each has its game."""
+"""For each package, a module that no other package has, and the module that contains the game."""
 DIFFICULTY = "7"
-"""Of the game's own player: "very hard", on which results are reported."""
+"""The difficulty of the game's built-in opponent: "very hard", for which results are usually reported."""
 CRASHES = 3
-"""In a row, without an episode between them that came to its end: then it is not chance."""
+"""After this many crashes in a row, without a complete episode between them, the run fails."""
 NOTHING = 0
-"""The choice of the dead, and of nobody else."""
+"""The only choice of dead units. Living units do not have it."""
 
 
 class StarCraft:
     """A map of SMAC as a `HostEnv`. Its choices are SMAC's: nothing, stop, north, south, east, west, and to attack each enemy.
 
     Args:
-        name: the map's.
-        relaunch: start the game anew at each `reset`, with its seed. SMAC takes a seed only there, and a start takes many
-            seconds; otherwise only the first episode is that of its seed, and the later ones continue its chance.
-        game: makes the game, if it is not the installed package's.
+        name: the name of the map.
+        relaunch: start the game again at each `reset`, with the given seed. SMAC accepts a seed only at the start of a game, and
+            a start takes many seconds. Without it, only the first episode follows its seed, and later ones continue from there.
+        game: a function that makes the game, in place of the installed package.
     """
 
     spec: EnvSpec
@@ -66,17 +66,17 @@ class StarCraft:
         )
 
     def launch(self, seed: int) -> Any:
-        """A game with this seed; StarCraft II itself starts with the first episode."""
+        """Make a game with this seed. StarCraft II itself only starts with the first episode."""
         self.close()
         try:
             self.game = self.make(map_name=self.name, difficulty=DIFFICULTY, seed=seed)
-        except Exception as error:  # whatever the package raises about a map or the game
+        except Exception as error:  # the package may raise anything about a map or the game
             raise LareError(f"SMAC cannot make {self.name!r}: {one_line(error)}") from error
         return self.game
 
     def reset(self, seed: int) -> Timestep:
         """The first step of an episode."""
-        # Until an episode has ended, SMAC's reset would start another game beside the one that runs.
+        # Before an episode has ended, SMAC's reset would start another game in addition to the running one.
         if self.relaunch or not self.goes_on:
             self.launch(seed)
         try:
@@ -87,10 +87,10 @@ class StarCraft:
         return self.show(np.zeros(self.spec.agents, np.float32), over=False, won=False)
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        """One step. An episode in which the game crashes is truncated there, and the next `reset` starts the game again.
+        """One step. If the game crashes, the episode is truncated, and the next `reset` starts the game again.
 
         Raises:
-            LareError: an agent chose an action that is not available, or the game crashes again and again.
+            LareError: an agent chose an action that is not available, or the game has crashed too often.
         """
         choice = np.argmax(action, axis=1)
         for agent, one in enumerate(choice):
@@ -98,7 +98,7 @@ class StarCraft:
                 raise LareError(f"agent {agent} of {self.name} chose action {one}, which is not available to it now")
         lived = self.alive
         reward, over, info = self.game.step([int(one) for one in choice])
-        if over and not info:  # all that SMAC says of a crash
+        if over and not info:  # SMAC reports a crash only in this way
             return self.crashed()
         self.steps += 1
         if over:
@@ -107,7 +107,7 @@ class StarCraft:
         return self.show(paid, over=bool(over), won=bool(info.get("battle_won", False)))
 
     def crashed(self) -> Timestep:
-        """The step in which the game crashed: it paid nothing, and the episode ends with what was shown before it."""
+        """The step in which the game crashed: its reward is 0, and it repeats the previous observations and ends the episode."""
         said = f"StarCraft II crashed in step {self.steps + 1} of an episode of {self.name}"
         self.goes_on, self.crashes = False, self.crashes + 1
         if self.crashes == CRASHES:
@@ -116,7 +116,7 @@ class StarCraft:
         return self.shown._replace(reward=np.zeros_like(self.shown.reward), truncated=np.array(True))
 
     def show(self, paid: Float[np.ndarray, " agents"], over: bool, won: bool) -> Timestep:
-        """What is seen after a step that paid so much. To SMAC the end of the time is an end like the others."""
+        """The timestep after a step with this reward. SMAC itself does not distinguish truncation from termination."""
         self.available = np.array(self.game.get_avail_actions(), bool)
         self.alive = living(self.available)
         late = self.steps >= self.spec.max_steps
@@ -145,12 +145,12 @@ class StarCraft:
 
 
 def living(available: Bool[np.ndarray, "agents choices"]) -> Bool[np.ndarray, " agents"]:
-    """Who acts now: only the dead may do nothing."""
+    """Which units are alive: only dead units have the choice `NOTHING`."""
     return ~available[:, NOTHING]
 
 
 def find_game() -> Callable[..., Any]:
-    """What makes a game.
+    """The function that makes a game.
 
     Raises:
         LareError: the package or StarCraft II is missing.
@@ -168,7 +168,7 @@ def find_game() -> Callable[..., Any]:
         )
     try:
         return importlib.import_module(found[0]).StarCraft2Env
-    except (ImportError, AttributeError, TypeError) as error:  # TypeError: an old protocol buffer beside a new protobuf
+    except (ImportError, AttributeError, TypeError) as error:  # TypeError: old protocol buffers with a new protobuf
         raise LareError(f"{found[0]} cannot be imported: {one_line(error)}") from error
 
 

@@ -1,7 +1,7 @@
-"""The table of families: from what a task calls its environment to the environment.
+"""The table of families, which maps the name of a task's environment to the environment.
 
-What stands before the first slash names the family; every other name is one of Gymnasium's. A new family is one module with a
-class that is a `JaxEnv` or a `HostEnv`, and one row here, which says what it reads of a task.
+The part before the first slash is the family's name; all other names belong to Gymnasium. A new family is one module with a
+class that is a `JaxEnv` or a `HostEnv`, and one row here, which lists the keys of a task that the family reads.
 """
 
 import functools
@@ -13,14 +13,14 @@ from lare.tasks.env import EnvSpec, HostEnv, JaxEnv
 from lare.tasks.spec import NO_ENVIRONMENT, OF_THE_ENVIRONMENT, TaskSpec
 
 NOT_FOR_ALL = ("max_episode_steps", "arguments", "agents")
-"""Keys of a task that only some families read. The others refuse them: what is said and not heard would mislead."""
+"""Keys of a task that only some families read. The other families refuse them, because ignoring them would mislead the user."""
 
 
 class Family(NamedTuple):
     """A row of the table."""
 
     make: Callable[..., JaxEnv | HostEnv]
-    """From a task to its environment."""
+    """Makes the environment of a task."""
     reads: tuple[str, ...] = ()
     """Which of `NOT_FOR_ALL` this family reads."""
 
@@ -71,17 +71,17 @@ def no_environment(task: TaskSpec, **_: Any) -> HostEnv:
 
 
 LOGS = Family(no_environment, reads=("max_episode_steps",))
-"""Of a task that speaks of logs only."""
+"""The family of a task with logs only."""
 
 GYMNASIUM = Family(gymnasium, reads=("max_episode_steps",))
-"""Of every other name."""
+"""The family of all other names."""
 
 
 def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
-    """A task's environment; `kwargs` go to the constructor of one on the host.
+    """A task's environment. `kwargs` are passed to the constructor of an environment on the host.
 
     Raises:
-        LareError: it cannot be made, or is not what the task says.
+        LareError: the environment cannot be made, or does not match the task.
     """
     family = LOGS if task.environment == NO_ENVIRONMENT else FAMILIES.get(task.family, GYMNASIUM)
     check_keys(task, family)
@@ -96,7 +96,7 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
 
 
 def env_spec(task: TaskSpec) -> EnvSpec:
-    """Sizes and bounds of a task's environment, which is made for it once. Raises `LareError` as `make_env`."""
+    """Sizes and bounds of a task's environment, which is made once to read them. Raises `LareError` as `make_env` does."""
     return known_spec(task.model_dump_json())
 
 
@@ -109,7 +109,7 @@ def known_spec(task: str) -> EnvSpec:
 
 
 def check_logs(task: TaskSpec) -> None:
-    """Raise `LareError` where a task that speaks of logs only says what only an environment could hear."""
+    """Raise `LareError` if a task with logs only has keys that need an environment."""
     check_keys(task, LOGS)
     usual = {"teams": (), "team": None, "measures": (), "judged_from": "observation"}
     for key, nothing in usual.items():
@@ -118,7 +118,7 @@ def check_logs(task: TaskSpec) -> None:
 
 
 def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
-    """The same on the host, whatever it is."""
+    """A task's environment as a `HostEnv`, even if it is a `JaxEnv`."""
     env = make_env(task, **kwargs)
     if isinstance(env, HostEnv):
         return env
@@ -128,7 +128,7 @@ def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
 
 
 def check_keys(task: TaskSpec, family: Family) -> None:
-    """Raise `LareError` at the first key that nobody would read."""
+    """Raise `LareError` at the first key that would be ignored."""
     for role in (task, *task.teams):
         for key in NOT_FOR_ALL:
             if getattr(role, key) and key not in family.reads:
@@ -138,7 +138,7 @@ def check_keys(task: TaskSpec, family: Family) -> None:
     for key in ("agents", "team"):
         if getattr(task, key):
             raise LareError(
-                f"task {task.name!r}: {key} makes no difference to a task with teams: say it of one of them"
+                f"task {task.name!r}: {key} makes no difference to a task with teams: set it in the spec of a team"
             )
     for role in task.teams:
         if role.teams:
@@ -146,7 +146,7 @@ def check_keys(task: TaskSpec, family: Family) -> None:
 
 
 def check(task: TaskSpec, spec: EnvSpec) -> None:
-    """Raise `LareError` at the first thing in which an environment is not what a task says."""
+    """Raise `LareError` at the first mismatch between an environment and a task."""
     names = [team.name for team in spec.teams]
     if task.teams and [role.team for role in task.teams] != names:
         raise LareError(f"the teams of {task.environment} must be {', '.join(names)}, in this order")
@@ -155,7 +155,7 @@ def check(task: TaskSpec, spec: EnvSpec) -> None:
             f"{task.environment} has the teams {', '.join(names)}: name a spec for each of them, in this order"
         )
     for role in task.teams:
-        for key in OF_THE_ENVIRONMENT:  # training knows the task's only, and verifying the team's only
+        for key in OF_THE_ENVIRONMENT:  # training reads only the task's keys, verification only the team's
             own, whole = getattr(role, key), getattr(task, key)
             if own != whole:
                 raise LareError(

@@ -1,4 +1,4 @@
-"""Whose code an environment's name may import: a task file is code, and a run directory may be anybody's."""
+"""Decides which modules an environment's name may import. A task file can run code, and a run directory may be untrusted."""
 
 import os
 import site
@@ -11,35 +11,35 @@ from lare.errors import LareError
 from lare.tasks.spec import PETTINGZOO, TaskSpec
 
 TRUSTED = "LARE_TRUST"
-"""The environment variable that names modules, with commas between, that files other than one's own task may import."""
+"""The environment variable with the modules, separated by commas, that run directories and other files may import."""
 
 
 def module_of(task: TaskSpec) -> str | None:
-    """The module that making the task's environment imports by the name in the file, if there is one."""
+    """The module that is imported to make the task's environment, if its name contains one."""
     module, colon, _ = task.environment.removeprefix(PETTINGZOO).partition(":")
     return module if colon else None
 
 
 def is_trusted(module: str) -> bool:
-    """Whether this process has imported it already, or the user has named it."""
+    """Whether this process has already imported the module, or the user has named it in `LARE_TRUST`."""
     return module in sys.modules or module in [name.strip() for name in os.environ.get(TRUSTED, "").split(",")]
 
 
 def check_trusted(task: TaskSpec, directory: Path) -> None:
-    """Raise `LareError` where a run's environment would import a file that is of no installed package and that nobody named."""
+    """Raise `LareError` if a run's environment would import a file that belongs to no installed package and is not trusted."""
     module = module_of(task)
     if module is None or is_trusted(module):
         return
     place = place_of(module)
     if place is not None and not any(place.is_relative_to(installed) for installed in installed_places()):
         raise LareError(
-            f"{directory}: its environment {task.environment!r} would run {place}, which is of no installed package; "
+            f"{directory}: its environment {task.environment!r} would run {place}, which belongs to no installed package; "
             f"if you trust that file, set {TRUSTED}={module}"
         )
 
 
 def place_of(module: str) -> Path | None:
-    """The file of a module's outermost package, found without running it; None where there is none, or it is built in."""
+    """The file of a module's outermost package, found without running it; None if there is none, or if it is built in."""
     try:
         found = find_spec(module.partition(".")[0])
     except (ImportError, ValueError):
@@ -51,7 +51,7 @@ def place_of(module: str) -> Path | None:
 
 
 def installed_places() -> set[Path]:
-    """Where packages are installed, and Python itself."""
+    """The folders in which packages and Python itself are installed."""
     paths = sysconfig.get_paths()
     known = [*(paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")), *site.getsitepackages()]
     return {Path(place).resolve() for place in (*known, site.getusersitepackages())}

@@ -1,9 +1,10 @@
 """Many copies of a `HostEnv`, stepped in lockstep: in this process (`LocalEnvs`), or in several (`WorkerEnvs`).
 
-Workers are programs of their own, never forks: JAX runs threads in this process. Nor are they started by `multiprocessing`, which
-would run the user's script again in each. What an environment is made by is pickled, so it must be importable.
+Workers are new processes, never forks, because JAX runs threads in this process. They are not started by `multiprocessing`, which
+would run the user's script again in each of them. The functions that make environments are pickled, so they must be importable.
 
-Gymnasium's AsyncVectorEnv has one process for each environment, steps all of them or none, and does not say which one died.
+Gymnasium's AsyncVectorEnv is not used: it has one process for each environment, steps all of them or none, and does not report
+which one died.
 """
 
 import contextlib
@@ -35,13 +36,13 @@ PROGRAM = "import sys; from lare.tasks.workers import serve; serve(int(sys.argv[
 ARRAYS = tuple(name for name in Timestep._fields if name != "measures")
 
 GRACE = 2.0
-"""Seconds that workers have to close their environments."""
+"""Seconds within which workers must close their environments."""
 
 
 class Envs(ABC):
-    """Environments side by side. `where` says which ones are meant; the rows of the others stay what they were.
+    """A batch of environments. `where` selects some of them; the rows of the others do not change.
 
-    The arrays that are returned are written into by the next call.
+    The next call overwrites the returned arrays.
     """
 
     spec: EnvSpec
@@ -54,13 +55,13 @@ class Envs(ABC):
         self.batch = stacked([blank(self.spec) for _ in specs])
 
     def reset(self, where: Bool[np.ndarray, " n"], seeds: Integer[np.ndarray, " n"]) -> Timestep:
-        """Start episodes: the same ones for the same seeds."""
+        """Start episodes. The same seeds give the same episodes."""
         return self.all("reset", {place: int(seeds[place]) for place in np.flatnonzero(where).tolist()})
 
     def step(
         self, action: Float[np.ndarray, "n agents action"], where: Bool[np.ndarray, " n"] | None = None
     ) -> Timestep:
-        """One step of each."""
+        """One step of each selected environment."""
         places = range(len(self.batch.alive)) if where is None else np.flatnonzero(where).tolist()
         return self.all("step", {place: action[place] for place in places})
 
@@ -74,7 +75,7 @@ class Envs(ABC):
 
     @abstractmethod
     def ask(self, command: str, arguments: Mapping[int, Any]) -> Mapping[int, Timestep]:
-        """What the environments at these places answer."""
+        """The answers of the environments at these places to a command."""
 
     @abstractmethod
     def close(self) -> None:
@@ -103,10 +104,10 @@ class LocalEnvs(Envs):
 
 
 class WorkerEnvs(Envs):
-    """Environments in processes of their own, several in each where there are more than cores.
+    """Environments in separate processes; several in each process if there are more environments than cores.
 
     Raises:
-        LareError: one cannot be made, raised, died or did not answer in time. All workers have ended then.
+        LareError: an environment cannot be made, raised an error, died or did not answer in time. All workers have then ended.
     """
 
     def __init__(self, makers: Sequence[Maker], processes: int | None = None, timeout: float = 60.0):
@@ -132,12 +133,12 @@ class WorkerEnvs(Envs):
                 if own:
                     worker.send(command, own)
             return self.answers(command)
-        except BaseException:  # Ctrl-C too: what is still on its way would be taken for the next answer
+        except BaseException:  # Ctrl-C too: a pending answer would be taken for the next one
             self.end()
             raise
 
     def answers(self, command: str) -> dict[int, Any]:
-        """What comes back, as it comes."""
+        """All answers, in the order of their arrival."""
         found: dict[int, Any] = {}
         while waiting := [worker for worker in self.workers if worker.expected]:
             until = min(worker.heard for worker in waiting) + self.timeout
@@ -153,9 +154,9 @@ class WorkerEnvs(Envs):
         return found
 
     def close(self) -> None:
-        """Let the environments be closed, as far as they do that soon."""
+        """Close the environments, and end workers that take too long."""
         for worker in self.workers:
-            worker.connection.close()  # which they take for the end
+            worker.connection.close()  # tells the worker to end
         until = time.monotonic() + GRACE
         for worker in self.workers:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -173,7 +174,7 @@ class WorkerEnvs(Envs):
 
 
 class Failure:
-    """What a worker has to say instead of an answer."""
+    """An error that a worker sends instead of an answer."""
 
     def __init__(self, error: LareError):
         self.text = str(error)
@@ -181,7 +182,7 @@ class Failure:
 
     @property
     def error(self) -> LareError:
-        """What the worker raised."""
+        """The error that the worker raised."""
         if self.place is None:
             return LareError(self.text)
         error = EnvironmentFault(self.text)
@@ -190,7 +191,7 @@ class Failure:
 
 
 class Worker:
-    """A process and its environments, from outside."""
+    """A worker process and its environments, from the parent's side."""
 
     def __init__(self, places: Sequence[int]):
         self.places = places
@@ -198,7 +199,7 @@ class Worker:
         """Places of the environments that have not answered yet, in their order."""
         self.heard = time.monotonic()
         self.connection, theirs = Pipe()
-        # It finds what this process finds, and leaves the other cores to the other workers.
+        # The same import paths as in this process, and one thread, so that other workers can use the other cores.
         variables = (
             {"OMP_NUM_THREADS": "1"}
             | os.environ
@@ -210,12 +211,12 @@ class Worker:
                 stdin=subprocess.PIPE,
                 pass_fds=[theirs.fileno()],
                 env=variables,
-                start_new_session=True,  # Ctrl-C is for the one who waits
+                start_new_session=True,  # Ctrl-C must reach only the parent
             )
 
     @property
     def name(self) -> str:
-        """Which environment is meant where something goes wrong."""
+        """The environment and the process, for error messages."""
         return f"environment {self.expected[0]} (in worker process {self.process.pid})"
 
     def send(self, command: str, arguments: dict[int, Any]) -> None:
@@ -239,7 +240,7 @@ class Worker:
             self.process.wait(GRACE)
         status = self.process.returncode
         if status is None:
-            return LareError(f"{self.name} hung up")
+            return LareError(f"{self.name} closed its connection")
         how = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
         return LareError(f"{self.name} died: {how}")
 
@@ -252,7 +253,7 @@ class Worker:
 
 
 def serve(descriptor: int) -> None:
-    """The other end: make, reset and step environments, one answer for each, until nobody asks any more."""
+    """The worker's side: make, reset and step environments, with one answer for each, until the connection closes."""
     threading.Thread(target=end_with_the_parent, daemon=True).start()
     connection = Connection(descriptor)
     environments: dict[int, HostEnv] = {}
@@ -275,7 +276,7 @@ def serve(descriptor: int) -> None:
 
 
 def end_with_the_parent() -> None:
-    """Standard input closes when the parent ends, however it ends; a step that hangs would not notice."""
+    """Exit when standard input closes, which happens whenever the parent ends. A step that hangs would not notice this."""
     while os.read(0, 1):
         pass
     os._exit(0)
@@ -296,7 +297,7 @@ def made(place: int, maker: Maker) -> HostEnv:
 
 
 def told(place: int, environment: HostEnv, command: str, argument: Any) -> Timestep:
-    """A reset or a step. Whatever it raises is a `LareError` of one line."""
+    """A reset or a step. Whatever it raises becomes a `LareError` of one line."""
     try:
         return environment.reset(argument) if command == "reset" else environment.step(argument)
     except EnvironmentFault as error:
@@ -316,7 +317,7 @@ def sizes(spec: EnvSpec) -> tuple[Any, ...]:
 
 
 def blank(spec: EnvSpec) -> Timestep:
-    """Stands where no episode has begun."""
+    """The timestep of an environment whose first episode has not started."""
     return Timestep(
         observation=np.zeros((spec.agents, spec.observation_size), np.float32),
         state=np.zeros(spec.state_size, np.float32),
@@ -330,7 +331,7 @@ def blank(spec: EnvSpec) -> Timestep:
 
 
 def stacked(rows: Sequence[Timestep]) -> Timestep:
-    """Steps of several environments, with an axis for them in front."""
+    """Timesteps of several environments, stacked along a new first axis."""
     *parts, measures = (list(column) for column in zip(*rows, strict=True))
     by_name = {name: np.stack([one[name] for one in measures]) for name in measures[0]}
     observation, state, available, alive, reward, terminated, truncated = map(np.stack, parts)

@@ -1,1 +1,1 @@
-"""How a run trains: steps are collected, credited and learned from."""
+"""The training of a run: steps are collected, given credit and learned from."""

@@ -1,4 +1,4 @@
-"""phi at work: from collected steps to the factors of every judged row."""
+"""Applies phi: from collected steps to the factors of every judged row."""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from lare.training.config import TrainConfig
 
 
 def annotate(run: Run, config: TrainConfig, steps: Trajectory) -> Float[np.ndarray, "*lead time envs rows factors"]:
-    """The factors z of new steps: each team's `phi` on what its agents observed, or on the state; padded to the largest."""
+    """The factors z of new steps: each team's `phi` on its agents' observations, or on the state; padded to the largest number."""
     lead = np.shape(steps.after.terminated)
     found = np.zeros((*lead, config.judged_rows, max(config.factors, default=0)), np.float32)
     if not run.functions:
@@ -27,5 +27,5 @@ def annotate(run: Run, config: TrainConfig, steps: Trajectory) -> Float[np.ndarr
 
 
 def host(shown):
-    """What phi may see of a step, on the host."""
+    """A time step with the arrays that phi may see, observation and state, on the host."""
     return shown._replace(observation=np.asarray(shown.observation), state=np.asarray(shown.state))

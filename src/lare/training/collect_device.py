@@ -18,18 +18,18 @@ from lare.training.streams import Stream, device_noise, stream_keys
 
 
 class Worlds(NamedTuple):
-    """Every environment of every seed, between two steps."""
+    """The state of every environment of every seed, between two steps."""
 
     state: Any
     shown: Timestep
     memory: Any
-    """What the actors remember."""
+    """The memory of the actors."""
     new: Bool[Array, "seeds envs"]
     """Whether an episode has just begun."""
 
 
 class Played(NamedTuple):
-    """Whole episodes, each from a start of its own: [time seeds episodes ...]."""
+    """Whole episodes, each from its own initial state: [time seeds episodes ...]."""
 
     steps: Trajectory
     mask: Bool[Array, "time seeds episodes"]
@@ -39,7 +39,7 @@ class Played(NamedTuple):
 
 
 def on_all(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Mapped over seeds and environments."""
+    """The function, mapped over seeds and environments."""
     return jax.vmap(jax.vmap(function))
 
 
@@ -64,7 +64,7 @@ def step(
     greedy: bool,
     act: Callable[..., tuple[Array, Any]],
 ) -> tuple[Worlds, Trajectory]:
-    """One step of all; an episode that ends is not followed by another one here."""
+    """One step of all environments. An episode that has ended is not reset here."""
     count = worlds.new.shape[1]
     noise_keys, keys = jnp.unstack(spread(keys, 2), axis=1)
     noise = None
@@ -81,7 +81,7 @@ def step(
 def collect(
     env: JaxEnv, worlds: Worlds, actor: Any, keys: Key[Array, " seeds"], config: TrainConfig
 ) -> tuple[Worlds, Trajectory]:
-    """`rollout_steps` steps of every environment; where an episode ends, the next one begins."""
+    """`rollout_steps` steps of every environment. When an episode ends, the next one begins."""
 
     def one(worlds: Worlds, keys: Key[Array, " seeds"]) -> tuple[Worlds, Trajectory]:
         step_keys, reset_keys = jnp.unstack(spread(keys, 2), axis=1)
@@ -96,7 +96,7 @@ def collect(
             state, shown = jax.tree.map(choose, (fresh.state, fresh.shown), (worlds.state, worlds.shown))
             return Worlds(state, shown, worlds.memory, steps.ended)
 
-        # A reset costs as much as a step: none is made where no episode has ended.
+        # A reset costs as much as a step, so it is skipped if no episode has ended.
         return jax.lax.cond(jnp.any(steps.ended), begin, lambda worlds: worlds, worlds), steps
 
     keys = jnp.swapaxes(spread(keys, config.rollout_steps), 0, 1)
@@ -113,7 +113,7 @@ def play(
     greedy: bool,
     act: Callable[..., tuple[Array, Any]] | None = None,
 ) -> Played:
-    """Whole episodes of a policy, each from a start of its own; `act` asks the actor in another way than training does."""
+    """Whole episodes of a policy, each from its own initial state. `act`, if given, is called instead of training's `acting`."""
     act = act or acting(config, greedy)
     start_keys, step_keys = jnp.unstack(spread(keys, 2), axis=1)
     worlds = start(env, start_keys, count, config)
@@ -130,7 +130,7 @@ def play(
 
 
 def evaluate(env: JaxEnv, actor: Any, keys: Key[Array, " seeds"], count: int, config: TrainConfig) -> tuple[Any, ...]:
-    """What whole episodes of the policy gave: the parts of an `Evaluation`."""
+    """The results of whole episodes of the policy: the parts of an `Evaluation`."""
     played = play(env, actor, keys, count, config, config.algorithm.greedy)
     steps, mask = played.steps, played.mask
     reward = steps.after.reward * mask[..., None]
@@ -146,7 +146,7 @@ def evaluate(env: JaxEnv, actor: Any, keys: Key[Array, " seeds"], count: int, co
 
 
 class DeviceCollector:
-    """The environments of a run, where they are pure functions: one compiled call makes an iteration's steps."""
+    """The environments of a run, if they are pure functions: one compiled call makes an iteration's steps."""
 
     def __init__(self, env: JaxEnv, config: TrainConfig, seeds: Sequence[int]):
         self.seeds = seeds
@@ -161,18 +161,18 @@ class DeviceCollector:
         return steps
 
     def evaluate(self, actor: Any, episodes: int, number: int = 0) -> Evaluation:
-        """Whole episodes, from the same starts for the same number; those of the run's evaluations have 0."""
+        """Evaluate whole episodes. The same number gives the same initial states; the run's own evaluations use 0."""
         keys = stream_keys(self.seeds, Stream.EVALUATION_EPISODES, number)
         return Evaluation(*jax.device_get(tuple(self.evaluating(actor, keys, episodes))))
 
     def saved(self) -> dict[str, np.ndarray]:
-        """The worlds as they are."""
+        """The current worlds."""
         return {str(place): np.asarray(leaf) for place, leaf in enumerate(jax.tree.leaves(self.worlds))}
 
     def restore(self, saved: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
-        """The worlds as they were; nothing is dropped."""
+        """Restore saved worlds. No episode is dropped."""
         leaves, structure = jax.tree.flatten(self.worlds)
-        self.worlds = jax.tree.unflatten(structure, [jnp.asarray(saved[str(i)]) for i in range(len(leaves))])
+        self.worlds = jax.device_put(jax.tree.unflatten(structure, [saved[str(i)] for i in range(len(leaves))]))
         return np.zeros(self.worlds.new.shape, bool), []
 
     def close(self) -> None:

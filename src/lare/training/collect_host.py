@@ -1,7 +1,7 @@
-"""Collecting from environments that step on the host: the policy is asked once a step, for all environments of all seeds.
+"""Collecting from environments that step on the host: each step calls the policy once, for all environments of all seeds.
 
-An episode is its seed and its actions. That is how a run comes back into the middle of an episode, in any simulator: reset with
-the seed, play the actions, and compare what is shown bit for bit.
+An episode is determined by its seed and its actions. So a run can be resumed in the middle of an episode, in any simulator: reset
+with the seed, play the actions, and compare the observation bit for bit.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -26,33 +25,33 @@ from lare.training.evaluation import Evaluation
 from lare.training.streams import Stream, episode_seed, generator, host_noise
 
 Envs = LocalEnvs | WorkerEnvs
-"""Environments in one row: of the first seed, of the second, and so on."""
+"""Environments in one list: those of the first seed, of the second, and so on."""
 
 Acting = Callable[[Timestep, Bool[np.ndarray, "seeds envs"]], Float[np.ndarray, "seeds envs agents action"]]
-"""From what is shown, and which episodes are new, to actions."""
+"""From a time step, and which episodes are new, to actions."""
 
 
 class Diverged(LareError):
-    """What is being trained is not finite any more."""
+    """The policy is not finite any more."""
 
 
 class HostEpisodes:
-    """The training environments of a run, and the episode that is under way in each."""
+    """The training environments of a run, and the running episode of each."""
 
     def __init__(self, envs: Envs, seeds: Sequence[int], environments: int):
         self.envs, self.seeds, self.environments = envs, list(seeds), environments
         self.spec = envs.spec
         count = len(self.seeds) * environments
         self.episode = np.full(count, -1)
-        """The number of the episode under way in each."""
+        """The number of each environment's running episode."""
         self.actions: list[list[np.ndarray]] = [[] for _ in range(count)]
-        """Of that episode, in the environment's units."""
+        """The actions of that episode, in the environment's units."""
         self.shown = shaped(envs.batch, self.shape)
-        """What each environment shows now; written into by the next step."""
+        """The current time step of each environment. The next step overwrites it."""
         self.new = np.ones(self.shape, bool)
         """Which episodes have not had a step yet."""
         self.dropped = np.zeros(count, bool)
-        """Which episodes could not be had again by `restore`."""
+        """Which episodes `restore` could not restore."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -68,7 +67,7 @@ class HostEpisodes:
         self.new = self.new | where.reshape(self.shape)
 
     def episode_seeds(self) -> Int[np.ndarray, " all"]:
-        """What each environment's present episode begins with."""
+        """The random seed of each environment's running episode."""
         return np.array(
             [
                 episode_seed(self.seed_of(number), Stream.TRAINING_EPISODES, self.number_of(number))
@@ -81,11 +80,11 @@ class HostEpisodes:
         return self.seeds[place // self.environments]
 
     def number_of(self, place: int) -> int:
-        """The present episode's number among all episodes of the seed."""
+        """The running episode's number among all episodes of the seed."""
         return int(self.episode[place]) * self.environments + place % self.environments
 
     def step(self, taken: Float[np.ndarray, "seeds envs agents action"]) -> None:
-        """One step of all, by actions in the environment's units."""
+        """One step of all environments, with actions in their units."""
         rows = taken.reshape(-1, *taken.shape[2:])
         for actions, row in zip(self.actions, rows, strict=True):
             actions.append(row)
@@ -109,21 +108,21 @@ class HostEpisodes:
         return steps
 
     def asked(self, answer: Callable[[], Timestep]) -> Timestep:
-        """What the environments answer; a fault is said with its place."""
+        """Call the environments; an error names the place where it occurred."""
         try:
             return answer()
         except EnvironmentFault as fault:
             raise fault if fault.place is None else EnvironmentFault(f"{fault}, {self.where(fault.place)}") from None
 
     def where(self, place: int) -> str:
-        """Where an environment is."""
+        """The step, episode and seed of an environment, for messages."""
         among = f" in environment {place % self.environments}" if self.environments > 1 else ""
         return (
             f"at step {len(self.actions[place])} of episode {self.episode[place]} of seed {self.seed_of(place)}{among}"
         )
 
     def saved(self) -> dict[str, np.ndarray]:
-        """All that it takes to be here again."""
+        """All that is needed to restore the running episodes."""
         found = {"episode": self.episode.copy(), "new": self.new}
         observation = self.envs.batch.observation
         for number, actions in enumerate(self.actions):
@@ -133,10 +132,10 @@ class HostEpisodes:
         return found
 
     def restore(self, saved: dict[str, np.ndarray]) -> list[str]:
-        """Get into the middle of the episodes again, by their seeds and actions.
+        """Restore the running episodes, by their seeds and actions.
 
-        Where that does not lead to the same observation, bit for bit, the environment is not deterministic: a new episode
-        begins. Returns what is to be said of each of these, and sets `dropped`.
+        If that does not lead to the same observation, bit for bit, the environment is not deterministic: the episode is dropped,
+        and a new one begins. Returns a message about each dropped episode, and sets `dropped`.
         """
         self.episode = saved["episode"].copy()
         count = len(self.episode)
@@ -154,7 +153,7 @@ class HostEpisodes:
         self.dropped = lost | ~np.array(same)
         messages = [
             f"episode {self.episode[number]} of seed {self.seed_of(number)} was dropped after {len(whole[number])} steps: "
-            "the environment did not come back to the same observation by the same actions"
+            "the same actions did not lead to the same observation again"
             for number in np.flatnonzero(self.dropped).tolist()
         ]
         if self.dropped.any():
@@ -163,7 +162,7 @@ class HostEpisodes:
 
     @property
     def idle(self) -> Float[np.ndarray, "agents action"]:
-        """An action for an environment that is not asked."""
+        """A placeholder action for an environment that is not stepped."""
         return np.zeros((self.spec.agents, self.spec.action_size), np.float32)
 
 
@@ -177,7 +176,7 @@ class HostCollector:
         self.episodes.begin()
 
     def collect(self, actor: Any, step: int) -> Trajectory:
-        """The steps of the iteration that begins at this step: random ones, as long as it is to warm up."""
+        """The steps of the iteration that begins at this step; during the warmup, with random actions."""
         config, random = self.config, [generator(seed, Stream.EXPLORATION, step) for seed in self.seeds]
         shape = config.rollout_steps, config.environments, config.env.agents
         if step < config.warmup:
@@ -193,19 +192,19 @@ class HostCollector:
         return self.episodes.collect(act, noise)
 
     def evaluate(self, actor: Any, episodes: int) -> Evaluation:
-        """Whole episodes of the policy, from the starts that the run is evaluated from."""
+        """Whole episodes of the policy, from the initial states of the run's evaluations."""
         act = policy(self.functions, self.config, actor, self.seeds, episodes)
         return evaluate(self.evaluation, act, self.seeds, episodes)
 
     def saved(self) -> dict[str, np.ndarray]:
-        """Seeds and actions of the episodes under way, and what the actors remember of them."""
+        """Seeds and actions of the running episodes, and the actors' memory of them."""
         memory = {f"memory{place}": np.asarray(leaf) for place, leaf in enumerate(jax.tree.leaves(self.memory))}
         return self.episodes.saved() | memory
 
     def restore(self, saved: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
-        """Into the middle of the episodes again; which of them could not be had, and what is to be said of it."""
+        """Restore the running episodes. Returns which of them were dropped, and messages about these."""
         leaves, structure = jax.tree.flatten(self.memory)
-        self.memory = jax.tree.unflatten(structure, [jnp.asarray(saved[f"memory{i}"]) for i in range(len(leaves))])
+        self.memory = jax.device_put(jax.tree.unflatten(structure, [saved[f"memory{i}"] for i in range(len(leaves))]))
         messages = self.episodes.restore(saved)
         return self.episodes.dropped.reshape(self.episodes.shape), messages
 
@@ -218,14 +217,14 @@ class HostCollector:
 def host_collector(
     task: TaskSpec, config: TrainConfig, functions: Compiled, seeds: Sequence[int], episodes: int
 ) -> HostCollector:
-    """A task's environments around its policy: in this process, or in processes of their own where a seed has several."""
+    """A collector with a task's environments: in this process, or in worker processes if a seed has several."""
     kind, maker = LocalEnvs if config.environments == 1 else WorkerEnvs, partial(make_host_env, task)
     envs, evaluation = (kind([maker] * (len(seeds) * count)) for count in (config.environments, episodes))
     return HostCollector(envs, evaluation, config, functions, seeds)
 
 
 def policy(functions: Compiled, config: TrainConfig, actor: Any, seeds: Sequence[int], episodes: int) -> Acting:
-    """The policy of all seeds as it is evaluated, for so many episodes of each, from their start."""
+    """The policy of all seeds, as in evaluations, for the given number of episodes of each seed, from their beginning."""
     memory = [new_memory(config, len(seeds), episodes)]
     random = [generator(seed, Stream.EVALUATION_NOISE, 0) for seed in seeds]
 
@@ -253,7 +252,7 @@ def shaped(rows: Timestep, shape: tuple[int, ...]) -> Timestep:
 
 
 def blank_trajectory(spec: EnvSpec, shown: Timestep, shape: tuple[int, int], time: int) -> Trajectory:
-    """Room for so many steps."""
+    """An empty trajectory for so many steps."""
     seeds, environments = shape
 
     def rows(like: np.ndarray) -> np.ndarray:
@@ -268,7 +267,7 @@ def blank_trajectory(spec: EnvSpec, shown: Timestep, shape: tuple[int, int], tim
 
 
 def write(rows: Timestep, shown: Timestep, time: int) -> None:
-    """Copy what is shown to its place."""
+    """Copy a time step to its place in a trajectory."""
     *columns, measures = rows
     for column, value in zip(columns, shown, strict=False):
         column[:, time] = value
@@ -277,7 +276,7 @@ def write(rows: Timestep, shown: Timestep, time: int) -> None:
 
 
 def check_finite(action: Float[np.ndarray, "seeds *rest"], seeds: Sequence[int]) -> None:
-    """Raise `Diverged` where the actions of a seed's policy are not finite."""
+    """Raise `Diverged` if the actions of a seed's policy are not finite."""
     for seed, chosen in zip(seeds, action, strict=True):
         if not np.isfinite(chosen).all():
             raise Diverged(
@@ -286,10 +285,10 @@ def check_finite(action: Float[np.ndarray, "seeds *rest"], seeds: Sequence[int])
 
 
 def evaluate(envs: Envs, act: Acting, seeds: Sequence[int], episodes: int, first: int = 0) -> Evaluation:
-    """One episode in each environment, all in lockstep, each from a start of its own.
+    """One episode in each environment, all in lockstep, each from its own initial state.
 
-    The starts depend on seed and place only, which are counted from `first`: every evaluation of a run begins from the same
-    ones, and none of them is a start of a training episode.
+    The initial states depend only on the seed and on the episode's number, which counts from `first`. So every evaluation of a
+    run begins from the same ones, and no training episode does.
     """
     spec, shape = envs.spec, (len(seeds), episodes)
 

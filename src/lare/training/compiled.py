@@ -20,27 +20,29 @@ Metrics = dict[str, Float[Array, " seeds"]]
 
 
 class Compiled(NamedTuple):
-    """`store`, `fit` and `improve` consume the learner that they are given: its memory holds the new one."""
+    """`store`, `fit` and `improve` consume the learner that they are given: its buffers are reused for the new one."""
 
+    init: Callable[[Key[Array, " seeds"]], Learner]
+    """Untrained learners."""
     store: Callable[[Learner, Trajectory, Any], Learner]
     """From learner, new steps, and their factors."""
     learn_returns: Callable[[Learner], Learner]
-    """When episodes have finished: `episodes.learn_returns`."""
+    """`episodes.learn_returns`, for when episodes have finished."""
     fit: Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, Metrics]]
     """The decoders' own updates; the mean of each metric over them."""
     improve: Callable[..., tuple[Learner, Metrics]]
     """From learner, the newest steps, keys, and the environment steps done before."""
     assess: Callable[[Learner], Metrics]
     actor: Callable[[Learner, int], Any]
-    """What is needed to act."""
+    """The parts of the learner that are needed to act."""
     explore: Callable[..., tuple[Float[Array, "seeds envs agents action"], Any]]
     """The policy that collects, from actor, memory, observation, available actions, noise, and which episodes are new."""
     act: Callable[..., tuple[Float[Array, "seeds envs agents action"], Any]]
-    """The policy without noise, from the same but for noise."""
+    """The policy without noise, from the same arguments, with None as the noise."""
 
 
 def module_of(config: TrainConfig) -> ModuleType:
-    """How the run's algorithm consumes what is collected."""
+    """The module for the data that the run's algorithm consumes."""
     match config.algorithm.consumes:
         case Consumes.TRANSITIONS:
             return off_policy
@@ -57,12 +59,12 @@ def new_learners(keys: Key[Array, " seeds"], config: TrainConfig) -> Learner:
 
 
 def new_memory(config: TrainConfig, *lead: int) -> Any:
-    """What actors remember before the first step of an episode, for seeds and environments in `lead`."""
+    """The memory of actors before the first step of an episode, for seeds and environments in `lead`."""
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*lead, *leaf.shape)), module_of(config).memory(config))
 
 
 def acting(config: TrainConfig, greedy: bool) -> Callable[..., tuple[Array, Any]]:
-    """The policy of all seeds, which forgets where an episode is new."""
+    """The policy of all seeds. Its memory is reset where an episode is new."""
     module = module_of(config)
 
     def act(
@@ -87,7 +89,7 @@ def compiled(config: TrainConfig) -> Compiled:
     module = module_of(config)
 
     def fit_in_turn(learner: Learner, keys: Key[Array, " seeds"]) -> tuple[Learner, Metrics]:
-        # A large batch of episodes fills the caches as it is: in lockstep the seeds would only be in each other's way.
+        # One seed after the other, because a large batch of episodes fills the caches already.
         credit, measured = jax.lax.map(lambda one: common.fit_often(one[0], one[1], config), (learner, keys))
         return learner._replace(credit=credit), measured
 
@@ -99,6 +101,7 @@ def compiled(config: TrainConfig) -> Compiled:
         return learner._replace(credit=credit, counted=counted)
 
     return Compiled(
+        init=jax.jit(partial(new_learners, config=config)),
         learn_returns=learn_returns,
         store=jax.jit(jax.vmap(partial(common.store, config=config)), donate_argnums=0),
         fit=jax.jit(fit_in_turn, donate_argnums=0),

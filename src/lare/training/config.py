@@ -1,4 +1,4 @@
-"""What the compiled functions of a run hold fixed."""
+"""The static configuration of a run's compiled functions."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from lare.tasks.spec import JudgedFrom
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """What is to be trained and how."""
+    """What is trained, and how."""
 
     env: EnvSpec
     judged_from: JudgedFrom
@@ -27,9 +27,9 @@ class TrainConfig:
     scale_rewards: bool
     """Divide the rewards that the algorithm sees by the running root mean square of R/T."""
     factors: tuple[int, ...]
-    """Of each team's latent function; empty for a method that needs none."""
+    """The number of factors of each team's latent function; empty for a method that needs none."""
     environments: int
-    """That each seed collects from."""
+    """The number of environments that each seed collects from."""
     rollout_steps: int
     """Steps of each environment in an iteration."""
     capacity: int
@@ -37,11 +37,11 @@ class TrainConfig:
     steps: int
     """Environment steps of the whole run."""
     fit_updates: int
-    """Updates of the decoder in an iteration that fits it; one that goes with each update of the algorithm has no need of it."""
+    """Updates of the decoder in an iteration that fits it. Unused if the decoder is updated with every update of the algorithm."""
 
     @property
     def noise(self) -> Noise:
-        """What the policy that collects is disturbed by."""
+        """The exploration noise of the policy."""
         return self.algorithm.noise(self.env.discrete)
 
     @property
@@ -51,7 +51,7 @@ class TrainConfig:
 
     @property
     def of_state(self) -> bool:
-        """Whether credit is judged from the global state: one row a step for each team."""
+        """Whether credit is judged from the global state: one row for each step and team."""
         return self.judged_from == "state"
 
     @property
@@ -70,7 +70,7 @@ class TrainConfig:
 
     @property
     def interleaved(self) -> bool:
-        """Whether each update of the algorithm goes with one of the decoder."""
+        """Whether the decoder is updated with every update of the algorithm."""
         return (
             self.algorithm.consumes is not Consumes.ROLLOUTS
             and self.method.descends
@@ -80,12 +80,12 @@ class TrainConfig:
 
     @property
     def shown(self) -> int:
-        """Size of what a judged row is of: an observation, or the global state."""
+        """Size of the observation or of the global state that is judged."""
         return self.env.state_size if self.of_state else self.env.observation_size
 
     @property
     def entries(self) -> int:
-        """Size of the raw part of what a team's decoder sees of a judged row."""
+        """The number of raw entries in a team's decoder's input for a judged row."""
         action = self.env.action_size * (self.env.agents if self.of_state else 1)
         match self.method.encoder:
             case None | Encoder.LATENT:
@@ -97,7 +97,7 @@ class TrainConfig:
 
     @property
     def bases(self) -> tuple[Basis, ...]:
-        """What each team's decoder sees of a judged row, and what it makes of that in closed form."""
+        """The input of each team's decoder for a judged row, and the features that a closed-form decoder computes from it."""
         extended = self.method.decoder is Decoder.ADDITIVE
         factors = self.factors if self.method.latent else (0,) * len(self.env.teams)
         return tuple(Basis(size, self.entries, extended) for size in factors)
@@ -115,7 +115,7 @@ class TrainConfig:
 
     @property
     def columns(self) -> dict[str, jax.ShapeDtypeStruct]:
-        """What a row of the replay holds: what the algorithm and the decoder read, and no more."""
+        """The columns of a row of the replay: those that the algorithm and the decoder read, and no others."""
         env, consumes = self.env, self.algorithm.consumes
         stored = consumes is not Consumes.ROLLOUTS
         encoder = self.method.encoder

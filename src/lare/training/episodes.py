@@ -1,10 +1,10 @@
-"""What the decoders are told of episodes that have finished: their returns are predicted, then added to sums, then fitted to.
+"""How the decoders learn from finished episodes: predict their returns, add them to sums, fit the decoders to the sums.
 
-One order for every method that predicts returns, whatever fits it: predict, then learn. So `credit/return_r2` is of returns
-that nothing had been fitted to.
+Every method that predicts returns has this order: predict, then learn. So `credit/return_r2` is measured on returns that nothing
+had been fitted to.
 
-Written for all seeds: steps are read in lockstep, fits in closed form are made one seed after the other, as each one's turn comes.
-What is in float64 (`closed_form.py`) is so where all this is called within `jax.enable_x64(True)`.
+The functions are written for all seeds: steps are read in lockstep, and closed-form fits are made one seed after the other, when
+they are due. The functions must be called within `jax.enable_x64(True)`, because `closed_form.py` needs float64.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,10 @@ Credit = tuple[Decomposition, ...]
 def learn_returns(
     credit: Credit, buffer: Replay, counted: Int[Array, "seeds envs"], config: TrainConfig
 ) -> tuple[Credit, Int[Array, "seeds envs"]]:
-    """The decoders of each team, with a leading seed axis, when they have been told of what has finished; and how much that is."""
+    """Let the decoders learn from episodes that have finished. Everything has a leading seed axis.
+
+    Returns the decoders of each team, and how many episodes they have learned from.
+    """
     before = jnp.sum(counted, axis=1)
     new = jnp.sum(buffer.episodes, axis=1) - before
     due = new >= jnp.maximum(returns.GROWTH * before, 1)
@@ -50,12 +53,12 @@ def learn_those_due(
     due: Bool[Array, " seeds"],
     config: TrainConfig,
 ) -> Credit:
-    """The same, where at least one seed is due."""
+    """`learn_returns`, if at least one seed is due."""
     since = jnp.where(due[:, None], counted, buffer.episodes)
     learned = jax.vmap(partial(tell, config=config))(credit, buffer, since)
     if learned[0].closed is None:
         return learned
-    if config.method.fit is not Fit.SIGNS:  # which takes the factors as they are
+    if config.method.fit is not Fit.SIGNS:  # signs need no standardised factors
         again = due & jax.vmap(returns.is_stale)(learned[0])
         everything = jax.vmap(partial(sum_again, config=config))
         learned = jax.lax.cond(jnp.any(again), everything, lambda same, *_: same, learned, buffer, again)
@@ -70,9 +73,7 @@ def pieces(
     config: TrainConfig,
     expected: int = PLACES,
 ) -> Credit:
-    """What each team's decoder becomes when it `take`s all finished episodes from some number on, about as many at a time as are
-    expected.
-    """
+    """Apply `take` to each team's decoder and all finished episodes from number `since` on, about `expected` at a time."""
     longest = config.env.max_steps
     rows = max(1, min(expected, PLACES, ROWS // (config.judged_rows * longest))) * longest
     total = jnp.sum(episodes_since(buffer, since))
@@ -100,7 +101,7 @@ def tell(credit: Credit, buffer: Replay, since: Int[Array, " envs"], config: Tra
 
 
 def sum_again(credit: Credit, buffer: Replay, again: Bool[Array, ""], config: TrainConfig) -> Credit:
-    """One seed: where `again` is true, sums over all stored episodes, of features that are standardised anew."""
+    """One seed: if `again` is true, new sums over all stored episodes, with features standardised by the current statistics."""
     empty = tuple(returns.begin_again(one) for one in credit)
     since = jnp.where(again, buffer.oldest, buffer.episodes)
     summed = pieces(empty, buffer, since, returns.add_episodes, config)
@@ -108,7 +109,7 @@ def sum_again(credit: Credit, buffer: Replay, again: Bool[Array, ""], config: Tr
 
 
 def from_stored(credit: Credit, buffer: Replay, config: TrainConfig) -> Credit:
-    """One seed: untrained decoders that have met all finished episodes of a replay, in statistics and sums, but are not fitted."""
+    """One seed: decoders with all finished episodes of a replay in their statistics and sums, but not fitted yet."""
 
     def observe(one: Decomposition, episodes: Episodes, there: Bool[Array, " episodes"]) -> Decomposition:
         count = len(episodes.length)
@@ -123,7 +124,7 @@ def from_stored(credit: Credit, buffer: Replay, config: TrainConfig) -> Credit:
 
 
 def fit_those_due(credit: Decomposition, due: Bool[Array, " seeds"], config: TrainConfig) -> Decomposition:
-    """Fit in closed form, of those seeds that have been told enough."""
+    """Make the closed-form fits of the seeds that are due."""
 
     def one(of_seed: tuple[Decomposition, Bool[Array, ""]]) -> Decomposition:
         credit, due = of_seed

@@ -1,4 +1,4 @@
-"""What episodes of a policy gave."""
+"""The results of evaluation episodes."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -11,19 +11,19 @@ from lare.tasks.env import EnvSpec
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Of whole episodes of each seed's policy."""
+    """Results of whole episodes of each seed's policy."""
 
     returns: Float[np.ndarray, "seeds episodes teams"]
     """R of each team: the sum over time of the mean over its agents that are alive."""
     sums: Float[np.ndarray, "seeds episodes teams"]
-    """The sum over time and over all agents of a team: what particle tasks are reported by."""
+    """The sum over time and over all agents of a team, which is the usual score of particle tasks."""
     lengths: Int[np.ndarray, "seeds episodes"]
-    """In steps."""
+    """Lengths in steps."""
     measures: dict[str, Float[np.ndarray, "seeds episodes"]]
-    """What the task asks to be taken from the last step."""
+    """The task's own measures, taken from the last step."""
 
     def metrics(self, spec: EnvSpec) -> dict[str, Float[np.ndarray, " seeds"]]:
-        """Means over the episodes, and the deviation of returns, by the keys of metrics.jsonl; several teams have each its own."""
+        """Means over the episodes, and the deviation of returns, by the keys of metrics.jsonl. Several teams have separate keys."""
         found = {"evaluation/length": self.lengths.mean(axis=1)}
         found |= {f"evaluation/{name}": values.mean(axis=1) for name, values in self.measures.items()}
         for place, team in enumerate(spec.teams):
@@ -38,7 +38,7 @@ class Evaluation:
 
 
 def together(parts: Sequence[Evaluation]) -> Evaluation:
-    """Evaluations of the same seeds, as one."""
+    """Merge evaluations of the same seeds."""
 
     def joined(arrays: Iterable[np.ndarray]) -> np.ndarray:
         return np.concatenate(list(arrays), axis=1)

@@ -1,11 +1,10 @@
-"""What the stored returns of a run say of its factors, whatever decoder it trains with."""
+"""What the stored returns of a run say about its factors, whatever decoder it trains with."""
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
@@ -23,7 +22,7 @@ from lare.training.session import load_learner
 
 
 def judging(config: TrainConfig) -> TrainConfig:
-    """The run's configuration, with the fit in closed form that explains its returns from what its replay holds."""
+    """The run's configuration, with a closed-form fit that explains its returns from the columns of its replay."""
     shown = "state" if config.of_state else "observation"
     raw = {shown, "action"} <= set(config.columns)
     if not config.method.latent:
@@ -34,13 +33,16 @@ def judging(config: TrainConfig) -> TrainConfig:
 
 
 def explanations(learner: Learner, config: TrainConfig) -> list[Explanation]:
-    """Of the first seed's stored episodes, for each team. Empty for a method that fits nothing to returns, and for few episodes."""
-    one, chosen = of_seed(learner), judging(config)
+    """Explanations of the first seed's stored episodes, one for each team.
+
+    Empty for a method that fits nothing to returns, and for too few episodes.
+    """
+    chosen, held = judging(config), learner.replay
     known = learner.credit and all(basis.size for basis in chosen.bases)
-    if not known or int(jnp.sum(one.replay.episodes - one.replay.oldest)) < FEWEST:
+    if not known or np.sum(np.asarray(held.episodes)[0] - np.asarray(held.oldest)[0]) < FEWEST:
         return []
     with jax.enable_x64(True):
-        found = explaining(chosen)(one.replay, tuple(credit.average for credit in one.credit))
+        found = explaining(chosen)(held, tuple(credit.average for credit in learner.credit))
         return [jax.tree.map(np.asarray, each) for each in found]
 
 
@@ -49,8 +51,11 @@ def explaining(config: TrainConfig) -> Callable[..., list[Explanation]]:
     return jax.jit(partial(explain_stored, config=config))
 
 
-def explain_stored(buffer: Replay, average: tuple[Bool[Array, ""], ...], config: TrainConfig) -> list[Explanation]:
-    """By all finished episodes of a replay."""
+def explain_stored(
+    replay: Replay, averages: tuple[Bool[Array, " seeds"], ...], config: TrainConfig
+) -> list[Explanation]:
+    """Explanations from all finished episodes of the first seed."""
+    buffer, average = of_seed((replay, averages))
     credit = from_stored(init_credit([jax.random.key(0)] * len(average), config), buffer, config)
     found = []
     for one, form, basis in zip(credit, average, config.bases, strict=True):
@@ -60,7 +65,7 @@ def explain_stored(buffer: Replay, average: tuple[Bool[Array, ""], ...], config:
 
 
 def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
-    """What is to be said of a run's returns, of its first seed."""
+    """The explanations of the returns of a run's first seed, in sentences."""
     lines: list[str] = []
     roles = run.config.task.roles
     for place, found in enumerate(explanations(learner, config)):
@@ -77,6 +82,6 @@ def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
 
 
 def explanation_of(run: Run) -> list[str]:
-    """The same of a run's last checkpoint."""
+    """`described` for a run's last checkpoint."""
     config, learner, _, _ = load_learner(run)
     return described(run, learner, config)

@@ -1,7 +1,7 @@
-"""The first fit of many agents' decoders that descend a gradient: it goes on until the error on held-out episodes stops falling.
+"""The first fit of gradient-trained decoders for many agents: it lasts until the error on held-out episodes stops falling.
 
-As published, a decoder is fitted in 50 updates to the first episodes and, after every tenth iteration, in 50 more. Of 15 agents
-that is too few: the policy commits itself before the decoder is right (docs/results/agents.md).
+As published, a decoder is fitted in 50 updates to the first episodes and, after every tenth iteration, in 50 more. With 15 agents
+that is too few: the policy has settled before the decoder is accurate (docs/results/agents.md).
 """
 
 from collections.abc import Callable
@@ -22,11 +22,11 @@ from lare.training.episodes import Credit, pieces
 from lare.training.learner import Learner
 
 FEWEST = 10
-"""Finished episodes of each seed, below which none are held out."""
+"""If a seed has fewer finished episodes, none are held out."""
 PATIENCE = 2
-"""Fits in a row that may bring nothing."""
+"""Fitting stops after so many fits in a row without improvement."""
 MOST = 40
-"""Fits at most."""
+"""The most fits."""
 
 Fit = Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, dict[str, Float[Array, " seeds"]]]]
 
@@ -39,13 +39,13 @@ def has_enough(learner: Learner) -> bool:
 def fit_until_it_stops_helping(
     learner: Learner, fit: Fit, keys: Key[Array, " seeds"], config: TrainConfig
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
-    """Fit again and again; of each seed, the decoders with the least error on held-out episodes are kept.
+    """Fit repeatedly; for each seed, the decoders with the least error on held-out episodes are kept.
 
     Args:
-        learner: of all seeds, with enough episodes.
+        learner: the learner of all seeds, with enough episodes.
         fit: one fit, which consumes the learner that it is given.
-        keys: of the first fit; those of the others follow from them.
-        config: of the run.
+        keys: the random keys of the first fit; those of the others are derived from them.
+        config: the configuration of the run.
     """
     episodes, running = jnp.copy(learner.replay.episodes), jnp.copy(learner.replay.running)
     held = jax.vmap(held_out)(learner.replay)
@@ -68,12 +68,12 @@ def fit_until_it_stops_helping(
 
 
 def of_those(better: Bool[Array, " seeds"], new: Array, old: Array) -> Array:
-    """The new values of those seeds that are better."""
+    """The new values of the seeds that are better, and the old values of the others."""
     return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def held_out(buffer: Replay) -> Int[Array, " envs"]:
-    """How many of the newest episodes of each environment are held out: a fifth of all, those of the last environments."""
+    """How many of the newest episodes of each environment are held out: a fifth of all, from the last environments first."""
     there = finished(buffer)
     wanted = jnp.minimum(jnp.sum(there) // 5, LAST)
     behind = jnp.cumsum(there[::-1])[::-1] - there

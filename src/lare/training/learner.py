@@ -1,8 +1,8 @@
-"""The training state: what is stored, what the decoders are fitted to, what the algorithm is paid.
+"""The training state: the stored steps, the data that the decoders are fitted to, the rewards of the algorithm.
 
-This is the one place where credit and algorithm meet: `credit` does not know what its rewards are for, the algorithm not
-where they come from. A team is agents that share a return, and each team has a decoder of its own. How the algorithms update
-stands in `off_policy.py`, `on_policy.py` and `sequences.py`, by what they consume.
+Only here do credit and algorithm meet: `credit` does not know the algorithm, and the algorithm does not know which method computes
+its rewards. A team is a group of agents that share a return, and each team has its own decoder. The updates of the algorithms are
+in `off_policy.py`, `on_policy.py` and `sequences.py`, by the data that they consume.
 
 Functions are written for one seed; `compiled.py` gives them their leading seed axis.
 """
@@ -27,26 +27,26 @@ from lare.tasks.env import alive_mean, team_mean
 from lare.training.config import TrainConfig
 
 PART = 2400
-"""Rows of features, about, over which one part of a decoder's gradient is computed. More fall out of the cache, fewer keep
-the matrix products waiting; on one core 256 episodes of six agents at once took 1.5 times as long."""
+"""About how many rows of features each part of a decoder's gradient is computed from. More rows do not fit into the cache, and
+fewer make the matrix products inefficient. On one core, 256 episodes of six agents at once took 1.5 times as long."""
 
 
 class Learner(NamedTuple):
     """The whole training state of one seed."""
 
     algorithm: Any
-    """What the algorithm learns."""
+    """The state of the algorithm."""
     credit: tuple[Decomposition, ...]
-    """One for each team; none for a method that fits nothing."""
+    """The decoders, one for each team; empty for a method that fits nothing."""
     scale: tuple[Scale, ...]
-    """Of each team's R/T."""
+    """The scale of each team's R/T."""
     replay: Replay
     counted: Int[Array, " envs"]
-    """Finished episodes of each environment that the decoders have been told of."""
+    """Finished episodes of each environment that the decoders have learned from."""
 
 
 class Paid(NamedTuple):
-    """What rewards are computed by."""
+    """The state from which rewards are computed."""
 
     credit: tuple[Decomposition, ...]
     scale: tuple[Scale, ...]
@@ -85,7 +85,7 @@ def init(key: PRNGKeyArray, config: TrainConfig, algorithm: Any) -> Learner:
 
 
 def features(steps: StoredSteps, config: TrainConfig, place: int) -> Float[Array, "*batch rows features"]:
-    """What a team's decoder sees of some steps."""
+    """The inputs of a team's decoder for some steps."""
     rows, encoder, found = config.judged(place), config.method.encoder, []
     if config.method.latent:
         found.append(steps.before["factors"][..., rows, : config.factors[place]])
@@ -95,7 +95,7 @@ def features(steps: StoredSteps, config: TrainConfig, place: int) -> Float[Array
 
 
 def raw_features(steps: StoredSteps, config: TrainConfig, rows: slice) -> list[Float[Array, "*batch rows _"]]:
-    """The raw part of what a decoder sees of some steps."""
+    """The raw part of a decoder's inputs for some steps."""
     before, after, encoder = steps.before, steps.after, config.method.encoder
     name = "state" if config.of_state else "observation"
     shown, led_to = (
@@ -103,7 +103,7 @@ def raw_features(steps: StoredSteps, config: TrainConfig, rows: slice) -> list[F
     )
     if encoder is Encoder.RAW and not config.raw_differences:
         return [led_to]
-    # A Gaussian may choose beyond the bounds; what happened is that the bound was taken.
+    # A Gaussian may choose an action beyond the bounds; the environment then took the bound.
     action = jnp.clip(before["action"], -1, 1)
     action = action.reshape(*action.shape[:-2], 1, -1) if config.of_state else action[..., rows, :]
     match encoder:
@@ -123,7 +123,7 @@ def alive(steps: StoredSteps, config: TrainConfig) -> Bool[Array, "*batch agents
 
 
 def alive_rows(steps: StoredSteps, config: TrainConfig, place: int) -> Bool[Array, "*batch rows"] | None:
-    """Which of a team's judged rows count; None where all always do."""
+    """Which of a team's judged rows count; None if all always do."""
     if "alive" not in steps.before or config.of_state:
         return None
     return steps.before["alive"][..., config.judged(place)]
@@ -146,7 +146,7 @@ def store(
 
 
 def rows_of(steps: Trajectory, factors: Array, config: TrainConfig) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The replay's columns of new steps, and what the steps led to."""
+    """The replay's columns for new steps, before and after each step."""
     there = {
         **{name: getattr(steps.before, name) for name in replay.SHOWN},
         "action": steps.action,
@@ -160,7 +160,7 @@ def rows_of(steps: Trajectory, factors: Array, config: TrainConfig) -> tuple[dic
 
 
 def team_rewards(steps: Trajectory, config: TrainConfig) -> Float[Array, "time envs teams"]:
-    """What each team has earned by each step."""
+    """The reward of each team for each step."""
     of_each = (team_mean(steps.after.reward, steps.before.alive, team) for team in config.env.teams)
     return jnp.stack(list(of_each), axis=-1)
 
@@ -181,12 +181,12 @@ def shares(mask: Bool[Array, "*batch rows"]) -> Float[Array, "*batch rows"]:
 
 
 def forget_episodes(learner: Learner, dropped: Bool[Array, " envs"]) -> Learner:
-    """Without the episodes that are under way in some of the environments."""
+    """The learner without the running episodes of some environments."""
     return learner._replace(replay=replay.drop_running(learner.replay, dropped))
 
 
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditSample | None:
-    """Decide for some updates of the decoders which steps each of them reads; None for a method without such updates."""
+    """Choose the steps that each of some updates of the decoders reads; None for a method without such updates."""
     fit, credit, longest = config.method.fit, config.credit, config.env.max_steps
     if fit is None or not config.method.descends:
         return None
@@ -201,7 +201,7 @@ def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: Train
 
 
 def parts_count(config: TrainConfig) -> int:
-    """Episodes of an update: of so many steps, whole where all episodes are equally long, else as many as are drawn of each."""
+    """The number of episodes in an update: whole episodes if all have the same length, else with `drawn_steps` steps of each."""
     longest = config.env.max_steps
     return max(1, config.credit.steps // (longest if config.env.fixed_length else config.credit.drawn_steps))
 
@@ -221,7 +221,7 @@ def fit(
 
 
 def episodes_of(steps: StoredSteps, sample: CreditSample, config: TrainConfig, place: int) -> Episodes:
-    """What a team's decoder is given of the steps that were chosen."""
+    """The batch of a team's decoder, from the chosen steps."""
     mask, chosen = alive_rows(steps, config, place), sample.episodes
     return Episodes(
         features(steps, config, place),
@@ -236,7 +236,7 @@ def episodes_of(steps: StoredSteps, sample: CreditSample, config: TrainConfig, p
 def update_decoder(
     credit: Decomposition, batch: Episodes, key: PRNGKeyArray, config: TrainConfig
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """One gradient step; a large batch of equally long episodes part by part."""
+    """One gradient step. The gradient of a large batch of equally long episodes is computed in parts."""
     assert config.method.fit is not None
     rows, count = batch.features[..., 0].size, len(batch.length)
     parts = 1
@@ -254,7 +254,7 @@ def update_decoder(
 def fit_often(
     learner: Learner, key: PRNGKeyArray, config: TrainConfig
 ) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
-    """`fit_updates` updates of the decoders, one behind the other; the mean of each metric over them."""
+    """`fit_updates` updates of the decoders, one after the other; the mean of each metric over them."""
     sample_key, key = jax.random.split(key)
     samples = sample_credit(learner.replay, sample_key, config.fit_updates, config)
     if samples is None:
@@ -268,7 +268,7 @@ def fit_often(
 
 
 def rewards(steps: StoredSteps, paid: Paid, config: TrainConfig) -> Float[Array, "*batch agents"]:
-    """What the algorithm is trained on: of each agent, proxy rewards always by the decoders as they stand."""
+    """The rewards that the algorithm is trained on, for each agent. Proxy rewards are always by the current decoders."""
     acting, parts = alive(steps, config), []
     for place, team in enumerate(config.env.teams):
         shape = (*steps.finished.shape, team.size)
@@ -291,11 +291,11 @@ def rewards(steps: StoredSteps, paid: Paid, config: TrainConfig) -> Float[Array,
 def proxy_rewards(
     steps: StoredSteps, paid: Paid, config: TrainConfig, place: int, *, as_paid: bool = False
 ) -> Float[Array, "*batch rows"]:
-    """r_hat of a team, for a method that has one: of each of its agents, or one for all. `as_paid`: with optimism, if it is set."""
+    """r_hat of a team, for a method that has one: for each of its agents, or one for all. `as_paid` adds optimism, if it is set."""
     if config.method.reward is Reward.DESIGNED:
         return steps.before["factors"][..., config.judged(place), 0]
     if config.method.reward is Reward.UNIFORM:
-        # What an episode under way is worth is not known yet.
+        # The return of a running episode is not known yet.
         share = within_range(paid.scale[place], steps.mean_reward[..., place])
         return jnp.where(steps.finished, share, 0.5)[..., None]
     rows = features(steps, config, place)
@@ -307,11 +307,11 @@ def proxy_rewards(
 
 
 def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]:
-    """How near the newest proxy rewards come to the true ones, over the last steps of every environment."""
+    """How close the newest proxy rewards are to the true ones, over the last steps of every environment."""
     if not config.method.has_proxy:
         return {}
     buffer, found = learner.replay, []
-    # What looks at whole episodes is given no others: those of the newest iteration.
+    # Decoders of whole episodes need whole episodes: those of the newest iteration.
     count = config.rollout_steps if config.env.fixed_length else max(1, RECENT // config.environments)
     index = replay.newest(buffer, min(replay.capacity(buffer) - 1, count))
     oldest = replay.oldest_transition(buffer)[:, None]
@@ -336,6 +336,6 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
 
 
 def by_team(measured: list[dict[str, Array]], config: TrainConfig) -> dict[str, Array]:
-    """The metrics of all teams: those of the first and, where there are several, each team's under its own name too."""
+    """The metrics of all teams: those of the first and, if there are several, those of each team under its own name, too."""
     teams = zip(config.env.teams, measured, strict=True) if len(measured) > 1 else ()
     return measured[0] | {f"{name}_{team.name}": value for team, own in teams for name, value in own.items()}

@@ -26,7 +26,7 @@ from lare.training.learner import Learner, Paid, sample_credit
 
 
 class UpdateSample(NamedTuple):
-    """Which transitions one update reads. Only numbers; the rows are read when the update runs."""
+    """The transitions that one update reads, by number. The rows are read when the update runs."""
 
     batch: Index
     credit: CreditSample | None
@@ -49,12 +49,12 @@ def init(key: PRNGKeyArray, config: TrainConfig) -> Any:
 
 
 def actor(learner: Learner, done: int, config: TrainConfig) -> MLP:
-    """What is needed to act, of all seeds."""
+    """The parts of the learner that are needed to act, for all seeds."""
     return learner.algorithm.online.actor
 
 
 def memory(config: TrainConfig) -> tuple[()]:
-    """What an actor remembers of an episode: nothing."""
+    """The memory of an actor: none."""
     return ()
 
 
@@ -74,7 +74,7 @@ def act(
 
 
 def sample(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> UpdateSample:
-    """Decide for many updates at once what each of them reads."""
+    """Choose the steps of many updates at once."""
     batch_key, credit_key = jax.random.split(key)
     batch = sample_transitions(buffer, batch_key, (updates, settings_of(config).batch_size))
     return UpdateSample(batch, sample_credit(buffer, credit_key, updates, config) if config.interleaved else None)
@@ -120,5 +120,5 @@ def transitions(steps: StoredSteps, reward: Float[Array, "batch 1"]) -> Transiti
 def improve(
     learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], done: Int[Scalar, ""], config: TrainConfig
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
-    """The same for all seeds."""
+    """`improve_one` for all seeds."""
     return jax.vmap(partial(improve_one, config=config), in_axes=(0, 0, 0, None))(learner, steps, keys, done)

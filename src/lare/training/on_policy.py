@@ -1,6 +1,6 @@
-"""Algorithms that consume rollouts: relabel the newest steps by the decoder as it stands, update the policy on them.
+"""Algorithms that consume rollouts: relabel the newest steps by the current decoder, update the policy on them.
 
-Algorithm 1 of the LaRe paper, lines 6 to 8, for PPO and IPPO. The decoder has been fitted on all that is stored.
+Algorithm 1 of the LaRe paper, lines 6 to 8, for PPO and IPPO. The decoder was fitted to all stored episodes before.
 """
 
 from functools import partial
@@ -38,7 +38,7 @@ def policy_input_size(config: TrainConfig) -> int:
 def policy_input(
     observation: Float[Array, "*batch agents observation"], config: TrainConfig
 ) -> Float[Array, "*batch agents policy_input"]:
-    """What actor and critic see: the observation and, where there are several teams, which agent it is."""
+    """The input of actor and critic: the observation and, if there are several teams, the agent's one-hot number."""
     if len(config.env.teams) == 1:
         return observation
     agents = config.env.agents
@@ -47,12 +47,12 @@ def policy_input(
 
 
 def actor(learner: Learner, done: int, config: TrainConfig) -> ppo.Actor:
-    """What is needed to act, of all seeds."""
+    """The parts of the learner that are needed to act, for all seeds."""
     return ppo.actor_of(learner.algorithm)
 
 
 def memory(config: TrainConfig) -> tuple[()]:
-    """What an actor remembers of an episode: nothing."""
+    """The memory of an actor: none."""
     return ()
 
 
@@ -72,7 +72,7 @@ def act(
 
 
 def rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> ppo.Rollout:
-    """The newest steps with what the method pays for them. A lane is an agent in an environment."""
+    """The newest steps with the method's rewards. A lane is an agent in an environment."""
     stored = replay.read(learner.replay, replay.newest(learner.replay, config.rollout_steps))
     reward = common.rewards(stored, Paid(learner.credit, learner.scale), config)  # [envs time agents]
     agents, leave = config.env.agents, config.env.agents_leave
@@ -80,7 +80,7 @@ def rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> ppo.Rol
     def each(values: Array) -> Float[Array, "time envs agents"]:
         return jnp.broadcast_to(values[..., None], (*values.shape, agents)).astype(jnp.float32)
 
-    # Undiscounted, what would follow a time limit has no finite value: an episode is worth its return up to there.
+    # Without a discount, the value after a time limit is not finite. The episode's value is then its return up to the limit.
     over = steps.after.terminated if settings_of(config).gamma < 1 else steps.ended
     continues, ended = each(~jnp.asarray(over)), each(jnp.asarray(steps.ended))
     if leave:
@@ -115,5 +115,5 @@ def improve_one(
 def improve(
     learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], done: Int[Scalar, ""], config: TrainConfig
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
-    """The same for all seeds."""
+    """`improve_one` for all seeds."""
     return jax.vmap(partial(improve_one, config=config), in_axes=(0, 0, 0, None))(learner, steps, keys, done)

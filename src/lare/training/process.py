@@ -1,4 +1,4 @@
-"""What can befall the process that trains: memory that runs out, and somebody who asks it to stop."""
+"""Events that the training process must handle: memory that runs out, and requests to stop."""
 
 import contextlib
 import signal
@@ -13,7 +13,7 @@ from lare.run.directory import Run
 
 @contextlib.contextmanager
 def enough_memory(run: Run) -> Iterator[None]:
-    """Raise `LareError` where memory runs out."""
+    """Raise `LareError` if memory runs out."""
     try:
         yield
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
@@ -29,10 +29,10 @@ def enough_memory(run: Run) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_requests() -> Iterator[threading.Event]:
-    """An event that Ctrl-C or a polite kill sets, once; a second one ends the process at once."""
+    """An event that the first Ctrl-C or SIGTERM sets. The second one ends the process at once."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield stop  # only the main thread may say what a signal does
+        yield stop  # only the main thread may set signal handlers
         return
 
     def handle(number: int, frame: object) -> None:

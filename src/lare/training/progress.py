@@ -1,4 +1,4 @@
-"""What a run says while it goes: a live line on a terminal, plain lines elsewhere; TensorBoard events if asked for."""
+"""The progress of a run: a live line on a terminal, plain lines elsewhere; TensorBoard events if asked for."""
 
 import math
 import time
@@ -13,15 +13,15 @@ from lare.errors import needs_extra
 from lare.legible import legible
 
 Metrics = Sequence[Mapping[str, Any]]
-"""One mapping a seed, as in metrics.jsonl."""
+"""One mapping for each seed, as in metrics.jsonl."""
 
 
 @runtime_checkable
 class Listener(Protocol):
-    """Whoever wants to know how a run is going. Steps are environment steps of each seed."""
+    """An object that is told the progress of a run. Steps are environment steps of each seed."""
 
     def started(self, name: str, step: int, steps: int) -> None:
-        """Training begins at a step (above 0 when a run is resumed), and is to go to `steps`."""
+        """Training begins at `step` (above 0 if a run is resumed), and will end at `steps`."""
 
     def stepped(self, step: int) -> None:
         """An iteration has been made: some steps, and their updates."""
@@ -33,7 +33,7 @@ class Listener(Protocol):
         """Something that the user should read, in a line."""
 
     def stopped(self) -> None:
-        """The run has ended, in one way or another: called always, and once."""
+        """The run has ended, for whatever reason. This is always called, exactly once."""
 
 
 def mean(metrics: Metrics, key: str) -> float | None:
@@ -42,7 +42,7 @@ def mean(metrics: Metrics, key: str) -> float | None:
 
 
 def summary(metrics: Metrics) -> str:
-    """The figures that matter, means over the seeds."""
+    """The main metrics in one line, as means over the seeds."""
     parts = [f"{mean(metrics, 'time/steps_per_second') or 0:.0f} steps/s"]
     for key, label, form in (
         ("evaluation/return", "return", ".1f"),
@@ -57,7 +57,7 @@ def summary(metrics: Metrics) -> str:
 
 
 class Terminal:
-    """A live line where the console is a terminal, a plain line for each evaluation where it is not."""
+    """A live line if the console is a terminal, else a plain line for each evaluation."""
 
     def __init__(self, console: Console | None = None):
         self.console = console or Console(stderr=True)
@@ -93,7 +93,7 @@ class Terminal:
             )
 
     def left(self, step: int, metrics: Metrics) -> str:
-        """How long the rest takes at the pace of the last steps; nothing as long as there are no updates, which take the time."""
+        """The remaining time at the pace of the last steps; empty before the first update, as updates take most of the time."""
         rate = mean(metrics, "time/steps_per_second")
         if not rate or mean(metrics, "critic/loss") is None or step >= self.steps:
             return ""
@@ -108,7 +108,7 @@ class Terminal:
 
 
 def summary_writer() -> Any:
-    """What writes TensorBoard events. Raises `LareError` where the extra is not there."""
+    """The class that writes TensorBoard events. Raises `LareError` if the extra is not installed."""
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
@@ -117,11 +117,11 @@ def summary_writer() -> Any:
 
 
 class TensorBoard:
-    """Every number of metrics.jsonl as TensorBoard events, one writer a seed."""
+    """Every number of metrics.jsonl as TensorBoard events, with one writer for each seed."""
 
     def __init__(self, directory: Path, step: int, seeds: Sequence[int]):
         writer = summary_writer()
-        # What an earlier process wrote behind the checkpoint comes again, and is purged.
+        # Events that an earlier process wrote after the checkpoint are purged, because they are written again.
         purge = step + 1 if step else None
         self.writers = {
             seed: writer(str(directory / f"seed-{seed}"), purge_step=purge, flush_secs=10) for seed in seeds
@@ -143,7 +143,7 @@ class TensorBoard:
 
 
 class Clock:
-    """Steps per second since it was last asked."""
+    """Measures steps per second since the last call of `rate`."""
 
     def __init__(self, step: int):
         self.step, self.time = step, time.perf_counter()

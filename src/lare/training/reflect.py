@@ -1,6 +1,6 @@
-"""What the returns of some episodes say of a function, for the model that wrote it; and the model's next try.
+"""Reflection: a model sees how well its function explains the returns of some episodes, and tries to improve it.
 
-The episodes are played for it before training, or are those that a run has stored.
+The episodes are played for this purpose before training, or are those that a run has stored.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from lare.tasks.play import Episode, Policy, episodes_of
 from lare.tasks.spec import TaskSpec, as_task, the_role
 
 EPISODES = 40
-"""That are played, where none are given."""
+"""The number of episodes to play, if none are given."""
 
 
 def reflect(
@@ -36,27 +36,27 @@ def reflect(
     record: Path | None = None,
     said: Callable[[str], None] = lambda _: None,
 ) -> LatentFunction:
-    """Show a model what returns say of its function; keep the function whose factors tell them best. Not in the paper.
+    """Show a model how well its function explains returns; keep the function whose factors explain them best. Not in the paper.
 
     A function is judged by R^2 of the returns of the same episodes, each predicted before it was seen (`credit/judging.py`).
-    Whatever goes wrong on the way, the best function so far is returned.
+    If anything fails, the best function so far is returned.
 
     Args:
-        function: from `lare.design`, or by hand.
-        task: that it is for: a name, a path, or a spec.
-        model: whom to ask.
-        rounds: how often.
-        episodes: whole episodes; 40 are played, unless given.
-        policy: from one observation of a single agent to one action: plays them, instead of random actions.
-        record: a file that takes every exchange; the one that the design had, if it had one.
-        said: is told how it goes.
+        function: a function from `lare.design`, or written by hand.
+        task: the task of the function: a name, a path, or a spec.
+        model: the model to ask.
+        rounds: number of rounds.
+        episodes: whole episodes; by default, 40 are played.
+        policy: from one observation of a single agent to one action: plays the episodes instead of random actions.
+        record: a file to record every exchange in; if the design was recorded, the same file.
+        said: called with messages about the progress.
 
     Raises:
-        LareError: rounds are less than 1, or each team of the task has a function of its own.
+        LareError: `rounds` is less than 1, or each team of the task has its own function.
     """
     role = the_role(as_task(task))
     if rounds < 1:
-        raise LareError(f"rounds = {rounds}: at least one")
+        raise LareError(f"rounds = {rounds}: at least one is needed")
 
     @cache
     def played() -> Sequence[Episode]:
@@ -69,27 +69,27 @@ def reflect(
 
 
 class Told(NamedTuple):
-    """What the returns of some episodes say of a function."""
+    """What the returns of some episodes say about a function."""
 
     r2: float
-    """Of the returns, each predicted by the factors before it was seen; NaN where they are all the same."""
+    """R^2 of the returns, each predicted by the factors before it was seen; NaN if the returns are all the same."""
     sentences: list[str]
-    """Those that a user reads; none where the returns are all the same."""
+    """Sentences for the user; empty if the returns are all the same."""
     ranges: list[str]
-    """Of each factor's values, a line each."""
+    """A line on the values of each factor."""
 
 
 def evidence_of(function: LatentFunction, role: TaskSpec, episodes: Sequence[Episode]) -> Evidence:
-    """The same, for a language model. Raises `LareError` as `told_by_returns`."""
+    """`told_by_returns` as a text for a language model. Raises `LareError` like it."""
     found = told_by_returns(function, role, episodes)
     return Evidence(found.r2, "\n".join([*found.ranges, *found.sentences]))
 
 
 def told_by_returns(function: LatentFunction, role: TaskSpec, episodes: Sequence[Episode]) -> Told:
-    """What the returns of some episodes say of a function.
+    """What the returns of some episodes say about a function.
 
     Raises:
-        LareError: they are too few, or the function failed on one of them.
+        LareError: there are too few episodes, or the function failed on one of them.
     """
     if len(episodes) < FEWEST:
         raise LareError(f"{len(episodes)} episodes say too little of a function: {FEWEST} are needed")
@@ -117,7 +117,7 @@ def factors_of(function: LatentFunction, role: TaskSpec, episode: Episode) -> Fl
 
 
 def said_of(found: Judgement, names: list[str], role: TaskSpec, basis: Basis) -> list[str]:
-    """The sentences that a user reads too."""
+    """The explanation in sentences, which the user reads, too."""
     form = None if found.average is None else FORMS[int(found.average)]
     return words(
         found.explanation, form, names, entry_names(role.observation, role.action, basis.used_entries, role.action_size)
@@ -125,7 +125,7 @@ def said_of(found: Judgement, names: list[str], role: TaskSpec, basis: Basis) ->
 
 
 def ranges(names: Sequence[str], factors: Float[np.ndarray, "rows factors"]) -> list[str]:
-    """Which values each factor took, and which other ones it goes with."""
+    """A line on each factor: the range of its values, and the factors with which it correlates most."""
     among = correlations(factors)
     lines = []
     for place, name in enumerate(names):
@@ -140,6 +140,6 @@ def ranges(names: Sequence[str], factors: Float[np.ndarray, "rows factors"]) -> 
 
 
 def correlations(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
-    """Pearson's, 0 where something does not vary."""
+    """Pearson's correlations; 0 for a column that does not vary."""
     with np.errstate(all="ignore"):
         return np.atleast_2d(np.nan_to_num(np.corrcoef(columns, rowvar=False)))

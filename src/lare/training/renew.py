@@ -1,7 +1,7 @@
-"""Reflection in the middle of a run: phi is judged by the stored episodes, and one that tells their returns better takes its place.
+"""Reflection during a run: phi is judged by the stored episodes, and a phi that explains their returns better replaces it.
 
 The factors of all stored steps are then computed again from the stored observations, and the decoder is fitted in closed form to
-all stored episodes, so that it is right at once. What the algorithm has learned stays as it is.
+all stored episodes, so that it matches the new phi at once. The state of the algorithm is unchanged.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ from lare.training.seeds import of_seed
 from lare.training.streams import seed_keys
 
 EPISODES = 200
-"""The newest of all seeds together, by which functions are judged."""
+"""Functions are judged by so many newest episodes of all seeds together."""
 ROWS = 10_000
 """Steps whose factors are computed at a time."""
 
@@ -37,7 +37,7 @@ ROWS = 10_000
 def reflected(
     run: Run, config: TrainConfig, learner: Learner, model: Model, said: Callable[[str], None]
 ) -> tuple[LatentFunction, ...]:
-    """The functions of a run after a round of reflection each, by the run's stored episodes."""
+    """The functions of a run after one round of reflection for each, on the run's stored episodes."""
     found = []
     for place, (function, role) in enumerate(zip(run.functions, run.config.task.roles, strict=True)):
         known = None if config.credit.score == "auto" else config.credit.score
@@ -53,7 +53,7 @@ def reflected(
 
 
 def stored_episodes(learner: Learner, config: TrainConfig, role: TaskSpec, place: int) -> list[Episode]:
-    """The newest finished episodes of all seeds, in the order in which they were played, as one role is judged."""
+    """The newest finished episodes of all seeds, as one role is judged, in the order in which they were played."""
     seeds = len(learner.counted)
     each = max(1, EPISODES // (seeds * config.environments))
     read_one, found = jax.jit(partial(stored_episode, longest=config.env.max_steps)), []
@@ -73,13 +73,13 @@ def stored_episodes(learner: Learner, config: TrainConfig, role: TaskSpec, place
 def stored_episode(
     buffer: Replay, since: Int[Array, " envs"], number: Int[Array, ""], longest: int
 ) -> tuple[StoredSteps, Int[Array, ""]]:
-    """The steps of one finished episode and, behind them, padding; and how many there are."""
+    """The steps of one finished episode, followed by padding, and the number of steps."""
     sample = in_order(buffer, since, number, 1, longest)
     return read(buffer, sample.steps), sample.episodes.length[0]
 
 
 def as_judged(steps: StoredSteps, length: int, config: TrainConfig, role: TaskSpec, team: Team) -> Episode:
-    """Stored steps as a role is judged."""
+    """Stored steps as an episode, as a role is judged."""
     env = config.env
     before, after = (
         {name: np.asarray(part)[:length] for name, part in one.items()} for one in (steps.before, steps.after)
@@ -96,7 +96,7 @@ def as_judged(steps: StoredSteps, length: int, config: TrainConfig, role: TaskSp
 
 
 def timestep(columns: dict[str, np.ndarray]) -> Timestep:
-    """As far as functions look at one."""
+    """A time step with the arrays that latent functions read; the others are empty."""
     none = np.zeros(0, np.float32)
     return Timestep(
         observation=columns.get("observation", none),
@@ -111,12 +111,12 @@ def timestep(columns: dict[str, np.ndarray]) -> Timestep:
 
 
 def with_functions(run: Run, config: TrainConfig, learner: Learner) -> Learner:
-    """A learner whose stored factors, and whose decoders, are of a run's new functions.
+    """The learner with the factors and the decoders of a run's new functions.
 
     Args:
-        run: with the new functions.
-        config: of that run.
-        learner: with the factors of the old ones.
+        run: the run with the new functions.
+        config: the configuration of that run.
+        learner: the learner with the factors of the old functions.
     """
     columns = dict(learner.replay.columns)
     buffers = [of_seed(learner.replay, seed) for seed in range(len(run.seeds))]
@@ -151,7 +151,7 @@ def factors_again(run: Run, config: TrainConfig, buffer: Replay) -> Float[Array,
 
 
 def untrained(known: Credit, key: Array, config: TrainConfig) -> Credit:
-    """New decoders of one seed. What was learned of returns alone is kept."""
+    """New decoders of one seed. The parts that depend on returns alone are kept."""
     return tuple(
         new._replace(scale=old.scale, return_scale=old.return_scale, average=old.average, rivals=old.rivals)
         for new, old in zip(init_credit([key] * len(known), config), known, strict=True)
@@ -159,14 +159,14 @@ def untrained(known: Credit, key: Array, config: TrainConfig) -> Credit:
 
 
 def fitted_to_all(credit: Credit, buffer: Replay, config: TrainConfig) -> Credit:
-    """Untrained decoders of all seeds, fitted to all stored episodes. In float64, where that is enabled."""
+    """Fit untrained decoders of all seeds to all stored episodes; in float64, if that is enabled."""
     credit = jax.vmap(lambda one, stored: from_stored(one, stored, config))(credit, buffer)
     every = jnp.ones(len(buffer.episodes), bool)
     return tuple(fit_those_due(one, every, config) for one in credit)
 
 
 def in_place_of(run: Run, functions: tuple[LatentFunction, ...], step: int) -> Run:
-    """A run that goes on with other functions from some step on; they are kept in its directory."""
+    """The run with new functions from a step on, which are saved in its directory."""
     renewed = replace(run, functions=functions, since=step)
     renewed.keep_functions()
     for function in run.functions:

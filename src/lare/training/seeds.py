@@ -6,21 +6,23 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
+from jaxtyping import Array, Int
 
 State = TypeVar("State")
 
 
-def of_seed(state: State, place: int = 0) -> State:
+@jax.jit
+def of_seed(state: State, place: int | Int[Array, ""] = 0) -> State:
     """The part of a training state that belongs to one seed."""
     return jax.tree.map(lambda leaf: leaf[place], state)
 
 
 def lines(seeds: Sequence[int], step: int, measured: Mapping[str, Any], rate: float) -> list[dict[str, Any]]:
-    """One line of metrics.jsonl for each seed, of arrays that have a number for each."""
+    """One line of metrics.jsonl for each seed, from arrays with one number for each seed."""
     found = []
     for place, seed in enumerate(seeds):
         numbers = {name: float(np.asarray(values)[place]) for name, values in measured.items()}
-        # JSON knows no NaN: a correlation with something that never varies is null.
+        # JSON has no NaN: a correlation with a value that never varies is null.
         known = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
         found.append({"step": step, "seed": seed, **known, "time/steps_per_second": round(rate, 1)})
     return found

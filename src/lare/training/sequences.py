@@ -1,8 +1,8 @@
-"""Algorithms that consume whole episodes: sample them, relabel them by the newest decoder, update; as often as episodes have ended.
+"""Algorithms that consume whole episodes: sample them, relabel them by the newest decoder, update; once for so many new episodes.
 
-QMIX and VDN. The team has one reward a step: the mean over its agents that are alive. The mixer is given the global state by its
-running mean and deviation (PyMARL2: as it comes, where its environments scale it); where there is none, all observations side
-by side.
+QMIX and VDN. The team has one reward for each step: the mean over its agents that are alive. The mixer's input is the global state,
+standardised by its running mean and deviation (PyMARL2 does not standardise it; its environments scale it). If there is no global
+state, the input is all observations side by side.
 """
 
 from functools import partial
@@ -31,21 +31,22 @@ Updated = tuple[qmix.QMIX, tuple[Decomposition, ...]]
 
 
 WORTH_CUTTING = 32
-"""Steps of the longest episode. Each length is compiled by itself, and shorter episodes have little to save."""
+"""Batches are cut to shorter lengths only if the longest episode has so many steps: each length is compiled by itself, and little
+is saved for shorter episodes."""
 
 
 class SequenceState(NamedTuple):
-    """What QMIX learns, and what stands around it."""
+    """The state of QMIX, and what its training needs beside it."""
 
     qmix: qmix.QMIX
     states: RunningMeanStd
-    """Of what the mixer is given."""
+    """Running statistics of the mixer's input."""
     done: Int[Array, ""]
-    """Updates that the episodes so far have been worth: one for `update_every`, made or not."""
+    """The number of updates that were due so far, made or not: one for every `update_every` episodes."""
 
 
 class Actor(NamedTuple):
-    """What is needed to act."""
+    """The parts of the state that are needed to act."""
 
     agent: Recurrent
     epsilon: Float[Array, ""]
@@ -58,7 +59,7 @@ def settings_of(config: TrainConfig) -> QMIXSettings:
 
 
 def mixer_input_size(config: TrainConfig) -> int:
-    """Size of what the mixer is given."""
+    """Size of the mixer's input."""
     return config.env.state_size or config.env.agents * config.env.observation_size
 
 
@@ -78,13 +79,13 @@ def init(key: PRNGKeyArray, config: TrainConfig) -> SequenceState:
 
 
 def actor(learner: Learner, done: int, config: TrainConfig) -> Actor:
-    """What is needed to act, of all seeds."""
+    """The parts of the learner that are needed to act, for all seeds."""
     state = learner.algorithm
     return Actor(state.qmix.online.agent, jnp.full(state.done.shape, qmix.epsilon(done, settings_of(config))))
 
 
 def memory(config: TrainConfig) -> qmix.Memory:
-    """What the agents remember before the first step of an episode."""
+    """The memory of the agents before the first step of an episode."""
     return qmix.no_memory((config.env.agents,), config.env.action_size, settings_of(config))
 
 
@@ -96,14 +97,14 @@ def act(
     noise: Float[Array, "*batch agents 1+action"] | None,
     config: TrainConfig,
 ) -> tuple[Float[Array, "*batch agents action"], qmix.Memory]:
-    """The available actions of largest value or, with noise, sometimes any."""
+    """The available actions of largest value; with noise, sometimes random available ones."""
     return qmix.act(actor.agent, memory, observation, available, noise, actor.epsilon)
 
 
 def sequences(
     buffer: Replay, episodes: EpisodeSample, steps: int, paid: Paid, states: RunningMeanStd, config: TrainConfig
 ) -> qmix.Sequences:
-    """Drawn episodes, each padded with its last step to so many, with what the method pays for them."""
+    """Drawn episodes with the method's rewards, each padded with its last step to `steps` steps."""
     number = jnp.minimum(jnp.arange(steps), episodes.length[:, None] - 1)
     env = jnp.broadcast_to(episodes.first.env[:, None], number.shape)
     drawn = replay.read(buffer, Index(env, episodes.first.number[:, None] + number))
@@ -128,7 +129,7 @@ def sequences(
 
 
 def lengths(config: TrainConfig) -> list[int]:
-    """To which a batch may be cut: the shortest that holds its longest episode is taken."""
+    """The lengths to which a batch may be cut. The shortest one that holds its longest episode is taken."""
     longest = config.env.max_steps
     if config.env.fixed_length or longest < WORTH_CUTTING:
         return [longest]
@@ -143,7 +144,7 @@ def one_update(
     config: TrainConfig,
     steps: int,
 ) -> tuple[Updated, Measured]:
-    """The decoder's update, and then the algorithm's, of one seed; only what they change, for the learner holds much more."""
+    """Update the decoder and then the algorithm of one seed. Returns only the parts that change; the learner holds much more."""
     sample_key, fit_key = jax.random.split(key)
     credit, measured = learner.credit, {}
     chosen = sample_credit(learner.replay, sample_key, 1, config)
@@ -165,7 +166,7 @@ def improve(
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
     """One update for every `update_every` episodes that have ended, once there are enough for a batch; the mean of each metric.
 
-    All seeds together, so that the length of a batch is one number and no more is computed than is needed.
+    This function is for all seeds, so that the length of a batch is one number for all of them, and no longer than needed.
     """
     settings, before = settings_of(config), learner.algorithm.done
     worth = jnp.sum(learner.replay.episodes, axis=1) // settings.update_every
@@ -214,6 +215,6 @@ def loss_names(config: TrainConfig) -> list[str]:
 
 
 def with_states(states: RunningMeanStd, steps: Trajectory, config: TrainConfig) -> RunningMeanStd:
-    """With what the mixer will be given of new steps."""
+    """The statistics with the mixer's inputs for new steps."""
     rows = mixer_input({"state": steps.after.state, "observation": steps.after.observation}, config)
     return observe(states, jnp.asarray(rows).reshape(-1, rows.shape[-1]))

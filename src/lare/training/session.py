@@ -1,4 +1,4 @@
-"""A run under way: the training state, the environments around it, one iteration of the work at a time."""
+"""A running training: the training state, its environments, and the functions that advance it by one iteration."""
 
 import contextlib
 import ctypes
@@ -28,7 +28,7 @@ from lare.training import first_fit, renew
 from lare.training.annotate import annotate
 from lare.training.collect_device import DeviceCollector
 from lare.training.collect_host import HostCollector, host_collector
-from lare.training.compiled import Compiled, compiled, new_learners
+from lare.training.compiled import Compiled, compiled
 from lare.training.config import TrainConfig
 from lare.training.learner import Learner, forget_episodes
 from lare.training.seeds import lines
@@ -36,7 +36,7 @@ from lare.training.streams import Stream, seed_keys, stream_keys
 
 
 def config_for(run: Run) -> TrainConfig:
-    """What the run's compiled functions hold fixed."""
+    """The static configuration of the run's compiled functions."""
     task, settings, env = run.config.task, run.config.settings, env_spec(run.config.task)
     return TrainConfig(
         env=env,
@@ -57,7 +57,7 @@ def config_for(run: Run) -> TrainConfig:
 
 @dataclass
 class Session:
-    """The training state, and what is around it on the host."""
+    """The training state, and the objects on the host that belong to it."""
 
     run: Run
     config: TrainConfig
@@ -67,13 +67,13 @@ class Session:
     step: int = 0
     """Environment steps done, of each seed."""
     metrics_length: int = 0
-    """Bytes of metrics.jsonl that belong to the state."""
+    """The size of metrics.jsonl in bytes at this state."""
     fitted: bool = False
     """Whether the decoders' first fit has been made."""
     latest: dict[str, Float[Array, " seeds"]] = field(default_factory=dict)
-    """What the last updates measured."""
+    """The metrics of the last updates."""
     best: Best | None = None
-    """Of the evaluations so far; None before the first, and where several teams learn, which are each other's measure."""
+    """The best evaluations so far; None before the first, and if several teams learn, whose returns depend on each other."""
 
     @property
     def settings(self) -> ResolvedSettings:
@@ -81,11 +81,11 @@ class Session:
 
     @property
     def actor(self) -> Any:
-        """What is needed to act now."""
+        """The parts of the learner that are needed to act now."""
         return self.functions.actor(self.learner, self.step)
 
     def advance(self) -> None:
-        """One iteration: steps, factors, replay, sometimes the decoder, the algorithm."""
+        """One iteration: collect steps, compute factors, store them, sometimes fit the decoder, update the algorithm."""
         steps = self.collector.collect(self.actor, self.step)
         self.learner = self.functions.store(self.learner, steps, annotate(self.run, self.config, steps))
         if self.learner.credit and np.any(steps.ended):
@@ -95,7 +95,7 @@ class Session:
         self.step += self.settings.iteration_steps
 
     def update(self, steps: Trajectory) -> None:
-        """The decoder's own updates, where it has any and their turn has come, and the algorithm's."""
+        """Make the decoder's own updates, if it has any and they are due, and those of the algorithm."""
         number = self.step // self.settings.iteration_steps
         fits = self.config.method.descends and not self.config.interleaved
         if fits and number % self.settings.fit_every == 0:
@@ -106,7 +106,7 @@ class Session:
             self.latest |= learned
 
     def fit(self, keys: Key[Array, " seeds"]) -> None:
-        """The decoder's own updates, the first time until they stop helping."""
+        """Make the decoder's own updates; the first time, until they bring no improvement."""
         if self.settings.first_fit == "held-out" and not self.fitted and first_fit.has_enough(self.learner):
             self.learner, measured = first_fit.fit_until_it_stops_helping(
                 self.learner, self.functions.fit, keys, self.config
@@ -117,7 +117,7 @@ class Session:
         self.latest |= measured
 
     def report(self, rate: float) -> list[dict[str, Any]]:
-        """Evaluate, always from the same starts; one line of metrics.jsonl for each seed."""
+        """Evaluate, always from the same initial states; returns one line of metrics.jsonl for each seed."""
         evaluation = self.collector.evaluate(self.actor, self.settings.evaluation_episodes)
         if len(self.config.env.teams) == 1:
             self.keep_best(evaluation.returns[..., 0].mean(axis=1))
@@ -125,7 +125,7 @@ class Session:
         return lines(self.run.seeds, self.step, measured, rate)
 
     def keep_best(self, score: Float[np.ndarray, " seeds"]) -> None:
-        """Keep the policies of the seeds that have never been evaluated better."""
+        """Save the policies of the seeds whose evaluation is their best so far."""
         before = self.best or best_policies.none_yet(len(self.run.seeds))
         found = best_policies.better_of(before, score, self.step, self.actor)
         if np.any(found.score > before.score):
@@ -133,7 +133,7 @@ class Session:
         self.best = found
 
     def save(self, anew: bool = False) -> None:
-        """Write a checkpoint; `anew` where stored rows have changed."""
+        """Write a checkpoint; `anew` if stored rows have changed."""
         digests = [function.digest for function in self.run.functions]
         host = {"step": self.step, "metrics_length": self.metrics_length, "fitted": self.fitted}
         host |= {"functions_since": self.run.since, "function_sha256": digests}
@@ -142,7 +142,7 @@ class Session:
         checkpoint.save(self.run.checkpoint, self.learner, host, arrays, anew)
 
     def reflect(self, model: Model, said: Callable[[str], None]) -> None:
-        """Ask for a better phi, and go on with it from here where it tells the stored returns better."""
+        """Ask a model for a better phi, and use it from now on if it explains the stored returns better."""
         found = renew.reflected(self.run, self.config, self.learner, model, said)
         if [one.source for one in found] == [one.source for one in self.run.functions]:
             return
@@ -153,15 +153,15 @@ class Session:
         self.save(anew=True)
 
     def return_to(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[str]:
-        """Put everything around the learner back to a checkpoint; returns what is to be said about it."""
+        """Restore everything but the learner from a checkpoint; returns messages for the user."""
         self.step, self.metrics_length, self.fitted = host["step"], host["metrics_length"], host.get("fitted", False)
-        self.latest = {name: jnp.asarray(values) for name, values in part(arrays, "latest/").items()}
+        self.latest = jax.device_put(part(arrays, "latest/"))
         if (self.run.checkpoint / best_policies.FILE).exists():
             self.best = best_policies.load(self.run.checkpoint, actor_shape(self.run, self.config), self.run.seeds)
         dropped, messages = self.collector.restore(part(arrays, "collector/"))
         if dropped.any():
             self.learner = drop(self.learner, jnp.asarray(dropped))
-            self.save()  # before a new episode is in the rows of the dropped one, which the checkpoint has as written
+            self.save()  # now, because a new episode will overwrite rows that the checkpoint counts as saved
         return messages
 
     def close(self) -> None:
@@ -170,7 +170,7 @@ class Session:
 
 
 def part(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """The arrays whose names begin so, by the rest of their names."""
+    """The arrays whose names begin with a prefix, by the rest of their names."""
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
 
 
@@ -178,39 +178,39 @@ drop = jax.jit(jax.vmap(forget_episodes))
 
 
 def load_learner(run: Run) -> tuple[TrainConfig, Learner, dict[str, Any], dict[str, np.ndarray]]:
-    """The training state of a run's last checkpoint, and what stood with it."""
+    """The training state of a run's last checkpoint, and the data that were saved with it."""
     config = config_for(run)
     return config, *checkpoint.load(run.checkpoint, learner_shape(run, config))
 
 
 def load_actor(run: Run, of_best: bool = False) -> tuple[TrainConfig, Any, Int[np.ndarray, " seeds"]]:
-    """What is needed to act as a run acts at last or, of each seed, as in its best evaluation; and since which step it does.
+    """The actor of the last checkpoint or, for each seed, of its best evaluation; and the step at which it was saved.
 
     Raises:
-        LareError: it has not been saved.
+        LareError: no actor has been saved.
     """
     if of_best:
         config = config_for(run)
         found = best_policies.load(run.checkpoint, actor_shape(run, config), run.seeds)
-        return config, jax.tree.map(jnp.asarray, found.actor), found.step
+        return config, jax.device_put(found.actor), found.step
     config, learner, host, _ = load_learner(run)
     return config, compiled(config).actor(learner, host["step"]), np.full(len(run.seeds), host["step"])
 
 
 def actor_shape(run: Run, config: TrainConfig) -> Any:
-    """What is needed to act, with the shapes of its arrays in their place."""
+    """An actor, with shapes instead of arrays."""
     return jax.eval_shape(lambda learner: compiled(config).actor(learner, 0), learner_shape(run, config))
 
 
 def learner_shape(run: Run, config: TrainConfig) -> Learner:
-    """A learner with the shapes of its arrays in their place."""
-    return jax.eval_shape(partial(new_learners, config=config), seed_keys(jnp.asarray(run.seeds), 0))
+    """A learner, with shapes instead of arrays."""
+    return jax.eval_shape(compiled(config).init, seed_keys(jnp.asarray(run.seeds), 0))
 
 
 def new_learner(run: Run, config: TrainConfig) -> Learner:
     """An untrained learner."""
     keys = seed_keys(jnp.asarray(run.seeds), 0)
-    made = ahead(jax.jit(partial(new_learners, config=config)), keys)
+    made = ahead(compiled(config).init, keys)
     give_memory_back()
     return made(keys)
 
@@ -222,7 +222,7 @@ def start(run: Run) -> Session:
 
 
 def restore(run: Run) -> tuple[Session, list[str]]:
-    """A session as of the last checkpoint, and what is to be said about it."""
+    """A session at the last checkpoint, and messages for the user."""
     config, learner, host, arrays = load_learner(run)
     session = begin(run, config, lambda: learner)
     try:
@@ -234,9 +234,9 @@ def restore(run: Run) -> tuple[Session, list[str]]:
 
 
 def begin(run: Run, config: TrainConfig, make_learner: Callable[[], Learner]) -> Session:
-    """Environments and compiled functions around a learner, which is made when they are there.
+    """A session with compiled functions, environments and a learner, which is made after the functions were compiled.
 
-    The compiler needs hundreds of megabytes for a while; what it gives back in time holds the replay.
+    The compiler needs hundreds of megabytes for a while. They are given back before the replay needs them.
     """
     functions = compile_ahead(run, config, compiled(config))
     give_memory_back()
@@ -288,6 +288,6 @@ def ahead(function: Any, *shapes: Any) -> Any:
 
 
 def give_memory_back() -> None:
-    """What the compiler has freed, glibc keeps for the process unless it is asked not to."""
-    with contextlib.suppress(OSError, AttributeError):  # there is another C library, or none that can be asked
+    """Return memory that the compiler has freed to the system. Otherwise, glibc keeps it for the process."""
+    with contextlib.suppress(OSError, AttributeError):  # another C library may not have this function
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,4 +1,4 @@
-"""Random numbers that are a function of seed, purpose and number: there is no state to save."""
+"""Random numbers that are a function of seed, purpose and number, so that there is no state to save."""
 
 from collections.abc import Sequence
 from enum import IntEnum
@@ -12,7 +12,7 @@ from lare.algorithms.table import Noise
 
 
 class Stream(IntEnum):
-    """What random numbers are for. Each use has numbers of its own, whatever the others consume."""
+    """The purposes of random numbers. Each purpose has its own numbers, independent of the others."""
 
     TRAINING_EPISODES = 0
     EXPLORATION = 1
@@ -27,7 +27,7 @@ def generator(seed: int, stream: Stream, number: int) -> np.random.Generator:
 
 
 def episode_seed(seed: int, stream: Stream, episode: int) -> int:
-    """What an environment on the host is reset with."""
+    """The seed with which an environment on the host is reset."""
     return int(generator(seed, stream, episode).integers(2**31))
 
 
@@ -38,7 +38,7 @@ def seed_keys(seeds: Int[Array, " seeds"], number: int | Array) -> Key[Array, " 
 
 
 def stream_keys(seeds: Sequence[int], stream: Stream, number: int) -> Key[Array, " seeds"]:
-    """A key for each seed, by what it is for and a number."""
+    """A key for each seed, by a purpose and a number."""
     streams = seed_keys(jnp.asarray(seeds), -1 - int(stream))
     return jax.vmap(lambda key: jax.random.fold_in(key, number))(streams)
 
@@ -55,6 +55,6 @@ def host_noise(random: np.random.Generator, noise: Noise, shape: tuple[int, ...]
 
 
 def device_noise(key: Array, noise: Noise, shape: tuple[int, ...]) -> Float[Array, "..."]:
-    """The same in compiled code."""
+    """`host_noise` in compiled code."""
     draw = {Noise.NORMAL: jax.random.normal, Noise.GUMBEL: jax.random.gumbel, Noise.UNIFORM: jax.random.uniform}
     return draw[noise](key, shape)

@@ -1,9 +1,9 @@
-"""Listeners that send metrics.jsonl to a tracking service. Each seed becomes a run of its own there.
+"""Listeners that send metrics.jsonl to a tracking service. Each seed becomes a separate run of the service.
 
     lare.train(task, settings, listeners=[Terminal(), WeightsAndBiases(project="cheetah")])
 
-Where the service keeps them, and whether it is reached at all, is up to its own settings (`WANDB_MODE=offline`,
-`MLFLOW_TRACKING_URI`). A run that is resumed goes on in new runs of the service, from the step of its checkpoint.
+The service's own settings decide where it stores them, and whether it is reached at all (`WANDB_MODE=offline`,
+`MLFLOW_TRACKING_URI`). A resumed run continues in new runs of the service, from the step of its checkpoint.
 """
 
 import time
@@ -18,14 +18,14 @@ class WeightsAndBiases:
     """Sends every number to Weights & Biases, with the extra `lare-rl[wandb]`."""
 
     def __init__(self, **arguments: Any):
-        """Arguments are those of `wandb.init`: project, group, config, mode, dir, ... Raises `LareError` where wandb is missing."""
+        """Arguments are those of `wandb.init`: project, group, config, mode, dir, ... Raises `LareError` if wandb is missing."""
         try:
             import wandb
         except ImportError:
             raise needs_extra("Weights & Biases", "wandb") from None
         self.init, self.arguments, self.name = wandb.init, arguments, ""
         self.runs: dict[int, Any] = {}
-        """By seed."""
+        """The service's runs, by seed."""
 
     def started(self, name: str, step: int, steps: int) -> None:
         self.name = name
@@ -55,9 +55,9 @@ class MLflow:
         """Begin or continue an experiment.
 
         Args:
-            experiment: its name.
-            tracking_uri: of the server or the directory; MLflow's own setting unless given.
-            parameters: what is kept with every run.
+            experiment: the name of the experiment.
+            tracking_uri: the server or the directory; the default is MLflow's own setting.
+            parameters: parameters that are saved with every run.
 
         Raises:
             LareError: mlflow is missing, or the tracking server or directory cannot be used.
@@ -78,7 +78,7 @@ class MLflow:
             raise LareError(f"MLflow cannot be used: {error}") from error
         self.name = ""
         self.runs: dict[int, str] = {}
-        """By seed."""
+        """The service's runs, by seed."""
 
     def started(self, name: str, step: int, steps: int) -> None:
         self.name = name
@@ -103,5 +103,5 @@ class MLflow:
 
 
 def numbers(line: Mapping[str, Any]) -> dict[str, float]:
-    """What a line of metrics.jsonl has measured."""
+    """The measured numbers of a line of metrics.jsonl."""
     return {key: value for key, value in line.items() if key not in ("step", "seed") and value is not None}

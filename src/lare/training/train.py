@@ -1,4 +1,4 @@
-"""Training from start to end, and from a checkpoint to the end: Algorithm 1 of the LaRe paper around the fused step."""
+"""Training from the start or from a checkpoint to the end: the outer loop of Algorithm 1 of the LaRe paper."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -12,8 +12,9 @@ from lare.credit.methods import Fit, Method, Reward, find_method
 from lare.errors import LareError, shortened
 from lare.latent.candidates import CANDIDATES
 from lare.latent.design import design
-from lare.latent.function import LatentFunction, check_task, load, per_role
+from lare.latent.function import LatentFunction, check_task, per_role
 from lare.latent.improve import Model
+from lare.latent.saved import load
 from lare.run.decide import decide
 from lare.run.directory import Run, as_run, create, default_directory, isolation, locked
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain
@@ -30,7 +31,7 @@ Given = LatentFunction | str | Path
 
 
 EVENTS = "tensorboard"
-"""Where the run directory has them."""
+"""The directory of TensorBoard events within the run directory."""
 
 
 class Interrupted(LareError):
@@ -54,16 +55,16 @@ def train(
     Args:
         task: a shipped name, the path of a TOML file, or a spec.
         settings: method, algorithm, steps, seeds and all the rest.
-        function: `phi`, or the path of its file, for the methods that need one; one for each team where several learn. Without
-            it, it is designed from the shipped recordings.
-        model: whom `reflect_every` asks.
-        out: the run directory, which must not exist; `runs/...` unless given.
+        function: `phi`, or the path of its file, for the methods that need one; one for each team if several learn. By default,
+            `phi` is designed from the shipped recordings.
+        model: the model that `reflect_every` asks.
+        out: the run directory, which must not exist; the default is `runs/...`.
         tensorboard: also write every number of metrics.jsonl as TensorBoard events, with the extra `lare-rl[tensorboard]`.
-        listeners: who is told of the progress; the terminal, unless given.
+        listeners: objects that are told the progress; the default is the terminal.
 
     Raises:
-        LareError: something that was given cannot be used, or an environment or function failed. What was written until
-            then is whole, and `resume` goes on from there.
+        LareError: an argument cannot be used, or an environment or function failed. The files of the run are then still
+            complete, and `resume` continues from the last checkpoint.
     """
     if tensorboard:
         summary_writer()  # before anything is made
@@ -83,7 +84,7 @@ def train(
 def chosen_functions(
     task: TaskSpec, settings: ResolvedSettings, given: Given | Sequence[Given] | None
 ) -> tuple[LatentFunction, ...]:
-    """One for each role of the task, designed where none was given; none for a method that needs none."""
+    """One function for each role of the task, designed if none is given; empty for a method that needs none."""
     method = find_method(settings.method)
     if not method.latent:
         if given is not None:
@@ -96,7 +97,7 @@ def chosen_functions(
         check_given(settings)
         if not isinstance(given, Given | Sequence):
             raise LareError(
-                "a latent function is the path of its file, or what lare.design and lare.load_function give; it is "
+                "a latent function must be the path of its file, or come from lare.design or lare.load_function, and is "
                 f"{shortened(given)}: write its source to a file, which is verified"
             )
         each = per_role([given] if isinstance(given, Given) else given, task)
@@ -109,7 +110,7 @@ def chosen_functions(
 
 
 def check_model(settings: ResolvedSettings, model: Model | None) -> None:
-    """Raise `LareError` where a model is needed and not given, or given and not needed."""
+    """Raise `LareError` if a model is needed and not given, or given and not needed."""
     if settings.reflect_every is not None and model is None:
         raise LareError("reflect_every asks a language model: say which one with --model NAME (model=... in Python)")
     if settings.reflect_every is None and model is not None:
@@ -117,13 +118,13 @@ def check_model(settings: ResolvedSettings, model: Model | None) -> None:
 
 
 def check_given(settings: ResolvedSettings) -> None:
-    """Raise `LareError` where a recorded function is chosen although another one is given."""
+    """Raise `LareError` if a recorded function is chosen although another one is given."""
     if (settings.draw, settings.candidates) != (0, CANDIDATES):
         raise LareError("draw and candidates choose a recorded function, and a function is given: leave either out")
 
 
 def check_size(method: Method, factors: int) -> None:
-    """Raise `LareError` where a method can do nothing with so many factors."""
+    """Raise `LareError` if a method cannot use so many factors."""
     if method.reward is Reward.DESIGNED and factors != 1:
         raise LareError(
             f"{method.name} needs a function with one array, the reward, and this one has {factors}: "
@@ -141,20 +142,20 @@ def resume(
     tensorboard: bool = False,
     listeners: Sequence[Listener] | None = None,
 ) -> Run:
-    """Go on with a run that was stopped or killed, from its last checkpoint to its end; or beyond it.
+    """Continue a run that was stopped or killed, from its last checkpoint to its end; or extend it.
 
-    On the CPU the metrics are then, bit for bit, those of a run that never stopped (but for the times).
+    On the CPU, the metrics are the same, bit for bit, as those of a run that was never stopped (except the times).
 
     Args:
-        directory: of the run, or the run.
-        steps: environment steps of each seed that the run is to have made at its end, where that is more than was asked for at
-            first. What falls over the whole run (`ppo.anneal`) falls over the longer one from now on.
-        model: whom `reflect_every` asks.
-        tensorboard: also write TensorBoard events. They go on by themselves where the run has some.
-        listeners: who is told of the progress; the terminal, unless given.
+        directory: the run, or its directory.
+        steps: a new number of environment steps of each seed, to extend the run. Schedules over the whole run (`ppo.anneal`)
+            then go by the new number.
+        model: the model that `reflect_every` asks.
+        tensorboard: also write TensorBoard events. A run that has some always continues them.
+        listeners: objects that are told the progress; the default is the terminal.
 
     Raises:
-        LareError: it is not a run, or its checkpoint is not there any more, or `steps` are fewer; and as `train`.
+        LareError: it is not a run, its checkpoint does not exist any more, or `steps` is smaller than before; and as in `train`.
     """
     run, told = as_run(directory), told_by(listeners)
     tensorboard = tensorboard or (run.directory / EVENTS).is_dir()
@@ -164,8 +165,8 @@ def resume(
     with locked(run), enough_memory(run):
         run = run if steps is None else run.extended(steps)
         if not run.has_checkpoint():
-            if run.metrics():  # what has been measured is never taken back
-                raise LareError(f"{run.directory} has no checkpoint any more: there is nothing to go on from")
+            if run.metrics():  # metrics are never removed
+                raise LareError(f"{run.directory} has no checkpoint any more: it cannot be resumed")
             return begin(run, model, tensorboard, told)
         prepare(run, told)
         restored, messages = sessions.restore(run)
@@ -174,37 +175,37 @@ def resume(
 
 
 def told_by(listeners: Sequence[Listener] | None) -> list[Listener]:
-    """The listeners that were given, or the terminal. Raises `LareError` where one cannot listen."""
+    """The given listeners, or the terminal. Raises `LareError` if an object is not a listener."""
     told: list[Listener] = [Terminal()] if listeners is None else list(listeners)
     for one in told:
         if not isinstance(one, Listener):
             raise LareError(
-                f"a listener has the methods started, stepped, evaluated, said and stopped (lare.training.progress.Listener): "
-                f"{shortened(one)} has not"
+                "a listener must have the methods started, stepped, evaluated, said and stopped "
+                f"(lare.training.progress.Listener): {shortened(one)} does not"
             )
     return told
 
 
 def checked_settings(given: Settings | None) -> Settings:
-    """The settings, or the usual ones. Raises `LareError` where they are something else."""
+    """The given settings, or the default ones. Raises `LareError` if they are something else."""
     if given is None or isinstance(given, Settings):
         return given or Settings()
     raise LareError(
-        f"settings are a lare.Settings, as lare.Settings(method='rrdu', steps=100_000); they are {shortened(given)}"
+        f"settings must be a lare.Settings, such as lare.Settings(method='rrdu', steps=100_000), and are {shortened(given)}"
     )
 
 
 def prepare(run: Run, told: Sequence[Listener]) -> None:
-    """What comes before the first compilation, and a word on how long it takes."""
+    """Turn on the compilation cache, and tell the listeners how long compiling takes."""
     for listener in told:
         listener.said(
-            f"preparing {run.directory}: compiling takes about half a minute, or some ten seconds where it was done before"
+            f"preparing {run.directory}: compiling takes about half a minute, or about ten seconds if it was done before"
         )
     compilation.keep()
 
 
 def begin(run: Run, model: Model | None, tensorboard: bool, told: list[Listener], *messages: str) -> Run:
-    """From the first step on. The untrained learner is saved, so that there is a checkpoint whatever happens."""
+    """Train from the first step on. The untrained learner is saved, so that there is always a checkpoint."""
     prepare(run, told)
     started = sessions.start(run)
     started.save()
@@ -254,7 +255,7 @@ def finish(
                     check_losses(session)
                     session.save()
                     raise Interrupted(
-                        f"stopped at step {session.step} and saved; go on with: lare train --resume {run.directory}"
+                        f"stopped at step {session.step} and saved; to continue: lare train --resume {run.directory}"
                     )
     finally:
         for listener in told:
@@ -264,19 +265,19 @@ def finish(
 
 
 def due(step: int, every: int | None, last: int) -> bool:
-    """Whether it is the turn of what comes again and again, but not at the end."""
+    """Whether something that is done every so many steps is due; never at the last step."""
     return every is not None and step % every == 0 and step < last
 
 
 def explanation(session: Session) -> list[str]:
-    """How well returns can be told, in words; nothing before the first updates and as long as there are few episodes."""
+    """How well returns can be explained, in sentences; empty before the first updates and while there are too few episodes."""
     if session.step < session.settings.warmup:
         return []
     return described(session.run, session.learner, session.config)
 
 
 def introduce(session: Session, listener: Listener, messages: Sequence[str]) -> None:
-    """What is to be said of a session before its next step."""
+    """Tell a listener about a session before its next step."""
     run, settings = session.run, session.settings
     for message in messages:
         listener.said(message)
@@ -293,7 +294,7 @@ def introduce(session: Session, listener: Listener, messages: Sequence[str]) -> 
 
 
 def check_losses(session: Session) -> None:
-    """Raise `Diverged` where a loss is not finite: what is saved then is of no use."""
+    """Raise `Diverged` if a loss is not finite, so that the useless state is not saved."""
     updates = np.asarray(session.latest.get("algorithm/updates", np.ones(len(session.run.seeds))))
     losses = (name for name in session.latest if name.startswith(("critic/loss", "credit/loss")))
     for name in losses:

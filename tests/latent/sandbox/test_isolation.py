@@ -47,7 +47,7 @@ def test_a_program_does_not_run_where_a_layer_is_refused(refusing, monkeypatch, 
     with pytest.raises(NotIsolated) as error:
         JailedProgram(PHI, 2, 1)
     assert str(error.value) == (
-        f"this system refuses {layer} to the process of the latent function; to run it all the same, knowing that, "
+        f"this system refuses {layer} to the process of the latent function; to accept this risk and run it anyway, "
         f"set LARE_WITHOUT={named} (docs/security.md)"
     )
     assert asked == [None]  # the program was not even sent
@@ -65,8 +65,8 @@ def test_without_the_gate_nothing_makes_up_for_these(refusing, monkeypatch, laye
     with pytest.raises(NotIsolated) as error:
         JailedProgram(PHI, 2, 1, gated=False)
     assert str(error.value) == (
-        f"this system refuses {layer}, and without it no program runs that the gate has not passed: leave "
-        "--no-pre-verification out"
+        f"this system refuses {layer}, which is required for a program that has not passed the gate: remove "
+        "--no-pre-verification"
     )
     assert asked == [None]
 
@@ -88,8 +88,8 @@ def test_every_layer_is_refused_here_in_turn():
 @pytest.mark.parametrize(
     ("accepted", "message"),
     [
-        ("memory", "this system refuses memory and seccomp to the process of the latent function; to run it all the same, "
-         "knowing that, set LARE_WITHOUT=memory,seccomp (docs/security.md)"),
+        ("memory", "this system refuses memory and seccomp to the process of the latent function; to accept this risk and "
+         "run it anyway, set LARE_WITHOUT=memory,seccomp (docs/security.md)"),
         ("everything", "LARE_WITHOUT names 'everything': the layers are no new rights, landlock, memory, file size, "
          "core dumps, open files, processes, seccomp"),
     ],

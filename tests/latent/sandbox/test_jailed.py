@@ -418,7 +418,7 @@ def test_threads_take_turns(worker):
 
 def test_where_there_is_no_worker_it_is_said_in_a_line(monkeypatch):
     monkeypatch.setattr(sys, "platform", "win32")
-    with pytest.raises(NoWorker, match=r"^a latent function needs a process of its own, [^\n]*: use WSL$"):
+    with pytest.raises(NoWorker, match=r"^a latent function runs in a jailed process, [^\n]*: use WSL$"):
         JailedProgram(PHI, 2, 1)
 
 

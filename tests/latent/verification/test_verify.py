@@ -16,6 +16,7 @@ from lare.latent.verification.verify import random_steps, verify
 from lare.llm.recording import SHIPPED, read_recording
 from lare.llm.reply import parse
 from lare.tasks.spec import read_task
+from tiers import long
 from toys import PHI, phi, toy_spec
 
 RECORDINGS = {
@@ -23,6 +24,8 @@ RECORDINGS = {
     for kind in sorted(SHIPPED.iterdir(), key=lambda one: one.name)
     for entry in sorted(kind.iterdir(), key=lambda one: one.name)
 }
+RECORDED = [name if name.startswith("reward/") and "draw0" in name else long(name) for name in RECORDINGS]
+"""`test_design.py` verifies the first draw of every task's factors."""
 ORDER = ["gate", *CHECKS]
 
 
@@ -104,7 +107,7 @@ def test_advice_is_no_error(chase):
 def test_what_is_not_proved_is_said(chase):
     verdict = verify(phi("return [np.outer(action[:, 0], np.ones(1))]"), chase)
     assert verdict.passed
-    assert verdict.advice == ("that rows do not touch was tried, not proved: np.outer in line 2",)
+    assert verdict.advice == ("the independence of rows was tested, not proved: np.outer in line 2",)
 
 
 def test_a_reward_is_exactly_one(chase):
@@ -134,7 +137,7 @@ def test_the_methods_of_arrays_can_be_used(chase):
     assert verdict.size == len(METHODS_OF_ARRAYS)
 
 
-@pytest.mark.parametrize("name", RECORDINGS)
+@pytest.mark.parametrize("name", RECORDED)
 def test_every_recorded_combination_passes(name):
     recording = RECORDINGS[name]
     source = parse(recording.exchanges[-1].replies[0]).functions

@@ -1,1 +1,1 @@
-"""The closed language: what a program may say, and what becomes of it."""
+"""The closed language of programs: what is allowed, and how a program is compiled."""

@@ -1,18 +1,18 @@
-"""The language that generated code may be written in: a small, closed part of Python and NumPy.
+"""The language of generated code: a small, closed subset of Python and NumPy.
 
-Everything here is a list of what there is; whatever is not on a list is refused, so that what a new version of Python or
-NumPy adds is refused until somebody has thought about it. The functions are pure and total, and the shape of what they
-return never depends on values. `gate` checks a program against these lists; `program` binds the names to their functions.
+These lists contain everything that is allowed. Anything else is refused, so that additions of new versions of Python and NumPy
+are refused until they have been reviewed. The functions are pure and total, and the shapes of their results never depend on
+values. `gate` checks a program against these lists; `program` binds the names to their functions.
 """
 
 import re
 from typing import NamedTuple
 
 NAME = "evaluation_func"
-"""What a reply must call its function."""
+"""The name that a reply must give its function."""
 
 MODULES = {"np": "numpy", "numpy": "numpy", "math": "math"}
-"""Names that stand only in front of a dot, and what they mean."""
+"""Names that are allowed only before a dot, and their modules."""
 
 
 class Signature(NamedTuple):
@@ -20,10 +20,10 @@ class Signature(NamedTuple):
 
     least: int
     most: int
-    """Positional arguments. The ones that would be left out are `out`, for which there is a keyword, or strings."""
+    """The most positional arguments. `out` and strings, which would come after them, are only allowed as keywords."""
     keywords: frozenset[str] = frozenset()
     dtype_at: int | None = None
-    """Where a dtype may stand by position."""
+    """The position at which a dtype is allowed."""
 
 
 def signatures(names: str, least: int, most: int, keywords: str = "", dtype_at: int | None = None) -> dict:
@@ -164,10 +164,10 @@ METHODS: dict[str, Signature] = {
 }
 
 CHANGING = frozenset("append extend insert pop".split())
-"""Methods that change what they are called on."""
+"""Methods that change the object that they are called on."""
 
 ATTRIBUTES = frozenset("T dtype eps ndim resolution shape size tiny".split())
-"""What may be read without a call; of `np.finfo(...)` also max and min."""
+"""Attributes that may be read; of `np.finfo(...)` also max and min."""
 
 BUILTINS: dict[str, Signature] = {
     **signatures("abs all any bool float int len list reversed sorted tuple", 1, 1),
@@ -194,7 +194,7 @@ SHAPING = {
     **dict.fromkeys("expand_dims flip squeeze moveaxis swapaxes roll linalg.norm".split(), (1, 2)),
     **dict.fromkeys("percentile quantile take take_along_axis tensordot".split(), (2,)),
 }
-"""Functions of NumPy some of whose arguments say what shape the result has, or along which axis it is reckoned, and which."""
+"""For each function of NumPy, the positions of the arguments that determine the shape of the result or the axis."""
 
 SHAPING_METHODS = {
     **dict.fromkeys("all any argmax argmin cumprod cumsum max mean min prod squeeze std sum var".split(), (0,)),
@@ -203,15 +203,15 @@ SHAPING_METHODS = {
     "take": (1,),
 }
 SIZES = frozenset("shape num N M k repeats indices_or_sections pad_width axis axes keepdims n ndmin ord shift".split())
-"""Keywords that do."""
+"""Keywords that determine the shape of a result or the axis."""
 
 FUTURE = frozenset("absolute_import annotations division print_function unicode_literals".split())
-"""What comes of `__future__` and has come: importing it changes nothing."""
+"""Features of `__future__` that may be imported: they change nothing in a program."""
 
 TYPING = frozenset("Any Dict Iterable List NamedTuple Optional Sequence Tuple Union".split())
 
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_ -]{0,63}")
-"""A string that may stand in a program: a plain word, no format."""
+"""The strings that a program may contain: plain words, no format strings."""
 
 AXES = r"[a-zA-Z]{0,8}(\.\.\.[a-zA-Z]{0,8})?"
 EINSUM = re.compile(rf"{AXES}(,{AXES}){{0,7}}(->{AXES})?")
@@ -220,7 +220,7 @@ STRINGS = {
     "mode": frozenset("constant edge reflect symmetric wrap".split()),
     "method": frozenset("linear lower higher midpoint nearest".split()),
 }
-"""Keywords whose value is a string, and which ones."""
+"""Keywords whose value is a string, and the allowed strings."""
 
 FILES = "it reads or writes files"
 CHANCE = "it depends on chance"
@@ -236,7 +236,7 @@ REASONS = {
     **dict.fromkeys("unique nonzero argwhere flatnonzero extract compress trim_zeros union1d".split(), VALUES),
     **dict.fromkeys("vectorize frompyfunc apply_along_axis apply_over_axes fromfunction piecewise".split(), CALLBACK),
 }  # fmt: skip
-"""Why a NumPy function that exists is not allowed, where there is more to say."""
+"""The reasons why some existing NumPy functions are not allowed."""
 
 INSTEAD = {
     "numpy.clamp": "np.clip",
@@ -270,4 +270,4 @@ INSTEAD = {
     "map": "a list comprehension",
     "filter": "np.where with three arguments",
 }
-"""What to write for what is not there."""
+"""What to write instead of a function that is not available."""

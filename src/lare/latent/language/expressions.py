@@ -1,4 +1,4 @@
-"""The expressions of the language: a walk that notes every name, number, string, call and operator that is not in it."""
+"""Checks the expressions of a program, and records names, numbers, strings, calls and operators that are not in the language."""
 
 import ast
 import difflib
@@ -27,13 +27,13 @@ from lare.latent.language.allowed import (
 from lare.latent.language.syntax import Function, dotted, exists, is_key, is_singleton, is_string, shown
 
 LARGEST = 2**63
-"""Of the integers that may stand in a program."""
+"""The largest integer that a program may contain."""
 
 HUGE = "an integer is larger than 2**63"
 
 
 MOST_HINTS, LONGEST_HINTED = 10, 40
-"""Looking for a name that was meant takes time: only for so many problems, and names of so many letters."""
+"""The search for the intended name takes time. It is limited to this many problems, and to names of this many letters."""
 
 
 class Problem(NamedTuple):
@@ -59,18 +59,18 @@ class Scope:
 
     names: set[str]
     inputs: frozenset[str] = frozenset()
-    """Names that still mean the function's inputs, which nobody may write into."""
+    """Names that still refer to the function's inputs, which must not be written to."""
 
 
 @dataclass
 class Expressions(ast.NodeVisitor):
-    """Walks over expressions and notes what is not in the language. One method for each node that is."""
+    """Visits expressions and records what is not in the language. There is one method for each allowed node."""
 
     defined: list[tuple[str, Function]]
     problems: list[Problem] = field(default_factory=list)
     scopes: list[Scope] = field(default_factory=list)
     approved: set[ast.AST] = field(default_factory=set)
-    """Strings and lambdas that stand where they may."""
+    """Strings and lambdas at places where they are allowed."""
 
     @property
     def functions(self) -> frozenset[str]:
@@ -161,7 +161,7 @@ class Expressions(ast.NodeVisitor):
             self.visit(node.value)
 
     def unknown(self, node: ast.AST, name: str) -> None:
-        """A dotted name that is not on the list: say whether there is such a thing, and why it is not available."""
+        """Refuse a dotted name that is not on the list. The message says whether it exists, and why it is not available."""
         module, first, *_ = name.split(".")
         code, reason = {"numpy": ("E-NUMPY", REASONS.get(first)), "math": ("E-MATH", None)}[module]
         if reason is not None:
@@ -203,14 +203,14 @@ class Expressions(ast.NodeVisitor):
             self.visit(node.func.value)
         else:
             self.refuse("E-CALL", node, "only a function that has a name can be called")
-            self.approved.add(node.func)  # a lambda: that it has no name has been said
+            self.approved.add(node.func)  # a lambda has just been refused, because it has no name
             self.visit(node.func)
         if signature is not None and name is not None:
             self.arguments(node, name, signature)
         self.visit_all(inner)
 
     def arguments(self, node: ast.Call, name: str, signature: Signature) -> None:
-        """Whether a call of a known function is one that the language has."""
+        """Check the arguments of a call of a known function."""
         count, given = len(node.args), {one.arg for one in node.keywords}
         by_name = len(given & signature.keywords)
         if count > signature.most or count + by_name < signature.least:
@@ -243,14 +243,14 @@ class Expressions(ast.NodeVisitor):
         self.no_strings(node, name)
 
     def written_out(self, node: ast.AST, keyword: str) -> None:
-        """A keyword that takes a string must show which one."""
+        """The value of a keyword that takes a string must be a literal."""
         self.approved.add(node)
         if not is_string(node, STRINGS[keyword]):
             known = ", ".join(sorted(STRINGS[keyword]))
             self.refuse("E-STRING", node, f"{keyword} must be written out: one of {known}")
 
     def dtype(self, node: ast.AST) -> None:
-        """A dtype must stand there as it is, so that no other can come in."""
+        """A dtype must be one of the allowed literals, so that no other dtype is possible."""
         if is_string(node, DTYPE_NAMES) or (isinstance(node, ast.Name) and node.id in {"float", "int", "bool"}):
             self.approved.add(node)
         elif (dotted(node) or "").removeprefix("numpy.") not in DTYPES and not (
@@ -259,7 +259,7 @@ class Expressions(ast.NodeVisitor):
             self.refuse("E-DTYPE", node, f"a dtype must be one of {', '.join('np.' + name for name in sorted(DTYPES))}")
 
     def changing(self, target: ast.AST, node: ast.AST) -> None:
-        """Something is written into; it must belong to this function."""
+        """Check that `target`, which the program changes, belongs to this function."""
         while isinstance(target, ast.Subscript | ast.Attribute | ast.Call):
             target = target.func if isinstance(target, ast.Call) else target.value
         if isinstance(target, ast.Name):
@@ -269,7 +269,7 @@ class Expressions(ast.NodeVisitor):
                 self.refuse("E-STATE", node, f"{target.id} belongs to another place, and cannot be changed here")
 
     def no_strings(self, node: ast.Call, name: str) -> None:
-        """Strings that stand in a call of a function that takes none; where it takes some, they have been approved."""
+        """Refuse strings in a call of a function that takes none. Strings that a function may take have been approved before."""
         if name == "get":
             return
         for one in [*node.args, *(keyword.value for keyword in node.keywords)]:
@@ -281,7 +281,7 @@ class Expressions(ast.NodeVisitor):
         self.visit_all([node.value, node.target])
 
     def visit_Starred(self, node: ast.Starred) -> None:
-        """Of an assignment. What stands in a list has been rewritten, and what stands in a call is refused there."""
+        """A star in an assignment. Stars in lists have been rewritten, and stars in calls are refused by `visit_Call`."""
         if node not in self.approved:
             self.refuse("E-CONSTRUCT", node, "* is available in lists, and once on the left of an assignment")
         self.visit(node.value)

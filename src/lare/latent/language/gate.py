@@ -1,8 +1,8 @@
-"""The static gate: what a program may consist of, read off its syntax tree. Nothing is executed.
+"""The static gate checks the syntax tree of a program. Nothing is executed.
 
-A closed language: a node, name, attribute, keyword or string that `allowed.py` does not list is refused. This is what makes
-errors precise and most attacks unspeakable; it is not the boundary. The boundary is the sandbox, in which the gate itself,
-and everything after it, runs.
+The language is closed: a node, name, attribute, keyword or string that `allowed.py` does not list is refused. This gives precise
+errors, and most attacks cannot be expressed. But the gate is not the security boundary. The boundary is the sandbox, in which the
+gate and everything after it runs.
 """
 
 import ast
@@ -50,18 +50,18 @@ CONSTRUCTS = {
     ast.Set: "a set",
     ast.SetComp: "a set",
 }
-"""How the commonest of what is not available is called."""
+"""The names of the most common constructs that are not available."""
 
 KEPT = (
     *(ast.While, ast.Try, ast.TryStar, ast.AsyncFor, ast.AsyncWith, ast.Set, ast.SetComp),
     *(ast.Yield, ast.YieldFrom, ast.Await),
 )
-"""The code inside of these is checked too: a repair often removes the `while` or the `try` alone."""
+"""The code inside these constructs is checked too, because a repair often removes only the `while` or the `try`."""
 
 
 @dataclass
 class Gate(Expressions, ast.NodeVisitor):
-    """Walks over a program and notes what is not in the language. One method for each node that is."""
+    """Visits a program and records what is not in the language. There is one method for each allowed node."""
 
     def generic_visit(self, node: ast.AST) -> None:
         name = CONSTRUCTS.get(type(node), type(node).__name__)
@@ -150,7 +150,7 @@ class Gate(Expressions, ast.NodeVisitor):
         self.scopes.append(Scope(bound | parameters(arguments), inputs))
 
     def annotation(self, node: ast.expr | None) -> None:
-        """Annotations are never evaluated; they only must not look as if they did something."""
+        """Annotations are never evaluated. They must still be plain types, so that no other code can appear in them."""
         allowed = (
             ast.Name,
             ast.Attribute,
@@ -227,7 +227,7 @@ class Gate(Expressions, ast.NodeVisitor):
 
 
 def recursion(tree: ast.Module, functions: frozenset[str]) -> Iterator[Problem]:
-    """A function that can come back to itself."""
+    """The functions that can call themselves."""
     calls = {
         name: {
             inner.func.id
@@ -247,27 +247,28 @@ def recursion(tree: ast.Module, functions: frozenset[str]) -> Iterator[Problem]:
 
 
 LONGEST = 20_000
-"""Bytes of a program."""
+"""The largest size of a program, in bytes."""
 
 DEEPEST_BRACKETS = 40
 DEEPEST = 100
-"""Of the syntax tree."""
+"""The most levels of the syntax tree."""
 
 CHAIN = re.compile(r"(?:[-+~]\s*){12}|(?:\bnot\s+){12}|(?:\blambda\s*:\s*){12}")
-"""Operators that nest without brackets, and would go deep into the parser's own stack."""
+"""Chains of operators that nest without brackets, and could exhaust the parser's stack."""
 
 BREAKS = str.maketrans("\r\f", "\n\n")
-"""What Python takes for the end of a line, or for a space."""
+"""Characters that Python treats as the end of a line, or as a space."""
 
 LETTERS = frozenset({tokenize.COMMENT, tokenize.STRING})
-"""Parts of a program in which letters of every script are welcome. Elsewhere one looks like another: the Cyrillic a is no a."""
+"""Tokens that may contain letters of every script. Elsewhere, letters that look alike could be confused: Cyrillic a and Latin a."""
 
 UNREAD = re.compile(r'"""[^\\]*?"""|#[^\n]*', re.DOTALL)
-"""Comments and docstrings, where rulers and smileys are welcome. Who hides code from this meets the parser's own limits."""
+"""Comments and docstrings, where rows of brackets and operators are harmless. For code that only looks like one of these, the
+parser's own limits still apply."""
 
 
 def inspect(source: str) -> list[Problem]:
-    """Everything that is wrong with a program, in the order of its lines; nothing, where it may go on to be run."""
+    """All problems of a program, in the order of its lines. There are none if the program may run."""
     too_much = list(guard(source))
     if too_much:
         return too_much
@@ -280,11 +281,11 @@ def inspect(source: str) -> list[Problem]:
         return [Problem("E-SYNTAX", 1, f"this cannot be parsed: {str(error) or type(error).__name__}")]
     try:
         foreign = list(other_letters(source))
-    except (tokenize.TokenError, SyntaxError):  # the parser's own eyes are others
+    except (tokenize.TokenError, SyntaxError):  # the tokenizer differs from the parser
         foreign = [Problem("E-SYNTAX", 1, "this cannot be taken apart: write it in ASCII")]
     if foreign:
         return foreign
-    # What is written in other words may go deeper in those of the language.
+    # The tree may become deeper when it is simplified.
     if depth(tree) > DEEPEST or depth(tree := simplified(tree)) > DEEPEST:
         return [Problem("E-SIZE", 1, f"the expressions are nested more than {DEEPEST} deep")]
     gate = Gate(definitions(tree))
@@ -304,7 +305,7 @@ def other_letters(source: str) -> Iterator[Problem]:
 
 
 def guard(source: str) -> Iterator[Problem]:
-    """What must be known before the parser sees a text."""
+    """The problems that must be found before a text is parsed."""
     size = len(source.encode(errors="replace"))
     if any("\ud800" <= letter <= "\udfff" for letter in source):
         yield Problem("E-SYNTAX", 1, "there are characters that are no text (surrogates)")
@@ -312,7 +313,7 @@ def guard(source: str) -> Iterator[Problem]:
     if size > LONGEST:
         yield Problem("E-SIZE", 1, f"the program has {size} bytes; at most {LONGEST} are accepted")
         return
-    hidden = unseen(source.translate(BREAKS))  # who reads a function must see what there is
+    hidden = unseen(source.translate(BREAKS))  # a reader of the function must see every character
     if hidden is not None:
         line, letter = source.count("\n", 0, hidden) + 1, source[hidden]
         yield Problem("E-SYNTAX", line, f"there is {letter!a}, a character that nobody sees: only text, please")
@@ -331,7 +332,7 @@ def guard(source: str) -> Iterator[Problem]:
 
 
 def depth(tree: ast.AST) -> int:
-    """Levels of a syntax tree."""
+    """The number of levels of a syntax tree."""
     level, found = [tree], 0
     while level:
         found += 1

@@ -1,8 +1,8 @@
-"""Functions that a program gets in place of Python's and NumPy's own: no single call can make an array of any size, and nothing
-becomes something else than numbers.
+"""Functions that replace Python's and NumPy's own functions in a program. Their results are bounded, and their arrays hold numbers
+only.
 
-What can grow that way are `*` and `**` on integers, and whatever joins or repeats sequences. Arrays of objects and strings would
-lead around every other guard.
+Without them, a single call could make huge values: `*` and `**` on integers, and everything that joins or repeats sequences.
+Arrays of objects or strings would bypass all other guards.
 """
 
 import builtins
@@ -16,20 +16,20 @@ import numpy as np
 from lare.latent.language.allowed import SHAPING, SIZES
 
 FUEL = 20_000
-"""Turns of loops, and calls, of one call of a program; and entries of what is gone through at once."""
+"""The most loop iterations and function calls in one call of a program, and the most entries that one function iterates over."""
 
 LONGEST_SEQUENCE = 10_000
 LARGEST_BITS, LARGEST_ENTRY = 4096, 64
-"""Bits of an integer, and of one in an array."""
+"""The most bits of an integer, and of an integer in an array."""
 
 LARGEST_SIZE = 1 << 25
-"""Numbers in an array: eight thousand for each row of the largest batch."""
+"""The most numbers in an array: eight thousand for each row of the largest batch."""
 
 MOST_TURNS = 1000
-"""Of what NumPy does one after the other: differences, pieces."""
+"""The most repetitions of NumPy's sequential operations: the order of `np.diff`, the pieces of `np.split`."""
 
 MOST_ENTRIES, DEEPEST = 50_000, 32
-"""Of lists within lists."""
+"""The most entries and the most levels of nested lists."""
 
 NESTING = (list, tuple, dict)
 SEQUENCES = (list, tuple, str)
@@ -37,11 +37,11 @@ INTEGERS = (int, np.integer)
 
 
 class TooLarge(Exception):
-    """A number or a sequence would grow beyond all bounds."""
+    """A number or a sequence would exceed its bound."""
 
 
 def numbers(value: Any) -> Any:
-    """The value, where it is not an array of anything else."""
+    """Returns the value, unless it is an array that holds something other than numbers, or is too large."""
     if isinstance(value, np.ndarray | np.generic) and value.dtype.kind not in "fiubc":
         raise TypeError(f"arrays hold numbers only, not {value.dtype}")
     if isinstance(value, np.ndarray) and value.size > LARGEST_SIZE:
@@ -50,9 +50,10 @@ def numbers(value: Any) -> Any:
 
 
 def few(value: Any) -> Any:
-    """The value, where lists within it are few and not deep: one that holds another twice, and so on, has entries without end.
+    """Returns the value, unless its nested lists have too many entries or levels.
 
-    Whoever compares, hashes or makes arrays goes through all of them, and takes to its own stack for what is deep.
+    If each list holds another list twice, the number of entries grows exponentially. Functions that compare, hash or convert to
+    arrays visit all entries, and recurse once per level.
     """
     level, left = [value], MOST_ENTRIES
     for _ in range(DEEPEST):
@@ -71,7 +72,7 @@ def entries(value: Any) -> Iterable[Any]:
 
 
 def check_entries(values: Iterable[Any]) -> None:
-    """NumPy makes arrays of objects of what no array of numbers holds, and reckons with it without end."""
+    """Refuses integers that no array of numbers can hold. NumPy would make arrays of objects, whose arithmetic is unbounded."""
     for value in values:
         if isinstance(value, list | tuple):
             check_entries(value)
@@ -80,7 +81,7 @@ def check_entries(values: Iterable[Any]) -> None:
 
 
 def size(value: Any, most: int = LARGEST_SIZE) -> Any:
-    """What says how large an array is to be, or how often something is done: NumPy reckons with it before it looks."""
+    """Returns a size or a number of repetitions, unless it is too large. NumPy would compute with it before checking it."""
     if isinstance(value, list | tuple):
         for one in value:
             size(one, most)
@@ -93,7 +94,7 @@ def size(value: Any, most: int = LARGEST_SIZE) -> Any:
 
 
 def only_numbers(function: Callable[..., Any], name: str) -> Callable[..., Any]:
-    """A NumPy function of numbers, whose results are numbers."""
+    """A NumPy function whose arguments are bounded, and whose results are numbers."""
     places = SHAPING.get(name.removeprefix("numpy."), ())
     most = MOST_TURNS if name in ("numpy.diff", "numpy.split") else LARGEST_SIZE
 
@@ -111,7 +112,7 @@ def only_numbers(function: Callable[..., Any], name: str) -> Callable[..., Any]:
 
 
 def array_only(value: Any) -> np.ndarray:
-    """What `out=` may be: without an array there, `where=` leaves memory that nobody has written."""
+    """Returns the argument of `out=` if it is an array. Without an array, `where=` would return uninitialised memory."""
     if not isinstance(value, np.ndarray):
         raise TypeError(f"out= must be an array, not a {type(value).__name__}")
     return value
@@ -122,21 +123,21 @@ def dtype_of(value: Any) -> Any:
 
 
 def rounded(value: Any, digits: int = 0) -> Any:
-    """Python's own round would compute 10 to the power of a million."""
+    """Python's `round` with a bounded number of digits. It could otherwise compute 10 to the power of a million."""
     if not isinstance(digits, int) or abs(digits) > 300:
         raise TooLarge("round to so many digits")
     return builtins.round(value, digits) if digits else builtins.round(value)
 
 
 def total(values: Any, start: Any = 0) -> Any:
-    """Python's own sum joins lists, again and again."""
+    """Python's `sum`, but not of sequences, which it would join repeatedly."""
     if isinstance(start, SEQUENCES):
         raise TooLarge("a sum of sequences")
     return numbers(of_few(builtins.sum)(values, start))
 
 
 def extend(target: Any, values: Any) -> None:
-    """A list feeds on itself if it is extended by its own iterator."""
+    """`list.extend`, but only by a list or tuple. A list that is extended by its own iterator would grow forever."""
     if not isinstance(target, list) or not isinstance(values, list | tuple):
         raise TypeError("extend takes a list")
     check_joined(target, values)
@@ -144,13 +145,13 @@ def extend(target: Any, values: Any) -> None:
 
 
 def at_once(function: Callable[..., Any]) -> Callable[..., list[Any]]:
-    """A function that gives an iterator, as a list: iterators of iterators go deep without a loop."""
+    """A function that returns a list instead of an iterator: iterators of iterators could be deep without any loop."""
     guarded_function = of_few(function)
     return lambda *arguments, **keywords: list(guarded_function(*arguments, **keywords))
 
 
 def of_few(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of Python's that goes through its arguments, one entry after the other."""
+    """A Python function that iterates over its arguments, with a bound on their entries."""
 
     def call(*arguments: Any, **keywords: Any) -> Any:
         for argument in arguments:
@@ -172,7 +173,7 @@ def check_joined(left: Any, right: Any) -> None:
     if isinstance(left, SEQUENCES):
         if not isinstance(right, SEQUENCES):
             if isinstance(right, np.ndarray | np.generic):
-                return  # NumPy takes the list for an array
+                return  # NumPy converts the list to an array
             raise TypeError(f"a {type(left).__name__} and a {type(right).__name__} cannot be joined")
         if len(left) + len(right) > LONGEST_SEQUENCE:
             raise TooLarge(f"a sequence of {len(left) + len(right)} entries")
@@ -208,11 +209,11 @@ OPERATORS: dict[str, tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]
     "or": (operator.or_, operator.ior),
     "xor": (operator.xor, operator.ixor),
 }
-"""Each operator, and what it does in place."""
+"""Each operator, and its in-place version."""
 
 
 def guarded(name: str, function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """An operator that lets nothing grow without bound."""
+    """An operator whose results are bounded."""
     check = CHECKED.get(name, lambda left, right: None)
 
     def call(left: Any, right: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What a source says of its factors: their names, and what the comments above them say they mean."""
+"""Reads the names of factors from a source, and their meanings from the comments above them."""
 
 import ast
 import itertools
@@ -11,25 +11,25 @@ from lare.latent.language.allowed import NAME
 NUMBERING = re.compile(r"^(factor\s*)?\d+\s*[.:)]\s*", re.IGNORECASE)
 
 ONE_AT_A_TIME = threading.Lock()
-"""Candidates are examined in threads, and before Python 3.11.8 and 3.12.2 two parsers may lose count of how deep they are: a
-SystemError, where the garbage collector lets another thread go on (python/cpython#106905)."""
+"""Candidates are examined in threads. Before Python 3.11.8 and 3.12.2, parsers in two threads may miscount their recursion depth
+and raise a SystemError, if the garbage collector switches threads (python/cpython#106905)."""
 
 
 def names_of(source: str, size: int) -> list[str]:
-    """A name for each factor; a number where the source gives none."""
+    """A name for each factor: from the source, or else `factor_1` and so on."""
     names = factor_names(source)
     return names if names and len(names) == size else [f"factor_{number}" for number in range(1, size + 1)]
 
 
 def parsed(source: str) -> ast.Module:
-    """The tree of a source that has passed. What Python would warn of is not for here."""
+    """The syntax tree of a source that has passed the gate, without Python's warnings."""
     with ONE_AT_A_TIME, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return ast.parse(source)
 
 
 def factor_names(source: str) -> list[str] | None:
-    """The names in the list that the function returns, or None where they cannot be read off."""
+    """The names in the list that the function returns, or None if they cannot be determined."""
     for node in ast.walk(parsed(source)):
         if isinstance(node, ast.FunctionDef) and node.name == NAME and isinstance(node.body[-1], ast.Return):
             returned = node.body[-1].value
@@ -42,9 +42,9 @@ def factor_names(source: str) -> list[str] | None:
 
 
 def factor_meanings(source: str) -> dict[str, str]:
-    """How a model explains its factors: for each variable, the comment right above its assignment.
+    """How a model explains its factors: for each variable, the comment directly above its assignment.
 
-    A factor that is worked out over several lines may have its comment, then with a number, above the first of them.
+    If a factor is computed in several lines, its comment may be above the first of these lines, but must then be numbered.
     """
     lines, factors = source.splitlines(), factor_names(source) or []
     assigned = {
@@ -71,6 +71,6 @@ def is_comment(line: str) -> bool:
 
 
 def read_comment(lines: list[str]) -> str:
-    """The comment that some lines begin with."""
+    """The comment at the start of the lines."""
     texts = (line.strip().lstrip("#").strip() for line in itertools.takewhile(is_comment, lines))
     return " ".join(texts)

@@ -1,12 +1,15 @@
-"""From a source that the gate has passed to a function: every name bound to what `allowed.py` lists, every loop counted.
+"""Compiles a source that has passed the gate. Names are bound only to what `allowed.py` lists, and loop iterations are counted.
 
-The program is simplified (`simplify.py`) and rewritten into the body of one function, in which nothing is named but what it is
-given. Dotted names become plain ones that no source can spell (`np.sum` in one piece), so that no module is in sight; operators
-become calls (`$add`), so that they can be guarded; what is compared or hashed is counted before; imports, annotations and
-docstrings go; generators become lists; loops, comprehensions and calls burn fuel. Lines stay where they are.
+The program is simplified (`simplify.py`) and rewritten to the body of one function, with these changes:
 
-The function is run anew at each call, so that nothing that a call leaves behind reaches the next one. Its names are bound to
-Python's and NumPy's functions, guarded (`guards.py`), and to nothing that leads further.
+* Dotted names such as `np.sum` become single names that no source can contain, so that no module is accessible.
+* Operators become calls (`$add`), so that they can be guarded.
+* The entries of values are counted before the values are compared or hashed.
+* Imports, annotations and docstrings are removed. Generators become lists.
+* Loops, comprehensions and calls consume fuel.
+
+Line numbers stay the same. The whole function is run at each call, so that no state passes from one call to the next. Its names
+are bound to guarded functions of Python and NumPy (`guards.py`), and to nothing else.
 """
 
 import ast
@@ -68,7 +71,7 @@ def named(name: str, value: ast.expr) -> ast.NamedExpr:
 
 
 def sliced(index: ast.expr) -> ast.expr:
-    """An index as a value: `1:2` is one only between brackets."""
+    """An index as an expression. `1:2` is only valid between brackets, and becomes a call of `slice`."""
     if isinstance(index, ast.Slice):
         ends = [end or ast.Constant(None) for end in (index.lower, index.upper, index.step)]
         return ast.copy_location(called("$slice", *ends), index)
@@ -78,19 +81,19 @@ def sliced(index: ast.expr) -> ast.expr:
 
 
 def looked_into(node: ast.expr) -> ast.expr:
-    """What is to be compared or hashed, counted before. Numbers and words that are written out are few."""
+    """Count the entries of a value before it is compared or hashed. Literals need no check."""
     return node if isinstance(node, ast.Constant) else ast.copy_location(called("$few", node), node)
 
 
 def looked_up(index: ast.expr) -> ast.expr:
-    """An index, which may be the key of a dictionary."""
+    """The same check for an index, which may be the key of a dictionary."""
     if isinstance(index, ast.Tuple):
         return ast.copy_location(ast.Tuple([looked_up(one) for one in index.elts], ast.Load()), index)
     return index if isinstance(index, ast.Slice) else looked_into(index)
 
 
 class Rewrite(ast.NodeTransformer):
-    """The walk over a tree that has passed the gate."""
+    """Rewrites a tree that has passed the gate."""
 
     def program(self, tree: ast.Module) -> ast.Module:
         body = [one for node in tree.body if (one := self.visit(node)) is not None]
@@ -173,7 +176,7 @@ class Rewrite(ast.NodeTransformer):
         old = copy.copy(node.target)
         old.ctx = ast.Load()
         if isinstance(old, ast.Subscript) and isinstance(node.target, ast.Subscript):
-            # What is indexed, and by what, is computed once, when the old value is read.
+            # The target and the index are evaluated only once, when the old value is read.
             old.value, old.slice = named("$target", old.value), named("$index", sliced(old.slice))
             node.target.value, node.target.slice = ast.Name("$target", ast.Load()), ast.Name("$index", ast.Load())
         new = called(f"$i{GUARDED[type(node.op)]}", old, node.value)
@@ -185,7 +188,7 @@ class Rewrite(ast.NodeTransformer):
         if name in CALLED_TYPES:
             node.func = ast.Name(f"{name}()", ast.Load())
         elif name is None and method in ("keys", "items", "values"):
-            return ast.copy_location(called("$list", node), node)  # views of keys make sets, whose order is chance
+            return ast.copy_location(called("$list", node), node)  # views of keys make sets, whose order is random
         elif name is None and method == "extend":
             assert isinstance(node.func, ast.Attribute)
             return ast.copy_location(called("$extend", node.func.value, *node.args), node)
@@ -212,21 +215,21 @@ class Rewrite(ast.NodeTransformer):
 
 
 FILE = "latent_function.py"
-"""What tracebacks call the program."""
+"""The file name of the program in tracebacks."""
 
 
 class OutOfFuel(Exception):
-    """The program made more turns than it may."""
+    """The program made more loop iterations and calls than allowed."""
 
 
 class Program:
-    """A compiled program. `steps` is how much fuel the last call took."""
+    """A compiled program. `steps` is the fuel that the last call consumed."""
 
     def __init__(self, source: str, functions: Mapping[str, Any] | None = None):
-        """`functions` replaces what dotted names mean, for a call that is to be watched.
+        """Compile a source. `functions` replaces the functions behind dotted names, for calls on special arrays.
 
         Raises:
-            SyntaxError: what passed the gate does not compile (as `return` outside of a function).
+            SyntaxError: the source passed the gate but does not compile, such as `return` outside a function.
         """
         tree = ast.fix_missing_locations(Rewrite().program(simplified(ast.parse(source))))
         names = {**namespace(), **(functions or {}), "$burn": self.burn, "$range": self.range}
@@ -249,7 +252,7 @@ class Program:
 
 
 def namespace() -> dict[str, Any]:
-    """Everything that a program can name, and nothing that leads further."""
+    """All names that a program can use."""
     return dict(everything())
 
 
@@ -260,7 +263,7 @@ def everything() -> dict[str, Any]:
         name: only_numbers(names[name], name) for name in DOTTED if name.startswith("numpy.") and name not in CONSTANTS
     }
     names |= {f"{name}()": only_numbers(names[name], name) for name in CALLED_TYPES}
-    names |= {name: getattr(builtins, name) for name in BUILTINS if name != "range"}  # which counts its turns
+    names |= {name: getattr(builtins, name) for name in BUILTINS if name != "range"}  # `$range` replaces it
     for name, (plain, in_place) in OPERATORS.items():
         names |= {f"${name}": guarded(name, plain), f"$i{name}": guarded(name, in_place)}
     names |= {
@@ -277,12 +280,12 @@ def everything() -> dict[str, Any]:
     }
     names |= {name: at_once(getattr(builtins, name)) for name in ("enumerate", "reversed", "zip")}
     names |= {name: of_few(getattr(builtins, name)) for name in "all any dict list max min sorted tuple".split()}
-    # NumPy imports parts of itself through its caller's __import__, which no program can name.
+    # NumPy imports parts of itself through its caller's __import__, a name that no program can use.
     return {**names, "__builtins__": {"__import__": already_loaded}}
 
 
 def resolve(name: str) -> Any:
-    """What a dotted name of the language means."""
+    """The object that a dotted name of the language refers to."""
     module, *parts = name.split(".")
     value: Any = {"numpy": np, "math": math}[module]
     for part in parts:

@@ -1,10 +1,10 @@
-"""What can be said in other words, said in those of the language. The gate judges what comes out of this, and that is what runs.
+"""Rewrites some constructs to equivalent ones that the language has. The gate checks the result, and the result is what runs.
 
 from numpy.linalg import norm; norm(x)      np.linalg.norm(x)
 map(lambda x: 2 * x, xs), filter(...)       [2 * x for x in xs]
 dict(a=1)                                   {"a": 1}
 [*a, x], first, *rest = xs                  list(a) + [x], first, *rest = list(xs)
-assert, if __name__ == "__main__":          nothing, as under `python -O`, and where a module is imported
+assert, if __name__ == "__main__":          removed, as by `python -O`, and as in an imported module
 """
 
 import ast
@@ -14,13 +14,13 @@ FROM = ("numpy", "numpy.linalg", "math")
 
 
 def simplified(tree: ast.Module) -> ast.Module:
-    """The tree of a program, in fewer words. It is changed on the way."""
+    """The simplified tree of a program. The given tree is changed."""
     imported = {name: where for name, where in imports(tree).items() if name not in bound(tree)}
     return ast.fix_missing_locations(Simplify(imported).visit(tree))
 
 
 def imports(tree: ast.Module) -> dict[str, str]:
-    """Names that are imported of NumPy and math, with what they mean."""
+    """Names that are imported from NumPy and math, and their full names."""
     found = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and not node.level and node.module in FROM:
@@ -31,7 +31,7 @@ def imports(tree: ast.Module) -> dict[str, str]:
 
 
 def bound(tree: ast.Module) -> set[str]:
-    """Every name that something is given to, other than by an import."""
+    """Every name that is bound by something other than an import."""
     found = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     found |= {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
     return found | {
@@ -40,7 +40,7 @@ def bound(tree: ast.Module) -> set[str]:
 
 
 def full_name(where: str) -> ast.expr:
-    """`np.linalg.norm` of `numpy.linalg.norm`."""
+    """The expression `np.linalg.norm` for `numpy.linalg.norm`."""
     module, *parts = where.split(".")
     node: ast.expr = ast.Name({"numpy": "np"}.get(module, module), ast.Load())
     for part in parts:
@@ -53,12 +53,12 @@ def call(name: str, *arguments: ast.expr) -> ast.Call:
 
 
 def is_main(node: ast.stmt) -> bool:
-    """`if __name__ == "__main__":`, which is not so where a module is imported."""
+    """Whether a statement is `if __name__ == "__main__":`, which does not run in an imported module."""
     return isinstance(node, ast.If) and not node.orelse and ast.unparse(node.test) == "__name__ == '__main__'"
 
 
 class Simplify(ast.NodeTransformer):
-    """A walk over a whole tree, from the leaves upwards."""
+    """Rewrites a whole tree, from the leaves upwards."""
 
     def __init__(self, imported: dict[str, str]):
         self.imported = imported
@@ -139,14 +139,14 @@ def starred(nodes: list[ast.expr]) -> bool:
 
 
 def comprehension(name: str, function: ast.expr, *values: ast.expr) -> ast.ListComp | None:
-    """What `map` or `filter` makes, as a list; None where it takes more to say."""
+    """The list comprehension that replaces `map` or `filter`; None if there is no simple one."""
     if isinstance(function, ast.Lambda):
         names = [one.arg for one in function.args.args]
         if len(names) != len(values) or len(vars_of(function.args)) != len(names) or function.args.defaults:
             return None
         body = function.body
     else:
-        names = [f"$item{number}" for number in range(len(values))]  # which no source can spell
+        names = [f"$item{number}" for number in range(len(values))]  # no source can contain such a name
         body = ast.Call(function, [ast.Name(one, ast.Load()) for one in names], [])
     targets: list[ast.expr] = [ast.Name(one, ast.Store()) for one in names]
     target = targets[0] if len(targets) == 1 else ast.Tuple(targets, ast.Store())

@@ -28,7 +28,7 @@ def is_name(node: ast.AST, *names: str) -> bool:
 
 
 def assigned(node: ast.AST) -> set[str]:
-    """Names that a function (or the module) binds itself, functions within it apart."""
+    """Names that a function or module binds, without those that are bound inside its inner functions."""
     found: set[str] = set()
     frontier = list(ast.iter_child_nodes(node))
     while frontier:
@@ -45,7 +45,7 @@ def assigned(node: ast.AST) -> set[str]:
 
 
 def evaluated(node: ast.AST) -> Iterator[ast.AST]:
-    """A node and everything below it, but for annotations: nobody evaluates these."""
+    """A node and everything below it except annotations, which are never evaluated."""
     yield node
     for name, value in ast.iter_fields(node):
         if name not in {"annotation", "returns"}:
@@ -55,7 +55,7 @@ def evaluated(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def beneath(node: ast.AST) -> Iterator[ast.AST]:
-    """Statements, expressions and loops right below a node, and those of its handlers of exceptions."""
+    """Statements, expressions and comprehensions directly below a node, and the statements of its exception handlers."""
     for inner in ast.iter_child_nodes(node):
         if isinstance(inner, ast.stmt | ast.expr | ast.comprehension):
             yield inner
@@ -64,7 +64,7 @@ def beneath(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def rebound(function: ast.FunctionDef) -> set[str]:
-    """Names that a function gives another value, so that they need not mean its inputs any more."""
+    """Names that a function rebinds, so that they may no longer refer to its inputs."""
     changed = {id(node.target) for node in ast.walk(function) if isinstance(node, ast.AugAssign)}
     return {
         node.id
@@ -78,7 +78,7 @@ def parameters(arguments: ast.arguments) -> set[str]:
 
 
 def dotted(node: ast.AST) -> str | None:
-    """`numpy.linalg.norm` of `np.linalg.norm`; None where an expression is not a dotted name of a module."""
+    """`numpy.linalg.norm` for `np.linalg.norm`; None if an expression is not a dotted name of a module."""
     parts: list[str] = []
     while isinstance(node, ast.Attribute):
         parts.insert(0, node.attr)
@@ -89,7 +89,7 @@ def dotted(node: ast.AST) -> str | None:
 
 
 def shown(name: str) -> str:
-    """A dotted name as people write it."""
+    """A dotted name as programs usually write it: `np.abs` for `numpy.abs`."""
     return name.replace("numpy.", "np.", 1)
 
 
@@ -102,7 +102,7 @@ def is_string(node: ast.AST, among: frozenset[str] | set[str]) -> bool:
 
 
 def is_singleton(node: ast.AST) -> bool:
-    """None, True or False, written out."""
+    """Whether a node is the literal None, True or False."""
     return isinstance(node, ast.Constant) and (node.value is None or isinstance(node.value, bool))
 
 
@@ -111,7 +111,7 @@ def is_key(value: object) -> bool:
 
 
 def is_number(node: ast.AST) -> bool:
-    """A number (perhaps with a sign), a truth value or None, or a tuple of them."""
+    """Whether a node is a literal number (possibly with a sign), a truth value or None, or a tuple of these."""
     if isinstance(node, ast.UnaryOp):
         return isinstance(node.op, ast.USub | ast.UAdd) and is_number(node.operand)
     if isinstance(node, ast.Tuple):
@@ -120,12 +120,12 @@ def is_number(node: ast.AST) -> bool:
 
 
 def exists(name: str) -> bool:
-    """Whether there is something of a dotted name, as far as it can be told without loading anything."""
+    """Whether a dotted name exists, as far as this can be determined without loading modules."""
     module, *parts = name.split(".")
     value: object = {"numpy": np, "math": math}[module]
     for part in parts:
         if value is None or part.startswith("_"):
-            return True  # nobody promises anything of what is private, or not loaded yet
+            return True  # unknown, because it is private or not loaded yet
         if part not in dir(value):
             return False
         value = inspect.getattr_static(value, part, None)

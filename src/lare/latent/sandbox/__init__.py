@@ -1,1 +1,1 @@
-"""Where a program runs: a process without rights, and its other end."""
+"""The sandbox: the process without rights in which a program runs, and the parent's side of it."""

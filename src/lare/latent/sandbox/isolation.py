@@ -1,4 +1,4 @@
-"""Whether what stands around a program is enough for what it may do. Decided before the program is sent to its process."""
+"""Decides whether a jail is strong enough for a program, before the program is sent to its process."""
 
 import os
 from collections.abc import Sequence
@@ -7,38 +7,38 @@ from lare.errors import LareError
 from lare.latent.sandbox.jail import LAYERS
 
 NEEDED = tuple(layer for layer in LAYERS if layer != "landlock")
-"""The least for every program. Kernels before 5.13 have no Landlock, and seccomp refuses all that it refuses."""
+"""The layers that every program needs. Landlock is not required: kernels before 5.13 lack it, and seccomp covers it."""
 
 ALWAYS = ("no new rights", "seccomp")
-"""Without these nothing runs that the gate has not passed, whatever is accepted."""
+"""A program that has not passed the gate never runs without these layers, even if `LARE_WITHOUT` names them."""
 
 ACCEPTED = "LARE_WITHOUT"
-"""The environment variable that names the layers, with commas between, that somebody knowingly does without."""
+"""The environment variable with the layers, separated by commas, that the user agrees to do without."""
 
 
 class NotIsolated(LareError):
-    """The system refuses a layer that a program needs around it. Nothing of the program has run."""
+    """The system refuses a layer that the program needs. No part of the program has run."""
 
 
 def check_isolation(layers: Sequence[str], gated: bool) -> None:
-    """Raise `NotIsolated` where less is in force than a program needs, and nobody accepts that."""
+    """Raise `NotIsolated` if a layer that the program needs is missing, and the user has not accepted that."""
     lacking = [layer for layer in NEEDED if layer not in layers]
     hopeless = [] if gated else [layer for layer in ALWAYS if layer in lacking]
     if hopeless:
         raise NotIsolated(
-            f"this system refuses {listed(hopeless)}, and without it no program runs that the gate has not passed: leave "
-            "--no-pre-verification out"
+            f"this system refuses {listed(hopeless)}, which is required for a program that has not passed the gate: remove "
+            "--no-pre-verification"
         )
     open_ones = [layer for layer in lacking if layer not in accepted()]
     if open_ones:
         raise NotIsolated(
-            f"this system refuses {listed(lacking)} to the process of the latent function; to run it all the same, knowing "
-            f"that, set {ACCEPTED}={','.join(name.replace(' ', '-') for name in lacking)} (docs/security.md)"
+            f"this system refuses {listed(lacking)} to the process of the latent function; to accept this risk and run it "
+            f"anyway, set {ACCEPTED}={','.join(name.replace(' ', '-') for name in lacking)} (docs/security.md)"
         )
 
 
 def accepted() -> set[str]:
-    """The layers that somebody does without. Raises `LareError` where there is no such layer."""
+    """The layers that the user agrees to do without. Raises `LareError` if a name is not that of a layer."""
     names = {name.strip().replace("-", " ") for name in os.environ.get(ACCEPTED, "").split(",")} - {""}
     unknown = sorted(names - set(LAYERS))
     if unknown:
@@ -47,7 +47,7 @@ def accepted() -> set[str]:
 
 
 def around(layers: Sequence[str]) -> str:
-    """What stands around a program, for a person: every layer in force, and every one that was refused."""
+    """A description of the jail for users: the layers in force, and the layers that the system refused."""
     refused = [layer for layer in LAYERS if layer not in layers]
     said = f"a process of its own ({', '.join(layers) or 'without limits'}"
     return said + (f"; refused: {', '.join(refused)})" if refused else ")")

@@ -1,12 +1,12 @@
-"""The jail: what a process gives up before it runs a program that nobody has read. Linux; plain ctypes, no privileges.
+"""The jail: the rights that a process gives up before it runs an unreviewed program. For Linux; needs only ctypes, no privileges.
 
-    no new rights   nothing that is started later gains rights back
-    rlimits         address space, no files written, no open files, no processes, no core
+    no new rights   the process, and any that it starts, cannot regain rights
+    rlimits         limited address space; no written files, open files, processes or core dumps
     Landlock        no file system, no TCP, no signals and no abstract sockets beyond this process
-    seccomp         some twenty system calls on memory, clocks and the three open pipes; all others fail
+    seccomp         about twenty system calls on memory, clocks and the three open pipes; all others fail
 
-A layer that a system refuses is left out, and the next one is tried: `enter` returns what is in force, and `isolation` decides
-whether that is enough. Layers stand on each other's ground on purpose; seccomp alone would hold.
+If the system refuses a layer, the next one is still tried. `enter` returns the layers in force, and `isolation` decides whether
+they are enough. The layers overlap on purpose; seccomp alone would be sufficient.
 """
 
 import ctypes
@@ -20,11 +20,11 @@ from collections.abc import Iterator
 
 try:
     import resource
-except ImportError:  # Windows, where there is no worker to be jailed
+except ImportError:  # on Windows, where no worker runs
     resource = None
 
 MEMORY = 2 << 30
-"""Bytes of address space beyond what the process has when it enters."""
+"""Bytes of address space that the process may use in addition to what it has when it enters the jail."""
 
 PR_SET_PDEATHSIG, PR_SET_NO_NEW_PRIVS = 1, 38
 
@@ -35,29 +35,29 @@ LIMITS = {
     "open files": "RLIMIT_NOFILE",
     "processes": "RLIMIT_NPROC",
 }
-"""What is limited, and what the system calls it."""
+"""The limited resources, and the system's names for these limits."""
 
 LAYERS = ("no new rights", "landlock", *LIMITS, "seccomp")
-"""Every layer that there can be."""
+"""All layers of the jail."""
 
 
 def enter(kill: bool = False) -> list[str]:
-    """Give up everything but computing. There is no way back.
+    """Give up all rights except to compute. This cannot be undone.
 
     Args:
-        kill: a refused system call ends the process, instead of failing. To prove that accepted programs make none.
+        kill: a refused system call ends the process instead of failing. Tests use this to prove that accepted programs make none.
 
     Returns:
         The layers in force, of `LAYERS`.
     """
-    space = address_space()  # while there still is a file system to read it from
+    space = address_space()  # read before the file system becomes inaccessible
     if sys.platform != "linux":
         return list(limits(space))
     libc = ctypes.CDLL(None, use_errno=True)
     layers = (
         ["no new rights"] if no_new_rights(libc) else []
-    )  # without them the kernel refuses Landlock and seccomp too
-    layers += ["landlock"] if landlock(libc) else []  # a ruleset is a file, and limits allow no more of them
+    )  # without this, the kernel also refuses Landlock and seccomp
+    layers += ["landlock"] if landlock(libc) else []  # before the limits, because a ruleset is an open file
     layers += limits(space)
     return [*layers, "seccomp"] if seccomp(libc, kill) else layers
 
@@ -67,10 +67,10 @@ def no_new_rights(libc: ctypes.CDLL) -> bool:
 
 
 def die_with(parent: int) -> None:
-    """Let the kernel kill this process when the thread ends that has started it. Linux."""
+    """On Linux, let the kernel kill this process when the thread that started it ends."""
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        if os.getppid() != parent:  # which has ended before it was asked for
+        if os.getppid() != parent:  # the parent ended before the request
             os._exit(0)
 
 
@@ -78,7 +78,7 @@ def die_with(parent: int) -> None:
 
 
 def limits(space: int) -> Iterator[str]:
-    """Lower every limit that the system lets be lowered; yields what is limited. `space`: what is mapped already."""
+    """Lower every limit that the system allows to lower, and yield its name. `space`: bytes that are already mapped."""
     for name, called in LIMITS.items():
         number = getattr(resource, called, None)
         if resource is None or number is None:
@@ -89,7 +89,7 @@ def limits(space: int) -> Iterator[str]:
             least = value if hard == resource.RLIM_INFINITY else min(value, hard)
             resource.setrlimit(number, (least, least))
         except (ValueError, OSError):
-            continue  # as on macOS, which does not limit address space: what is left is limited all the same
+            continue  # as on macOS, which cannot limit address space: the other limits are still set
         yield name
 
 
@@ -108,11 +108,11 @@ LANDLOCK_CREATE_RULESET, LANDLOCK_RESTRICT_SELF = 444, 446
 LANDLOCK_CREATE_RULESET_VERSION = 1
 
 FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
-"""How many rights on files each version of the interface knows; all of them are given up."""
+"""The number of file rights that each version of the interface knows. All of them are given up."""
 
 
 def landlock(libc: ctypes.CDLL) -> bool:
-    """Handle every right, and allow none: no rule is ever added."""
+    """Restrict every right, and allow none: the ruleset stays empty."""
     version = libc.syscall(LANDLOCK_CREATE_RULESET, None, ctypes.c_size_t(0), LANDLOCK_CREATE_RULESET_VERSION)
     if version < 1:
         return False
@@ -160,32 +160,32 @@ MACHINES = {
         },
     ),
 }  # fmt: skip
-"""Of each processor: its number in the kernel's audit, the number of `seccomp`, and the system calls that are left."""
+"""For each processor: its audit number in the kernel, the number of `seccomp`, and the system calls that stay allowed."""
 
 
 LOAD, EQUAL, SET, RETURN = 0x20, 0x15, 0x45, 0x06
-"""Instructions of the filter: load a word; jump where it equals; jump where it has a bit; end."""
+"""Instructions of the filter: load a word; jump if it equals a value; jump if a bit is set; return."""
 
 NUMBER, ARCHITECTURE, FIRST, THIRD = 0, 4, 16, 32
-"""Where the call's number, the processor and (the low words of) the first and third argument stand."""
+"""Offsets of the call's number, the processor, and the low words of the first and third argument."""
 
 
 ANSWERS = 3
-"""The descriptor of the pipe to the parent. Standard output is the program's own, and leads nowhere."""
+"""The descriptor of the pipe to the parent. Standard output is left to the program, and is discarded."""
 
 ONLY = {
     "read": (FIRST, (0,)),
     "write": (FIRST, (1, 2, ANSWERS)),
     "madvise": (THIRD, (4, 8, 14, 15)),
 }
-"""What an argument must be: the pipes; pages that are given back, or may be huge (and no worse advice)."""
+"""The allowed values of an argument. `read` and `write`: only the pipes. `madvise`: only advice on freed and on huge pages."""
 
 
 def instructions(audit: int, calls: dict[str, int], refused: int) -> Iterator[tuple[int, int, int, int]]:
     """The filter: (operation, jump if true, jump if false, value)."""
     yield LOAD, 0, 0, ARCHITECTURE
     yield EQUAL, 1, 0, audit
-    yield RETURN, 0, 0, KILL_PROCESS  # numbers of another processor mean other calls
+    yield RETURN, 0, 0, KILL_PROCESS  # on another processor, the numbers mean other calls
     yield LOAD, 0, 0, NUMBER
     for name, number in calls.items():
         if name in ONLY:

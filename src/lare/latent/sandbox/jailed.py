@@ -1,7 +1,7 @@
-"""A program in the worker's jail, as its parent sees it: called with arrays, and stopped if it does not answer.
+"""The parent's side of a program in the worker's jail. It calls the program with arrays, and ends it if it does not answer.
 
-What comes out of the jail is taken for what it is: bytes from a process that runs somebody else's code. Answers are
-bounded, read as JSON and checked; numbers come through shared memory that the worker cannot resize.
+The output of the jail is not trusted, because the worker runs foreign code. Answers are limited in size, read as JSON and
+checked. Numbers come through shared memory that the worker cannot resize.
 """
 
 import contextlib
@@ -36,57 +36,57 @@ from lare.latent.sandbox.worker import MOST_FACTORS
 from lare.legible import in_a_line
 
 ROWS = 4096
-"""Rows of one call; a larger batch takes several."""
+"""The largest number of rows of one call. A larger batch needs several calls."""
 
 SIZES = tuple(1 << power for power in range(ROWS.bit_length()))
-"""Rows that a call has in training. A program that does something else with some number of rows is met in verification."""
+"""The batch sizes of calls in training. Verification tries them all, and so detects a program that treats some size differently."""
 
 TIME_LIMIT = 30.0
 """Seconds for one answer."""
 
 LONGEST_ANSWER = 1 << 16
-"""Bytes."""
+"""In bytes."""
 
 Mode = Literal["plain", "oblivious", "rows", "strict", "traced"]
-"""A plain call; on arrays that refuse to be looked into; on arrays that know which row each number depends on; with floating-point
-errors raised; with memory traced."""
+"""In order: an ordinary call; a call on arrays that hide their values (`oblivious.py`); on arrays that record on which row each
+number depends (`rows.py`); with floating-point errors raised; with memory traced."""
 
 START = "import sys; sys.path[:] = {path!r}; from lare.latent.sandbox.worker import main; main({argument!r})"
 
 
 class NoWorker(LareError):
-    """There is no process to be had. Nothing is known of the program."""
+    """No worker process can be started. This says nothing about the program."""
 
 
 class WorkerFailed(LareError):
-    """The worker did not answer in time, or broke off: the program's doing, or somebody's who killed it."""
+    """The worker did not answer in time, or ended. The program caused this, or the worker was killed."""
 
 
 @dataclass(frozen=True)
 class Returned:
-    """What one call gave."""
+    """The result of one call."""
 
     error: str | None
     line: int | None
-    """Of the program, where the error came from."""
+    """The line of the program that raised the error."""
     values: tuple[tuple[Any, ...], ...] | None
-    """Of each thing in the list: ("array", shape, type) or (kind,). None where no list came."""
+    """For each entry of the returned list: ("array", shape, type) or (kind,). None if no list was returned."""
     instead: tuple[Any, ...]
-    """The same, of what came instead of a list."""
+    """The same description for a value that is not a list."""
     factors: Float[np.ndarray, "rows factors"] | None
-    """The numbers, where each thing was a real array (rows, 1)."""
+    """The numbers, if each entry was a real array (rows, 1)."""
     steps: int
-    """Turns of loops and calls."""
+    """The number of loop iterations and function calls."""
     peak: int
-    """Bytes, if they were traced."""
+    """The peak memory in bytes, if it was traced."""
     events: tuple[str, ...]
-    """Audit events, if they were watched."""
+    """The audit events, if they were recorded."""
 
 
 class JailedProgram:
-    """A worker and the program that it has been given.
+    """A worker and its program.
 
-    `problems` is what the gate found; where there are any, the worker has ended and nothing can be called.
+    `problems` are those that the gate found. If there are any, the worker has ended and the program cannot be called.
     """
 
     def __init__(
@@ -104,16 +104,16 @@ class JailedProgram:
         """Start a worker.
 
         Args:
-            gated: whether the gate stands in front of the jail. Without it a program may be any Python.
+            gated: whether the gate checks the program. Without the gate, a program may be any Python code.
             kill: a refused system call ends the worker.
-            audit: note Python's audit events during calls.
+            audit: record Python's audit events during calls.
             limit: seconds for one answer; `TIME_LIMIT` unless given.
-            until: when there is an end to all answers, by `time.monotonic`.
+            until: the time by which all answers must have come, in terms of `time.monotonic`.
 
         Raises:
-            NoWorker: it cannot be started.
-            NotIsolated: less stands around it than the program needs.
-            WorkerFailed: the program broke it.
+            NoWorker: the worker cannot be started.
+            NotIsolated: the jail is weaker than the program needs.
+            WorkerFailed: the worker failed while it loaded the program.
         """
         self.sizes = observation_size, action_size
         self.limit, self.until = limit, until
@@ -121,13 +121,13 @@ class JailedProgram:
         self.layers: tuple[str, ...] = ()
         self.problems: list[Problem] = list(guard(source)) if gated else []
         self.failed: Returned | None = None
-        """What happened to a program that could not even be loaded."""
+        """The error of a program that could not be loaded."""
         if self.problems:
             return
         if sys.platform == "win32":
-            raise NoWorker("a latent function needs a process of its own, which Windows does not give: use WSL")
+            raise NoWorker("a latent function runs in a jailed process, which Windows does not support: use WSL")
         given = ROWS * 8 * (observation_size + action_size)
-        text = source.encode(errors="replace")  # what cannot be encoded, the gate has refused
+        text = source.encode(errors="replace")  # the gate has refused characters that cannot be encoded
         with shared(max(given, len(text))) as self.inputs, shared(ROWS * 8 * MOST_FACTORS) as self.outputs:
             self.process = start([self.inputs, self.outputs], {"kill": kill, "audit": audit, "gate": gated})
         weakref.finalize(self, shut, self.process)
@@ -158,14 +158,14 @@ class JailedProgram:
 
     @property
     def isolation(self) -> str:
-        """What stands around the program, for a person."""
+        """A description of the jail for users."""
         return around(self.layers)
 
     def call(self, observation: np.ndarray, action: np.ndarray, mode: Mode = "plain") -> Returned:
         """Run the program on at most `ROWS` rows, float32 or float64.
 
         Raises:
-            WorkerFailed: there was no answer.
+            WorkerFailed: the worker did not answer.
         """
         rows, kind = len(observation), observation.dtype.str
         place = 8 * ROWS * self.sizes[0]
@@ -180,7 +180,7 @@ class JailedProgram:
                 self.broken(f"it said something that cannot be read ({error!r})")
 
     def read(self, answer: dict[str, Any], rows: int) -> Returned:
-        """An answer, checked as something that a stranger said."""
+        """Check an answer, which is untrusted, and convert it."""
         values = answer.get("values")
         several = [described(value) for value in values] if isinstance(values, list) else None
         instead = described(values["returned"]) if isinstance(values, dict) else ()
@@ -205,14 +205,14 @@ class JailedProgram:
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         seconds = max(0.1, min(self.limit or TIME_LIMIT, self.until - time.monotonic()))
-        if request is None:  # a process that starts on a busy machine is nothing that a program could do anything about
+        if request is None:  # a slow start on a busy machine is not the program's fault
             seconds = TIME_LIMIT
         deadline = time.monotonic() + seconds
         number = secrets.token_hex(8) if request is not None else ""  # the worker may not answer before it is asked
         try:
             if request is not None:
                 request = request | {"number": number, "seconds": seconds}
-                # A request fits into the pipe whole, or the pipe is full because nobody reads it, and this fails.
+                # Either the whole request fits into the pipe, or the pipe is full because nobody reads it, and the write fails.
                 os.write(self.process.stdin.fileno(), json.dumps(request).encode() + b"\n")
             line = b""
             while not line.endswith(b"\n"):
@@ -229,7 +229,7 @@ class JailedProgram:
         except (OSError, ValueError) as error:
             self.broken(f"it broke off ({error}; {self.ending()})")
         except BaseException:
-            self.close()  # its answer would be taken for that to the next request
+            self.close()  # a late answer would be taken for the answer to the next request
             raise
         if not isinstance(answer, dict) or answer.get("number", "") != number:
             self.broken("it said something that is no answer to what was asked")
@@ -248,10 +248,10 @@ class JailedProgram:
         return f"exit status {code}" + (f": {plain(last[0])[:200]}" if last else "")
 
     def complaint(self) -> str:
-        """What stands on its standard error, whoever wrote it."""
+        """The text on the worker's standard error, which the program may have written."""
         try:
             return os.read(self.process.stderr.fileno(), LONGEST_ANSWER).decode(errors="replace")  # type: ignore[union-attr]
-        except (OSError, ValueError):  # nothing, or it is closed
+        except (OSError, ValueError):  # it is empty or closed
             return ""
 
     def broken(self, how: str) -> Never:
@@ -259,7 +259,7 @@ class JailedProgram:
         raise WorkerFailed(f"the process that runs the latent function failed: {how}")
 
     def close(self) -> None:
-        """End the worker. Nothing can be called any more."""
+        """End the worker. The program cannot be called afterwards."""
         if hasattr(self, "process"):
             shut(self.process)
 
@@ -273,19 +273,19 @@ MOST = 1 << 62
 
 
 def count(value: Any) -> int:
-    """A number that somebody counted. Raises `ValueError` where it is none."""
+    """A count that the worker has sent. Raises `ValueError` if it is not a valid one."""
     if type(value) is not int or not 0 <= value <= MOST:
         raise ValueError("a number is out of range")
     return value
 
 
 def plain(value: Any) -> str:
-    """A text in a line, without what a terminal would obey, or nobody sees."""
+    """A text in one line, without control characters and invisible characters."""
     return in_a_line(str(value)[:500])
 
 
 def where(complaint: str) -> str:
-    """The line of the program that the worker was last seen at, where its standard error tells."""
+    """The line of the program that the worker executed last, if its standard error says so."""
     found = AT.search(complaint.rpartition("most recent call first")[2])
     return f", at line {found[1]}" if found else ""
 
@@ -305,7 +305,7 @@ def is_factor(value: tuple[Any, ...], rows: int) -> bool:
 
 @dataclass
 class Shared:
-    """Memory that two processes see. The child's descriptor of it can be made one for reading only."""
+    """Memory that two processes share. A child that gets only the descriptor `read` cannot write to it."""
 
     memory: mmap.mmap
     write: int
@@ -314,7 +314,7 @@ class Shared:
 
 @contextlib.contextmanager
 def shared(size: int) -> Iterator[Shared]:
-    """Memory in an unnamed file; the descriptors are open only as long as a child is started."""
+    """Memory in an unnamed file. Its descriptors are closed at the end of the context, in which a child is started."""
     try:
         with unnamed() as (write, read):
             os.posix_fallocate(write, 0, size) if hasattr(os, "posix_fallocate") else os.truncate(write, size)
@@ -326,7 +326,7 @@ def shared(size: int) -> Iterator[Shared]:
 
 @contextlib.contextmanager
 def unnamed() -> Iterator[tuple[int, int]]:
-    """Descriptors of a new file: one to write by, and one that can only read."""
+    """Two descriptors of a new file: one for writing, and one that can only read."""
     with contextlib.ExitStack() as stack:
         if hasattr(os, "memfd_create"):
             write = os.memfd_create("lare", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
@@ -341,7 +341,7 @@ def unnamed() -> Iterator[tuple[int, int]]:
 
 
 def seal(descriptor: int) -> None:
-    """Let nobody change the file's size, where the system has seals: memory whose file has shrunk kills whoever reads it."""
+    """Fix the file's size, if the system supports seals: a process that reads memory of a truncated file is killed."""
     if hasattr(os, "memfd_create"):
         import fcntl
 
@@ -349,11 +349,11 @@ def seal(descriptor: int) -> None:
 
 
 def start(memory: Sequence[Shared], asked: Mapping[str, bool]) -> subprocess.Popen[bytes]:
-    """A new worker: isolated Python, nothing of this environment, no open files but the pipes and the memory."""
+    """Start a worker: isolated Python, an almost empty environment, no open files except the pipes and the memory."""
     inputs, outputs = memory
     argument = json.dumps({"input": inputs.read, "output": outputs.write, "parent": os.getpid(), **asked})
     path = [entry for entry in sys.path if entry and Path(entry).is_absolute()]
-    # Pythons of some clusters find their own libraries by this variable alone; it holds no secrets.
+    # On some clusters, Python finds its libraries only by these variables. They hold no secrets.
     needed = {name: os.environ[name] for name in ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH") if name in os.environ}
     one_thread = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     try:
@@ -366,8 +366,8 @@ def start(memory: Sequence[Shared], asked: Mapping[str, bool]) -> subprocess.Pop
             cwd="/",
             env={**needed, **one_thread},
             pass_fds=[inputs.read, outputs.write],
-            # Ctrl-C is for the parent, which saves and leaves. A group of its own, but not a session: when the parent
-            # is killed, the kernel wakes and ends whoever is stopped in a group that nobody is left to continue.
+            # Ctrl-C must reach only the parent, which saves and exits: hence a separate process group. It is not a separate
+            # session, so that the kernel continues and ends a stopped worker whose parent was killed.
             process_group=0,
         )
     except OSError as error:

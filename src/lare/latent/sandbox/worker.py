@@ -1,8 +1,8 @@
-"""The process in which generated code runs, from its first check to the end of training: it goes to jail, then obeys.
+"""The process in which generated code runs, from its first check to the end of training. It enters the jail, then serves requests.
 
-Requests come on standard input and answers go out by a pipe of their own, one JSON object a line; arrays travel through two
-pieces of shared memory. What a program prints goes nowhere. `jailed` is the other end. Nothing in here judges what a program
-returns: whoever is in jail is no witness. It says what came back, and the parent checks the numbers.
+Requests come on standard input and answers leave by a separate pipe, one JSON object per line. Arrays are passed in two pieces
+of shared memory. What a program prints is discarded. `jailed` is the parent's side. The worker does not judge what a program
+returns, because it cannot be trusted once it has run the program. It describes the result, and the parent checks it.
 """
 
 import builtins
@@ -17,7 +17,7 @@ import signal
 import sys
 import traceback
 import tracemalloc
-import unicodedata  # noqa: F401 - Python's parser wants it for names that are not ASCII
+import unicodedata  # noqa: F401 - Python's parser needs it for names that are not ASCII
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -35,15 +35,15 @@ MOST_FACTORS = 32
 MOST_PROBLEMS = 30
 
 GRACE = 5.0
-"""Seconds that a worker outlives the end of a call: its parent, where there is one, ends it before."""
+"""A worker ends itself this many seconds after the time limit of a call, unless its parent has ended it before."""
 
 Function = Callable[[np.ndarray, np.ndarray], Any]
 
 
 def main(argument: str) -> None:
-    """Serve until standard input closes. `argument`: the descriptors of the memory, and what is to be watched."""
+    """Serve requests until standard input closes. `argument`: JSON with the descriptors of the memory and the options."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # whoever asks a run to stop means the parent, which needs this to save
+        signal.signal(number, signal.SIG_IGN)  # these signals are for the parent, which needs the worker to save
     warnings.simplefilter("ignore")
     given = json.loads(argument)
     memory = mmap.mmap(given["input"], 0, prot=mmap.PROT_READ), mmap.mmap(given["output"], 0)
@@ -52,7 +52,7 @@ def main(argument: str) -> None:
     warm(functions)
     tell_lines()
     events: list[str] = []
-    if not given["gate"]:  # no program that the gate has passed outlives its parent
+    if not given["gate"]:  # a program that has passed the gate cannot prevent its worker from ending with the parent
         jail.die_with(given["parent"])
     layers = jail.enter(kill=given["kill"])
     send({"layers": layers})
@@ -64,7 +64,7 @@ def main(argument: str) -> None:
         programs = {} if problems else load(source, functions, gated=given["gate"])
         begin(0)  # the first call may come much later
         send({"number": start["number"], "problems": problems[:MOST_PROBLEMS]})
-    except BaseException as error:  # a program that is not gated does what it likes here
+    except BaseException as error:  # a program that has not passed the gate may raise anything
         send({"number": start["number"], "problems": []} | failure(error))
         return
     sizes = start["observation"], start["action"], start["rows"]
@@ -80,9 +80,9 @@ def main(argument: str) -> None:
 
 
 def only_pipes(beyond: int) -> None:
-    """Leave nothing open but the pipes: requests on 0, errors on 2, answers on `jail.ANSWERS`. What is printed on 1 goes nowhere.
+    """Close all descriptors except the pipes: requests on 0, errors on 2, answers on `jail.ANSWERS`. Output on 1 is discarded.
 
-    The memory is mapped by then. `mmap` keeps descriptors of its own, the lowest that are free, and needs them no more.
+    The memory has already been mapped. `mmap` keeps its own descriptors, the lowest free ones, but does not need them any more.
     """
     os.closerange(jail.ANSWERS, beyond + 64)
     os.dup2(1, jail.ANSWERS)
@@ -92,23 +92,23 @@ def only_pipes(beyond: int) -> None:
 
 
 def tell_lines() -> None:
-    """Let a crash, and a call that takes a quarter of its time, write the line where it happens to standard error."""
-    os.set_blocking(2, False)  # nobody reads it before the end
+    """Write the current line to standard error at a crash, and when a call has used a quarter of its time."""
+    os.set_blocking(2, False)  # the parent reads it only at the end
     faulthandler.enable(2, all_threads=False)
     faulthandler.register(signal.SIGPROF, 2, all_threads=False)
 
 
 def begin(seconds: float) -> None:
-    """Start the clocks of a call, or stop them (0).
+    """Start the timers of a call, or stop them (0).
 
-    Whoever has lost its parent in the middle of a long call ends all the same: this signal is not handled.
+    SIGALRM is not handled, so that it ends a worker that has lost its parent during a long call.
     """
     signal.setitimer(signal.ITIMER_REAL, seconds and seconds + GRACE)
     signal.setitimer(signal.ITIMER_PROF, seconds / 4)
 
 
 def load(source: str, functions: Any, gated: bool) -> dict[str, Function]:
-    """The program, as it is called in each mode."""
+    """For each mode, the function to call."""
     if gated:
         program, watched = Program(source), Program(source, functions)
         modes = {"plain": program, "strict": program, "traced": program}
@@ -119,7 +119,7 @@ def load(source: str, functions: Any, gated: bool) -> dict[str, Function]:
 
 
 def warm(functions: Any) -> None:
-    """Let NumPy load now what it loads when it is first used; later there is no file system any more."""
+    """Make NumPy load its lazily loaded parts now, because the file system is inaccessible later."""
     x = np.linspace(-1.0, 1.0, 24, dtype=np.float32).reshape(8, 3)
     for axis in (None, 0, 1):
         for name in ("sum", "mean", "std", "var", "max", "min", "any", "all", "prod", "argmax", "cumsum"):
@@ -147,7 +147,7 @@ def serve(
     memory: tuple[mmap.mmap, mmap.mmap],
     sizes: tuple[int, int, int],
 ) -> dict[str, Any]:
-    """One call of the program. What it returned goes into the memory where it is what it should be, and is described."""
+    """One call of the program. Returns a description of its result; a result of the right form is written to the memory."""
     mode, rows = request["mode"], request["rows"]
     function = programs[mode]
     inputs = arrays(memory[0], rows, sizes, request["type"])
@@ -166,7 +166,7 @@ def serve(
                     check_own(values, rows)
                 out = np.frombuffer(memory[1], np.float64, rows * len(values))
                 np.concatenate(values, axis=1, out=out.reshape(rows, len(values)), casting="unsafe")
-    except BaseException as error:  # the same
+    except BaseException as error:  # here too
         answer = failure(error)
     peak = tracemalloc.get_traced_memory()[1] if mode == "traced" else 0
     tracemalloc.stop()
@@ -174,7 +174,7 @@ def serve(
 
 
 def arrays(memory: mmap.mmap, rows: int, sizes: tuple[int, int, int], kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """The batch in the memory: arrays that nobody can write into, since the memory is mapped so."""
+    """The batch in the memory. The arrays are read-only, because the memory is mapped read-only."""
     observation, action, most = sizes
     return (
         np.frombuffer(memory, kind, rows * observation).reshape(rows, observation),
@@ -183,7 +183,7 @@ def arrays(memory: mmap.mmap, rows: int, sizes: tuple[int, int, int], kind: str)
 
 
 def describe(values: Any) -> Any:
-    """What the parent is told of something that a program returned: [kind], or [kind, shape, type] of an array."""
+    """The description of a returned value for the parent: [kind], or [kind, shape, type] for an array."""
     if isinstance(values, list | tuple):
         return [one(value) for value in values[: MOST_FACTORS + 1]]
     return {"returned": one(values)}
@@ -197,7 +197,7 @@ def one(value: Any) -> list[Any]:
 
 @functools.lru_cache(maxsize=64)
 def name_of(dtype: np.dtype) -> str:
-    """A type's name, which NumPy makes up anew each time: this took a third of a small call."""
+    """The name of a type. It is cached, because NumPy computes it anew each time, which took a third of a small call."""
     return str(dtype)[:20]
 
 
@@ -210,7 +210,7 @@ def fits(values: Any, rows: int) -> bool:
 
 
 def failure(error: BaseException) -> dict[str, Any]:
-    """An exception, in a line, with the line of the program that it came from."""
+    """A description of an exception in one line, and the line of the program that raised it."""
     try:
         if isinstance(error, SyntaxError):
             return {"error": f"SyntaxError: {error.msg}"[:500], "line": error.lineno}
@@ -220,7 +220,7 @@ def failure(error: BaseException) -> dict[str, Any]:
             "error": f"{type(error).__name__}{': ' if said else ''}{said}"[:500],
             "line": lines[-1] if lines else None,
         }
-    except BaseException:  # an exception class of the program's own may fail when it is shown
+    except BaseException:  # an exception class that the program defines may fail in its own methods
         return {"error": "an exception that cannot be shown", "line": None}
 
 
@@ -231,7 +231,7 @@ def send(answer: dict[str, Any]) -> None:
 
 
 def receive() -> dict[str, Any]:
-    """The next request. Standard input closes when the parent ends, however it ends, and then so does this."""
+    """The next request. When the parent ends, for any reason, standard input closes and this process exits."""
     line = b""
     while not line.endswith(b"\n"):
         more = os.read(0, 4096)

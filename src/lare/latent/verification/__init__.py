@@ -1,1 +1,1 @@
-"""What a program must do before it is believed."""
+"""The checks that a program must pass before it is used."""

@@ -1,7 +1,7 @@
-"""The dynamic checks: what a program must do, judged by its parent from the numbers that come out of the jail.
+"""The dynamic checks of a program. The parent makes them, from the numbers that come out of the jail.
 
-Each check is a function of a trial, raises `Failed` with one message for person and model alike, and is named in
-`CHECKS`. The first ones tell whether there is anything to judge; after them all are made, so that all errors come at once.
+Each check is a function of a trial, is listed in `CHECKS`, and raises `Failed` with one message for users and for the model. If one
+of `FIRST` fails, the rest is skipped. Otherwise all checks are made, so that all errors are reported at once.
 """
 
 import itertools
@@ -18,31 +18,31 @@ from lare.latent.sandbox.jailed import REAL, ROWS, SIZES, Mode, Returned, Worker
 from lare.latent.sandbox.worker import MOST_FACTORS
 
 FEW, MANY = 64, 1031
-"""Rows between which the work must not change; a prime, so that nothing divides it."""
+"""Two batch sizes for which a program must do the same work. The second is a prime, so that no other size divides it."""
 
 SLOWEST = 1.0
-"""Seconds for a batch, of `ROWS` rows at most."""
+"""The most seconds for a batch of at most `ROWS` rows."""
 
 SLOWEST_CALL = 5.0
-"""Seconds after which nobody waits any longer, whatever the machine is busy with."""
+"""Seconds after which a call is ended, even on a busy machine."""
 
 LONGEST = 30.0
-"""Seconds for all checks."""
+"""The most seconds for all checks together."""
 
 HALVES = 4
-"""Times that a half of the rows, chosen by chance, keeps its steps while the others change."""
+"""The number of random halves of the rows. One half of the rows keeps its steps while the other half changes."""
 
 LAST_DIGITS, SHARE = 1e-6, 1e-4
-"""By how much factors may differ that should be the same: relative to their size, and to their spread. Matrix products of another
-shape end in other digits; whatever is more than that is learned from."""
+"""Tolerances for factors that should be equal, relative to their size and to their standard deviation. Matrix products of other
+shapes differ in their last digits. Larger differences could affect what is learned."""
 
 SLACK = 1 << 20
-"""Bytes that a call may take whatever the batch is."""
+"""Bytes of memory that a call may use in addition, for a batch of any size."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """What one check found."""
+    """The result of one check."""
 
     name: str
     passed: bool
@@ -50,46 +50,46 @@ class Check:
 
 
 class Failed(Exception):
-    """A check's verdict; the message says what was expected and what came, and where."""
+    """A check failed. The message says what was expected, what happened, and where."""
 
 
 @runtime_checkable
 class Callee(Protocol):
-    """A program that can be called: `JailedProgram`, or in tests anything."""
+    """A program that can be called: a `JailedProgram`, or a substitute in tests."""
 
     def call(self, observation: np.ndarray, action: np.ndarray, mode: Mode = "plain") -> Returned: ...
 
 
 @dataclass
 class Trial:
-    """A program before its judges."""
+    """A program that is verified, and the data for its checks."""
 
     program: Callee
     again: Callee
-    """The same in another process, where strings have other hashes."""
+    """The same program in another process, in which strings have other hashes."""
     observation: Float[np.ndarray, "steps observation"]
     action: Float[np.ndarray, "steps action"]
     """Steps of the task."""
     kind: Literal["factors", "reward"] = "factors"
     size: int | None = None
-    """Number of factors, when it is known."""
+    """The number of factors, once it is known."""
     random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
     unproved: str = ""
-    """Why it is not proved that rows do not touch; empty where it is."""
+    """Why the independence of rows is not proved; empty if it is proved."""
 
     def steps(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
-        """The recorded steps, as often as it takes."""
+        """The given number of rows of recorded steps, repeated if there are fewer."""
         places = np.arange(rows) % len(self.observation)
         return self.observation[places], self.action[places]
 
     def noise(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
-        """Steps that are nothing but chance."""
+        """Steps of random numbers."""
         sizes = self.observation.shape[1], self.action.shape[1]
         observation, action = (self.random.standard_normal((rows, size)).astype(np.float32) for size in sizes)
         return observation, action
 
     def factors(self, observation: np.ndarray, action: np.ndarray) -> Float[np.ndarray, "rows factors"]:
-        """Factors of a batch. Raises `Failed` where there are none, or another number of them than before."""
+        """Factors of a batch. Raises `Failed` if there are none, or if their number differs from before."""
         found = factors_of(self.program.call(observation, action), len(observation), self.kind)
         if self.size not in (None, found.shape[1]):
             raise failed("E-FORM", f"the number of factors depends on values: {self.size} before, {found.shape[1]} now")
@@ -106,7 +106,7 @@ def failed(code: str, message: str, line: int | None = None) -> Failed:
 
 
 def factors_of(returned: Returned, rows: int, kind: str) -> Float[np.ndarray, "rows factors"]:
-    """A list of 1 to 32 real arrays (B, 1), side by side. Raises `Failed` where something else came."""
+    """The factors, if a call returned a list of 1 to 32 real arrays (B, 1). Raises `Failed` if it returned anything else."""
     if returned.error is not None:
         raise failed("E-RUN", returned.error, returned.line)
     if returned.values is None and not returned.instead:
@@ -138,7 +138,7 @@ def shown(value: tuple) -> str:
 
 
 def in_time(trial: Trial, rows: int) -> None:
-    """A batch does not take long; once may be bad luck."""
+    """Raises `Failed` if a batch takes too long twice. A single slow call may have other causes."""
     seconds = []
     for _ in range(2):
         start = time.perf_counter()
@@ -153,7 +153,7 @@ def in_time(trial: Trial, rows: int) -> None:
 
 
 def runs(trial: Trial) -> None:
-    """It runs on steps of the task, and soon: else all that follows would take minutes."""
+    """The program runs on steps of the task, and is fast. With a slow program, the other checks would take minutes."""
     in_time(trial, len(trial.observation))
     returned = trial.program.call(trial.observation, trial.action)
     if returned.error is not None:
@@ -162,7 +162,7 @@ def runs(trial: Trial) -> None:
 
 
 def form(trial: Trial) -> None:
-    """A list of real arrays (B, 1), as many for every B."""
+    """The program returns a list of real arrays (B, 1), of the same length for every B."""
     counts = {rows: trial.factors(*trial.steps(rows)).shape[1] for rows in (len(trial.observation), FEW, 1, MANY)}
     if len(set(counts.values())) > 1:
         found = ", ".join(f"{count} for {rows} rows" for rows, count in counts.items())
@@ -171,7 +171,7 @@ def form(trial: Trial) -> None:
 
 
 def control_flow(trial: Trial) -> None:
-    """Which way it takes through its code does not depend on values; and it reads only entries that there are."""
+    """The program's control flow does not depend on values, and it reads only entries that exist."""
     returned = trial.program.call(trial.observation, trial.action, "oblivious")
     kind, _, said = (returned.error or "").partition(": ")
     if kind == "Missing":
@@ -183,7 +183,7 @@ def control_flow(trial: Trial) -> None:
 
 
 def loops(trial: Trial) -> None:
-    """It does not loop over the rows."""
+    """The program does not loop over the rows."""
     few, *more = (trial.program.call(*trial.steps(rows)).steps for rows in (FEW, MANY, ROWS))
     for rows, many in zip((MANY, ROWS), more, strict=True):
         if few != many:
@@ -194,7 +194,7 @@ def loops(trial: Trial) -> None:
 
 
 def batches(trial: Trial) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Steps of many kinds, that a long training may meet or not; no factor may be infinite on any of them."""
+    """Steps of many kinds, which training may or may not contain. Factors must be finite on all of them."""
     observation, action = trial.steps(len(trial.observation))
     yield "recorded steps", observation, action
     yield "random steps", *trial.noise(256)
@@ -210,7 +210,7 @@ def batches(trial: Trial) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
 
 
 def finite(trial: Trial) -> None:
-    """Every factor is a finite float32, whatever finite steps it sees, in single and in double precision."""
+    """Every factor is a finite float32 for all steps of `batches`, in single and in double precision."""
     for dtype in (np.float32, np.float64):
         for name, observation, action in batches(trial):
             inputs = observation.astype(dtype), action.astype(dtype)
@@ -236,11 +236,11 @@ def deterministic(trial: Trial) -> None:
 
 
 def prove_rows_apart(trial: Trial) -> None:
-    """No number of one row goes into another, in a batch of any size that training has, whatever the values are.
+    """Prove that no row depends on another, for every batch size of training and for all values.
 
-    Where an operation is not known for that, nothing is proved: that rows are apart is only tried then.
+    If the program uses an operation that `rows.py` does not know, nothing is proved. The independence is then only tested.
     """
-    for rows in SIZES[1:]:  # one row is alone
+    for rows in SIZES[1:]:  # the first size is a single row
         returned = trial.program.call(*trial.steps(rows), "rows")
         kind, _, said = (returned.error or "").partition(": ")
         if kind == "Mixed":
@@ -252,9 +252,9 @@ def prove_rows_apart(trial: Trial) -> None:
 
 
 def rows_apart(trial: Trial) -> None:
-    """A row's factors are its own: proved, where that can be; and the same, bit for bit, whatever stands in the other rows.
+    """The factors of a row do not depend on other rows. This is proved if possible, and tested: other rows must not change a bit.
 
-    Halves by chance: of any two rows, some half keeps one and changes the other.
+    The halves are random, so that for almost any two rows some half keeps one and changes the other.
     """
     prove_rows_apart(trial)
     known = trial.known
@@ -274,13 +274,13 @@ def rows_apart(trial: Trial) -> None:
 
 
 def same(found: np.ndarray, expected: np.ndarray, of: Float[np.ndarray, "rows factors"]) -> np.ndarray:
-    """Where factors are the same but for their last digits; `of` tells how large a factor is, and how much it varies."""
+    """Which factors are equal except for their last digits. `of` determines how large each factor is, and how much it varies."""
     tolerance = LAST_DIGITS * np.abs(of).max(axis=0) + SHARE * of.std(axis=0)
     return np.abs(found - expected) <= tolerance
 
 
 def batch_sizes(trial: Trial) -> None:
-    """A step has the same factors in every order and in a batch of any size that training has, but for their last digits."""
+    """A step has the same factors, except for their last digits, in every order and in every batch size of training."""
     known = trial.known
     order = trial.random.permutation(len(known))
     if not same(trial.factors(trial.observation[order], trial.action[order]), known[order], of=known).all():
@@ -301,7 +301,7 @@ def cost(trial: Trial) -> None:
 
 
 def empty_batch(trial: Trial) -> None:
-    """No rows have no factors."""
+    """A batch without rows gives factors without rows."""
     try:
         trial.factors(trial.observation[:0], trial.action[:0])
     except Failed as failure:
@@ -321,18 +321,18 @@ CHECKS: dict[str, Callable[[Trial], None]] = {
     "empty batch": empty_batch,
 }
 FIRST = ("runs", "form", "finite")
-"""Without these there is nothing to judge further."""
+"""If one of these checks fails, the following checks are skipped."""
 
 
 def examine(trial: Trial) -> Iterator[Check]:
-    """Every check with what it found; all of them, unless one of the first fails."""
+    """The results of all checks; if one of `FIRST` fails, the results up to it."""
     start = time.monotonic()
     for name, check in CHECKS.items():
         try:
             check(trial)
             if time.monotonic() - start > LONGEST:
                 raise failed("E-COST", f"the checks take more than {LONGEST:.0f} s in all")
-        except WorkerFailed as failure:  # there is nobody left to be asked
+        except WorkerFailed as failure:  # the worker has ended
             yield Check(name, False, f"E-RUN: {failure}")
             return
         except Failed as failure:
@@ -344,7 +344,7 @@ def examine(trial: Trial) -> Iterator[Check]:
 
 
 def advice(factors: Float[np.ndarray, "steps factors"], names: list[str]) -> list[str]:
-    """Factors that say nothing, or nothing new, on recorded steps. Not errors: early steps may show little of a task."""
+    """Remarks on factors that are constant or redundant on recorded steps. Not errors: early steps may show little of a task."""
     said = []
     spread = factors.std(axis=0)
     dead = spread <= 1e-9 * (1 + np.abs(factors).max(axis=0))

@@ -1,7 +1,7 @@
-"""Arrays that refuse to be looked into, to find control flow that depends on values.
+"""Arrays that hide their values, to detect control flow that depends on values.
 
-A latent function judges a whole batch at once; an `if` on a value would decide for every row by one of them. A program
-that runs through on these arrays takes the same way through its code whatever the values are.
+A latent function judges a whole batch at once; an `if` on a value would decide for all rows by one of them. If a program runs on
+these arrays without an error, its operations do not depend on values.
 """
 
 import weakref
@@ -17,21 +17,21 @@ from lare.latent.language.program import CALLED_TYPES, resolve
 
 
 class Looked(Exception):
-    """A value of a batch was asked for, where only the whole batch may be reckoned with."""
+    """The program read a value of the batch, but may only compute with whole arrays."""
 
 
 class Missing(Exception):
-    """An entry was asked for that there is not. NumPy itself lets a slice end anywhere."""
+    """The program read an entry that does not exist. NumPy itself accepts slices that end anywhere."""
 
 
 WRITTEN: weakref.WeakValueDictionary[int, np.ndarray] = weakref.WeakValueDictionary()
-"""Arrays of constants that values of the batch have been written into, by their identity."""
+"""Arrays of constants to which values of the batch have been written, by their `identity`."""
 
 
 class Watched(np.ndarray):
-    """An array of constants, as long as no values of the batch are written into its memory; then it is hidden too.
+    """An array of constants. It becomes hidden when values of the batch are written to its memory.
 
-    A single number is one as well: NumPy's own scalars would make arrays that nobody watches, by `reshape` or `[None]`.
+    Single numbers are such arrays too: `reshape` or `[None]` of NumPy's own scalars would make ordinary arrays.
     """
 
     def __bool__(self) -> bool:
@@ -51,7 +51,7 @@ class Watched(np.ndarray):
         return super().__index__()
 
     def __round__(self, digits: int | None = None) -> Any:
-        return round(float(self), digits)  # as NumPy's scalars, which have it, and arrays do not
+        return round(float(self), digits)  # NumPy's scalars have this method, its arrays do not
 
     def __hash__(self) -> int:  # type: ignore[override]
         refuse(self, "a value of the batch is used as a key: use np.where")
@@ -62,8 +62,8 @@ class Watched(np.ndarray):
         by = [part for part in parts if touched([part])]
         if is_hidden(self):
             check_slices(key, self.shape)
-        # x[np.arange(n), chosen] takes an entry of each row, as np.take_along_axis does. Not so a mask, which decides
-        # how many there are, a number, which speaks for all rows, or rows that are chosen.
+        # Allowed is x[np.arange(n), chosen], which takes one entry of each row, as np.take_along_axis does. Not allowed are
+        # hidden masks, which decide the number of entries; hidden numbers, which decide for all rows; and hidden row indices.
         if any(np.asarray(shown(part)).dtype == bool for part in by) or (
             is_hidden(self) and by and (touched(parts[:1]) or any(np.ndim(part) == 0 for part in by))
         ):
@@ -86,11 +86,11 @@ class Watched(np.ndarray):
 
 
 class Oblivious(Watched):
-    """An array whose values cannot decide anything. Everything computed from it is one as well."""
+    """A hidden array, whose values cannot decide anything. Everything that is computed from it is hidden too."""
 
 
 def check_slices(key: Any, shape: tuple[int, ...]) -> None:
-    """Slices of anything but rows must lie within the array; past its end they would silently be empty."""
+    """Slices of all axes except the rows must lie within the array. Beyond its end, they would silently be empty."""
     parts = key if isinstance(key, tuple) else (key,)
     for part, size in list(zip(parts, shape, strict=False))[1:]:
         if part is None or part is Ellipsis:
@@ -102,19 +102,19 @@ def check_slices(key: Any, shape: tuple[int, ...]) -> None:
 
 
 def owner(array: np.ndarray) -> np.ndarray:
-    """The array whose memory this one shows."""
+    """The array that owns the memory of this one."""
     while isinstance(array.base, np.ndarray):
         array = array.base
     return array
 
 
 def identity(array: np.ndarray) -> int:
-    """A number of the array whose memory this one shows. Not `id`, which is an audit event, and programs make none."""
+    """A number that identifies the owner of an array's memory. Not `id`: it is an audit event, and programs must cause none."""
     return object.__hash__(owner(array))
 
 
 def write(array: np.ndarray) -> None:
-    """Values of the batch have been written into an array: whoever sees its memory is hidden from now on."""
+    """Note that values of the batch were written to an array: all arrays on its memory are hidden from now on."""
     WRITTEN[identity(array)] = owner(array)
 
 
@@ -128,7 +128,7 @@ def refuse(array: Watched, message: str) -> None:
 
 
 def hidden(value: Any) -> Any:
-    """The same values, not to be looked into."""
+    """The same values as hidden arrays."""
     if isinstance(value, np.ndarray | np.generic):
         return np.asarray(value).view(Oblivious)
     if isinstance(value, list | tuple):
@@ -137,7 +137,7 @@ def hidden(value: Any) -> Any:
 
 
 def watched(value: Any) -> Any:
-    """The same constants, where it is noticed if something is written into them."""
+    """The same constants as arrays that become hidden when values of the batch are written to them."""
     if isinstance(value, np.ndarray | np.generic):
         return np.asarray(value).view(Watched)
     if isinstance(value, list | tuple):
@@ -155,14 +155,14 @@ def shown(value: Any) -> Any:
 
 
 def touched(values: Iterable[Any]) -> bool:
-    """Whether one of some values, or of the values in them, is hidden."""
+    """Whether one of the values, or an entry of them, is hidden."""
     return any(is_hidden(one) or (isinstance(one, list | tuple) and touched(one)) for one in values)
 
 
 def careful(function: Callable[..., Any], shaping: tuple[int, ...] = (), *owners: Any) -> Callable[..., Any]:
-    """A function whose result is hidden where one of its arguments, or its owner, is. NumPy itself may look.
+    """A function whose result is hidden if an argument or one of `owners` is. The NumPy function itself receives the values.
 
-    The arguments at the places `shaping` say what shape the result has, and must not be hidden.
+    The arguments at the positions `shaping` determine the shape of the result, and must not be hidden.
     """
 
     def call(*arguments: Any, **keywords: Any) -> Any:
@@ -181,7 +181,7 @@ def careful(function: Callable[..., Any], shaping: tuple[int, ...] = (), *owners
 
 
 TELLING = {"numpy.shape", "numpy.ndim", "numpy.size"}
-"""Functions that tell nothing of values."""
+"""Functions whose results do not depend on values."""
 
 
 def finfo(dtype: Any) -> SimpleNamespace:
@@ -193,7 +193,7 @@ def finfo(dtype: Any) -> SimpleNamespace:
 
 
 def careful_functions() -> Mapping[str, Callable[..., Any]]:
-    """The NumPy functions of the language, for `Program`: a result is hidden where an argument is. NumPy alone would lose that."""
+    """The NumPy functions of the language, for `Program`: a result is hidden if an argument is. NumPy itself would lose this."""
     names = DOTTED.keys() - TELLING - CALLED_TYPES
     functions = {
         name: careful(only_numbers(resolve(name), name), SHAPING.get(name.removeprefix("numpy."), ()))

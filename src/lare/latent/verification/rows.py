@@ -1,8 +1,8 @@
-"""Arrays of which every number knows the row of the batch that it depends on: that rows do not touch is proved, not tried.
+"""Arrays that record, for each number, the row of the batch on which it depends. They prove that rows are independent.
 
-A program takes the same way through its code whatever the values are (`oblivious`). So what meets what in a batch of some size is
-the same for all batches of that size, and one call on these arrays tells it. A number of no row is a constant (`NONE`). Where two
-rows would meet, or a constant tells a row's place, the call ends with `Mixed`; where an operation is not known, with `Unproved`.
+The operations of a program do not depend on values (`oblivious`). Which numbers are combined in a batch therefore depends only on
+its size, and one call on these arrays finds out. A number that depends on no row is a constant (`NONE`). The call raises `Mixed`
+if two rows are combined, or if a constant reveals the position of a row. It raises `Unproved` if an operation is not known.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,19 +18,19 @@ from lare.latent.verification.oblivious import TELLING
 NONE = -1
 
 Rows = np.ndarray
-"""The row of each number, as whole numbers. Without `jaxtyping`, which imports `socket`: this runs in the worker."""
+"""The index of each number's row. Not a `jaxtyping` type, because `jaxtyping` imports `socket`, and this runs in the worker."""
 
 
 class Mixed(Exception):
-    """Something of one row goes into another."""
+    """A number of one row is used for another row."""
 
 
 class Unproved(Exception):
-    """Nobody can tell which rows meet. Other checks try it."""
+    """It cannot be determined which rows are combined. Other checks test it instead."""
 
 
 class Rowed(np.ndarray):
-    """An array whose `rows` say for each of its numbers which row it depends on. Views of it share them."""
+    """An array whose `rows` hold, for each number, the row on which it depends. Views share the `rows`."""
 
     rows: Rows
 
@@ -60,7 +60,7 @@ class Rowed(np.ndarray):
     def __getitem__(self, key: Any) -> Any:
         parts, rows = key if isinstance(key, tuple) else (key,), self.rows
         chosen = [place for place, part in enumerate(parts) if of_rows(part)]
-        for place in chosen:  # any entry along this axis, whatever the values say
+        for place in chosen:  # the values may select any entry along this axis
             if any(part is None or part is Ellipsis or np.asarray(plain(part)).dtype == bool for part in parts):
                 raise Unproved("an index by values, beside new axes or masks")
             rows = np.broadcast_to(reduced(rows, place, True), rows.shape)
@@ -83,8 +83,8 @@ class Rowed(np.ndarray):
         if name == "astype":
             return lambda dtype, **keywords: made(
                 plain(self).astype(plain(dtype)), self.rows.copy()
-            )  # copied, whatever is said
-        if name in ("reshape", "transpose"):  # which take the sizes one by one
+            )  # always a copy, whatever `copy` is
+        if name in ("reshape", "transpose"):  # these also take sizes as separate arguments
             function = FUNCTIONS[f"numpy.{name}"]
             return lambda *sizes: function(self, *([sizes[0] if len(sizes) == 1 else sizes] if sizes else []))
         if name == "flatten":
@@ -99,17 +99,17 @@ class Rowed(np.ndarray):
         return product(function)(*inputs) if function is np.matmul else by_element(function)(*inputs, **keywords)
 
 
-# --- rows of values, and values of rows ------------------------------------------------------------------------------
+# --- values and their rows -------------------------------------------------------------------------------------------
 
 
 def labelled(array: np.ndarray) -> Rowed:
-    """A batch: its first axis is that of the rows."""
+    """A batch, whose first axis is that of the rows, with its rows."""
     rows = np.arange(len(array)).reshape(-1, *(1,) * (array.ndim - 1))
     return made(array, np.broadcast_to(rows, array.shape).copy())
 
 
 def made(value: Any, rows: Any) -> Any:
-    """Values and their rows, put together."""
+    """An array of values with the given rows."""
     if isinstance(value, list | tuple):
         return type(value)(made(one, of_one) for one, of_one in zip(value, rows, strict=True))
     array = np.asarray(value).view(Rowed)
@@ -127,7 +127,7 @@ def plain(value: Any) -> Any:
 
 
 def rows_of(value: Any) -> Any:
-    """Rows in the shape of a value; of a list's entries, a list."""
+    """The rows of a value, in its shape; for a list, a list."""
     if isinstance(value, list | tuple):
         return type(value)(map(rows_of, value))
     return value.rows if isinstance(value, Rowed) else np.full(np.shape(value), NONE)
@@ -146,7 +146,7 @@ def as_one(value: Any) -> Any:
 
 
 def joined(parts: list[Any], shape: tuple[int, ...]) -> Rows:
-    """The rows of what is made of several things, number by number."""
+    """The rows of a result that combines several arrays element by element."""
     rows = np.full(shape, NONE)
     for part in parts:
         other = np.broadcast_to(part, shape)
@@ -157,7 +157,7 @@ def joined(parts: list[Any], shape: tuple[int, ...]) -> Rows:
 
 
 def reduced(rows: Rows, axis: Any, keepdims: bool = False) -> Rows:
-    """The rows of what is made of all numbers along some axes."""
+    """The rows of a result that combines all numbers along some axes."""
     most = np.iinfo(rows.dtype).max
     least = np.where(rows == NONE, most, rows).min(axis=axis, keepdims=keepdims, initial=most)
     highest = rows.max(axis=axis, keepdims=keepdims, initial=NONE)
@@ -167,7 +167,7 @@ def reduced(rows: Rows, axis: Any, keepdims: bool = False) -> Rows:
 
 
 def check_places(rows: Rows, parts: list[Any]) -> None:
-    """Raise `Mixed` where a constant has another value for another row: it would tell the place in the batch."""
+    """Raise `Mixed` if a constant differs between rows: it would reveal the position in the batch."""
     for axis in range(rows.ndim):
         if (np.take(rows, [0], axis) == rows).all():
             continue
@@ -186,7 +186,7 @@ def value_of(function: Callable[..., Any], arguments: Any, keywords: Mapping[str
 
 
 def by_element(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Numbers that stand in the same place meet."""
+    """A function that combines numbers at the same position."""
 
     def call(*arguments: Any, out: Any = None, **keywords: Any) -> Any:
         target = out[0] if isinstance(out, tuple) else out
@@ -206,7 +206,7 @@ def by_element(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def over_axes(function: Callable[..., Any], place: int = 1, usual: Any = None) -> Callable[..., Any]:
-    """All numbers along some axes meet; `axis` is an argument, at `place` where it has no name."""
+    """A function that combines all numbers along some axes. `axis` is a keyword, or the positional argument `place`."""
 
     def call(value: Any, *arguments: Any, **keywords: Any) -> Any:
         value = as_one(value)
@@ -226,7 +226,7 @@ def over_axes(function: Callable[..., Any], place: int = 1, usual: Any = None) -
 
 
 def of_first(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Numbers of the first argument meet nobody."""
+    """A function of each single number of the first argument."""
 
     def call(value: Any, *arguments: Any, **keywords: Any) -> Any:
         if of_rows([*arguments, *keywords.values()]):
@@ -238,7 +238,7 @@ def of_first(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def along(function: Callable[..., Any], place: int, usual: Any = -1) -> Callable[..., Any]:
-    """Numbers along one axis meet, and as many come out, or fewer."""
+    """A function that combines numbers along one axis, and returns as many numbers or fewer."""
 
     def call(value: Any, *arguments: Any, **keywords: Any) -> Any:
         if of_rows([*arguments, *keywords.values()]):
@@ -253,7 +253,7 @@ def along(function: Callable[..., Any], place: int, usual: Any = -1) -> Callable
 
 
 def moving(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Numbers come to other places, and meet nobody: their rows go with them."""
+    """A function that moves numbers without combining them. Their rows are moved in the same way."""
 
     def call(value: Any, *arguments: Any, **keywords: Any) -> Any:
         if of_rows([*arguments, *keywords.values()]):
@@ -266,7 +266,7 @@ def moving(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def alike(value: Any, found: Any, rows: Any) -> Any:
-    """What was made of a value, with its rows. Who writes into one of them writes into the other where both see the same memory."""
+    """A result with its rows. Both or neither must share memory with `value`, so that a later write changes both alike."""
     if isinstance(value, Rowed):
         for one, own in zip(found, rows, strict=True) if isinstance(found, list) else [(found, rows)]:
             if np.may_share_memory(one, plain(value)) != np.may_share_memory(own, value.rows):
@@ -275,7 +275,7 @@ def alike(value: Any, found: Any, rows: Any) -> Any:
 
 
 def product(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Products of matrices."""
+    """A product of matrices."""
 
     def call(left: Any, right: Any) -> Any:
         left, right = as_one(left), as_one(right)
@@ -293,7 +293,7 @@ def product(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def einsum(pattern: str, *arguments: Any) -> Any:
-    """Every letter of a sum is an axis: that of the rows must be the same for all, and stand in the result."""
+    """`np.einsum`, where each letter is an axis. The axis of the rows must have one letter everywhere, also in the result."""
     found = np.einsum(pattern, *plain(arguments))
     given, arrow, result = pattern.replace(" ", "").partition("->")
     if not arrow or "." in pattern:
@@ -301,7 +301,7 @@ def einsum(pattern: str, *arguments: Any) -> Any:
     parts = []
     for letters, one in zip(given.split(","), arguments, strict=True):
         rows = rows_of(one)
-        for axis in range(rows.ndim - 1, -1, -1):  # what does not stand in the result is summed over
+        for axis in range(rows.ndim - 1, -1, -1):  # axes that are not in the result are summed over
             if letters[axis] not in result or letters.index(letters[axis]) != axis:
                 rows = reduced(rows, axis)
         kept = [letter for place, letter in enumerate(letters) if letter in result and letters.index(letter) == place]
@@ -312,7 +312,7 @@ def einsum(pattern: str, *arguments: Any) -> Any:
 
 
 def array(value: Any, *arguments: Any, **keywords: Any) -> Any:
-    """Always of its own memory: who writes into it writes into nothing else."""
+    """`np.array`, but always a copy, so that writes to it change no other array."""
     keywords = {name: one for name, one in keywords.items() if name != "copy"}
     found = value_of(np.array, (value, *arguments), keywords)
     return made(found, np.array(rows_of(value), np.int64, ndmin=keywords.get("ndmin", 0)))
@@ -326,7 +326,7 @@ def asarray(value: Any, *arguments: Any, **keywords: Any) -> Any:
 
 
 def filled(function: Callable[..., Any], by: int | None = None) -> Callable[..., Any]:
-    """A new array, perhaps of a value that is the argument at `by`."""
+    """A function that makes a new array. If `by` is given, the argument at `by` is the value that fills it."""
 
     def call(*arguments: Any, **keywords: Any) -> Any:
         found = value_of(function, arguments, keywords)
@@ -342,7 +342,7 @@ def take_along_axis(value: Any, index: Any, axis: int = -1) -> Any:
 
 
 def other(name: str) -> Callable[..., Any]:
-    """A function that is known to make constants of constants."""
+    """A function that is only known to return constants for constants."""
 
     def call(*arguments: Any, **keywords: Any) -> Any:
         if of_rows([*arguments, *keywords.values()]):
@@ -382,11 +382,11 @@ KINDS: dict[str, Callable[[Callable[..., Any]], Callable[..., Any]]] = {
     **dict.fromkeys("zeros ones arange linspace eye identity zeros_like ones_like".split(), filled),
     **dict.fromkeys("full full_like".split(), lambda function: filled(function, 1)),
 }
-"""What numbers meet in each function."""
+"""Which numbers each function combines."""
 
 
 def row_functions() -> dict[str, Callable[..., Any]]:
-    """The functions of the language, for `Program`."""
+    """The NumPy functions of the language on these arrays, for `Program`."""
     found: dict[str, Callable[..., Any]] = {}
     for name in DOTTED.keys() - TELLING - CALLED_TYPES:
         if name.startswith("numpy."):
@@ -404,7 +404,7 @@ FUNCTIONS = row_functions()
 
 
 def check_own(values: Any, rows: int) -> None:
-    """Raise `Mixed` where a factor (rows, 1) of some row is not its own."""
+    """Raise `Mixed` if a factor (rows, 1) of a row depends on another row or on the position in the batch."""
     for number, value in enumerate(values, start=1):
         found = rows_of(value)
         if not ((found[:, 0] == np.arange(rows)) | (found[:, 0] == NONE)).all():

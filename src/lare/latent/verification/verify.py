@@ -1,4 +1,4 @@
-"""Whether a source is a latent function of a task: the gate, and the checks, with the program in its jail throughout."""
+"""Verifies that a source is a latent function of a task, by the gate and the checks. The program always runs in its jail."""
 
 import contextlib
 import functools
@@ -20,26 +20,26 @@ from lare.tasks.spec import TaskSpec, the_role
 from lare.tasks.table import make_host_env
 
 STEPS = 256
-"""Random steps that a function is tried on."""
+"""The number of steps that a function is tried on."""
 LONGEST_PLAY = 20 * STEPS
-"""Environment steps, at most, until that many are found and an episode has ended: agents that have left have none."""
+"""The most environment steps that are played to collect `STEPS` steps and end an episode. Agents that have left have no steps."""
 
 
 Steps = tuple[Float[np.ndarray, "steps observation"], Float[np.ndarray, "steps action"]]
-"""Observations as the function judges them, and the actions beside them: rows of the task's sizes."""
+"""Observations as the function judges them, and their actions: rows of the task's sizes."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was found. Passed when there is a check and every one of them passed."""
+    """The result of verification. It is passed if there is at least one check and all checks passed."""
 
     checks: tuple[Check, ...]
     size: int
     """Number of factors."""
     advice: tuple[str, ...] = ()
-    """Not wrong, but worth a thought."""
+    """Remarks that are not errors."""
     isolation: str = ""
-    """What stood around the program while it was tried."""
+    """A description of the jail in which the program was tried."""
 
     @property
     def passed(self) -> bool:
@@ -51,18 +51,18 @@ class Verdict:
 
 
 def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | None = None) -> Verdict:
-    """Try a source, in a process without this one's environment, files and rights.
+    """Verify a source, in a process that has no access to this process's environment, files and rights.
 
     Args:
-        source: Python.
-        task: whose sizes of observations and actions it is for.
-        kind: what it is to return.
-        steps: what it is tried on, (n, observation size) and (n, action size), where there is no environment; 256 of them are
-            enough. Unless given, random steps of the task's environment.
+        source: Python code.
+        task: the task, which determines the sizes of observations and actions.
+        kind: whether it must return factors or one reward.
+        steps: observations (n, observation size) and actions (n, action size) that it is tried on if there is no environment;
+            256 steps are enough. Without them, it is tried on random steps of the task's environment.
 
     Raises:
-        LareError: the task's environment cannot be made, the steps are not of the task's sizes, there is no process to be had,
-            or each team of the task has a function of its own.
+        LareError: the task's environment cannot be made, the steps do not have the task's sizes, no process can be started, or
+            each team of the task needs its own function.
     """
     observation, action = tried_on(task, steps)
     sizes = observation.shape[1], action.shape[1]
@@ -77,7 +77,7 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | N
                 said = failed("E-RUN", program.failed.error or "", program.failed.line)
                 return Verdict((passed, Check("runs", False, str(said))), 0, isolation=program.isolation)
             again = stack.enter_context(contextlib.closing(start()))
-            # Numbers that always come out the same for a source, and that its author cannot know.
+            # Random numbers that are reproducible for a source, but that its author cannot know.
             random = np.random.default_rng(list(hashlib.sha256(source.encode(errors="replace")).digest()))
             trial = Trial(program, again, observation, action, kind, random=random)
             checks = (passed, *examine(trial))
@@ -86,14 +86,14 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | N
             factors = trial.known
             size = factors.shape[1]
             said = advice(factors, names_of(source, size))
-            said += [f"that rows do not touch was tried, not proved: {trial.unproved}"] if trial.unproved else []
+            said += [f"the independence of rows was tested, not proved: {trial.unproved}"] if trial.unproved else []
             return Verdict(checks, size, tuple(said), program.isolation)
     except (WorkerFailed, Failed) as error:
         return Verdict((Check("runs", False, f"E-RUN: {error}"),), 0)
 
 
 def tried_on(task: TaskSpec, steps: Steps | None) -> Steps:
-    """The steps that a function of a task is tried on: at most `STEPS` of those given, at equal distances; or random ones.
+    """The steps that a function of a task is tried on: at most `STEPS` of the given steps, evenly spaced; or random steps.
 
     Raises:
         LareError: as `verify`.
@@ -108,8 +108,8 @@ def tried_on(task: TaskSpec, steps: Steps | None) -> Steps:
         rows = np.asarray(values)
         if rows.dtype.kind not in "biuf" or rows.shape != (len(steps[0]), size) or not len(rows):
             raise LareError(
-                f"{name} of steps must be rows of {size} numbers, as {name[:-1]}_size of {role.name} says, as many as the other "
-                f"array has and one at least: the shape is {rows.shape}"
+                f"{name} of steps must have the shape (n, {size}), with the {name[:-1]}_size of {role.name}, and n >= 1 as for the "
+                f"other array: the shape is {rows.shape}"
             )
         if not np.isfinite(rows).all():
             raise LareError(f"{name} of steps hold a number that is not finite")
@@ -120,15 +120,15 @@ def tried_on(task: TaskSpec, steps: Steps | None) -> Steps:
 def random_steps(task: TaskSpec, steps: int = STEPS, seed: int = 0) -> Steps:
     """Steps of whole episodes under uniformly random actions (the paper's pre-collected random state-action pairs).
 
-    Observations are those that the task says are judged, that before or that after a step; with `both`, of either kind. Where
-    more steps were played than are asked for, they are taken at equal distances, from the first to the last.
+    The task's `judges` selects the observations before or after a step, or both. If more steps were played than requested, the
+    result is evenly spaced among them, from the first to the last.
     """
     return known_steps(task.model_dump_json(), steps, seed)
 
 
 @functools.lru_cache(maxsize=8)
 def known_steps(task: str, steps: int, seed: int) -> Steps:
-    """The same by the task as JSON. Read-only: they are given to everybody who asks."""
+    """As `random_steps`, with the task as JSON. The arrays are cached, and therefore read-only."""
     role = TaskSpec.model_validate_json(task)
     with contextlib.closing(make_host_env(role)) as env:
         team, random = team_of(role, env.spec), np.random.default_rng(seed)
@@ -142,7 +142,7 @@ def known_steps(task: str, steps: int, seed: int) -> Steps:
                 played += 1
                 if played == LONGEST_PLAY:
                     break
-            if count >= steps or played >= LONGEST_PLAY:  # at the end of an episode: functions are tried on it too
+            if count >= steps or played >= LONGEST_PLAY:  # at the end of an episode, to try functions on it too
                 break
     every = [np.concatenate(part).astype(np.float32) for part in zip(*found, strict=True)]
     if not count:

@@ -1,1 +1,1 @@
-"""Multi-agent particle tasks in JAX: see `table.py` for all of them, `world.py` for their physics, `env.py` for training."""
+"""Multi-agent particle tasks in JAX. `table.py` lists them, `world.py` has their physics, `env.py` the training environment."""

@@ -1,4 +1,4 @@
-"""Pictures of particle tasks: a state, and an episode as a film."""
+"""Pictures of particle tasks: of a state, and of all steps of an episode."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,10 +11,10 @@ from lare.tasks.canvas import blank, pixels
 from lare.tasks.particles.task import ParticleTask
 
 TEAM, OTHERS, LANDMARK = "#0072b2", "#d55e00", "#9a9a9a"
-"""The first team, all others that move, and what stays."""
+"""The colours of the first team, of all other moving entities, and of entities that do not move."""
 CREDIT = colormaps["RdBu"]
 MARGIN = 1.08
-"""How much further than the square the picture reaches."""
+"""The size of the picture relative to the square that it must contain."""
 
 
 def draw(
@@ -23,7 +23,7 @@ def draw(
     credit: Float[np.ndarray, " agents"] | None = None,
     scale: float | None = None,
 ) -> Figure:
-    """A state, to scale. With credit, each learning agent has its own as number and colour: `scale` is the darkest."""
+    """A state, to scale. Each learning agent's credit, if given, is shown as a number and a colour, darkest at `scale`."""
     figure, axes = blank()
     paint(axes, task, position, reach(task, position), credit, scale)
     return figure
@@ -34,7 +34,7 @@ def frames(
     positions: Float[np.ndarray, "steps entities 2"],
     credit: Float[np.ndarray, "steps agents"] | None = None,
 ) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """An episode as pictures, all of them to one scale of length and one of credit."""
+    """An episode as pictures, all with the same scale of length and the same scale of credit."""
     figure, axes = blank()
     side, scale = reach(task, positions), None if credit is None else float(np.abs(credit).max())
     found = []
@@ -46,7 +46,7 @@ def frames(
 
 
 def reach(task: ParticleTask, position: Float[np.ndarray, "*steps entities 2"]) -> float:
-    """Half the side of a picture in which nothing is cut off."""
+    """Half the side of a picture that contains all entities."""
     outermost = np.abs(position) + task.world.size[:, None]
     return float(MARGIN * max(task.radius, outermost.max()))
 

@@ -1,4 +1,4 @@
-"""The particle tasks as environments for training: pure functions, compiled with the rest of it."""
+"""The particle tasks as `JaxEnv`s: pure functions, which are compiled together with training."""
 
 from typing import NamedTuple
 
@@ -13,14 +13,14 @@ from lare.tasks.particles.world import State
 
 
 class Moment(NamedTuple):
-    """The world, and how many steps led to it."""
+    """The world, and the number of steps so far."""
 
     world: State
     step: Int[Array, ""]
 
 
 class ParticleJaxEnv:
-    """A particle task as a `JaxEnv`. The end of its time is the end of the task: it pays no more."""
+    """A particle task as a `JaxEnv`. The time limit terminates the episode: no rewards are expected after it."""
 
     def __init__(self, name: str):
         self.task = find_particle_task(name)
@@ -35,7 +35,7 @@ class ParticleJaxEnv:
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[Moment, Timestep]:
-        """A start."""
+        """The first state and timestep of an episode."""
         moment = Moment(self.task.reset(key), jnp.zeros((), jnp.int32))
         return moment, self.timestep(moment, jnp.zeros(self.spec.agents))
 
@@ -46,7 +46,7 @@ class ParticleJaxEnv:
         return moment, self.timestep(moment, self.task.reward(world))
 
     def timestep(self, moment: Moment, reward: Float[Array, " agents"]) -> Timestep:
-        """What a state shows."""
+        """The timestep of a state."""
         agents = self.spec.agents
         return Timestep(
             observation=self.task.observe(moment.world),

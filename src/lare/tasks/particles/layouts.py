@@ -1,4 +1,4 @@
-"""Landmarks that keep their distance: Poisson discs (Bridson, SIGGRAPH 2007)."""
+"""Positions of landmarks with a minimum distance, by Poisson disc sampling (Bridson, SIGGRAPH 2007)."""
 
 from functools import cache
 
@@ -6,22 +6,22 @@ import numpy as np
 from jaxtyping import Float
 
 CANDIDATES = 5
-"""Points tried around each point."""
+"""The number of points that are tried around each point."""
 LAYOUTS = 2048
-"""How many there are of one kind: an episode draws one of them."""
+"""The number of precomputed layouts. Each episode draws one of them."""
 
 
 @cache
 def layouts(points: int, radius: float, separation: float) -> Float[np.ndarray, "layouts points 2"]:
-    """LAYOUTS times as many points within ±radius, any two of one layout further apart than `separation`.
+    """LAYOUTS layouts of `points` points within ±radius. The points of a layout are further apart than `separation`.
 
-    Always the same ones. A layout is a uniform choice among the points of a sample that has enough of them.
+    The result is always the same. A layout is a uniform choice among the points of a sample that has enough points.
     """
     random = np.random.default_rng(0)
     kept: list[np.ndarray] = []
     while sum(map(len, kept)) < LAYOUTS:
         samples = poisson_discs(random, LAYOUTS // 2, 2 * radius, separation)
-        # A random order of the points, those that are not there last.
+        # A random order of the points, with the missing points last.
         rank = np.where(np.isinf(samples[..., 0]), np.inf, random.random(samples.shape[:2]))
         chosen = np.argsort(rank, axis=1)[:, :points]
         chosen = np.take_along_axis(samples, chosen[..., None], axis=1)
@@ -32,13 +32,13 @@ def layouts(points: int, radius: float, separation: float) -> Float[np.ndarray, 
 def poisson_discs(
     random: np.random.Generator, samples: int, side: float, separation: float
 ) -> Float[np.ndarray, "samples most 2"]:
-    """As many samples of a square (0, side)^2, in lockstep; `inf` where a sample has no more points.
+    """Poisson disc samples of a square (0, side)^2, computed in lockstep. Missing points of smaller samples are `inf`.
 
-    Bridson's algorithm: from a first point that is uniform in the square, take an active point at random, try
-    CANDIDATES points uniform in the ring of separation to 2 * separation around it, keep those that are further than
-    `separation` from all points there are, make these active and it inactive; until none is active.
+    Bridson's algorithm starts with one active point, uniform in the square. It then chooses an active point at random and tries
+    CANDIDATES points, uniform in the ring of separation to 2 * separation around it. Those that are further than `separation`
+    from all existing points are added and become active; the chosen point becomes inactive. It ends if no point is active.
     """
-    # Discs of half the separation do not overlap, and lie in a square that is larger by one of them.
+    # Discs with a radius of half the separation do not overlap, and lie within a square of side + separation.
     most = int((side + separation) ** 2 / (np.pi * separation**2 / 4))
     points = np.full((samples, most, 2), np.inf)
     points[:, 0] = side * random.random((samples, 2))

@@ -1,4 +1,4 @@
-"""Cooperative navigation: n agents shall reach n landmarks without colliding.
+"""Cooperative navigation: n agents should reach n landmarks without colliding.
 
     r_i = -min_l |x_i - x_l| - #{j != i: |x_i - x_j| < 2 * AGENT}
 
@@ -25,13 +25,13 @@ SENSITIVITY = 5.0
 SEPARATION = 4.5 * AGENT
 """Landmarks are further apart than this."""
 SEEN_LANDMARKS, SEEN_AGENTS = 6, 5
-"""How many of the nearest an agent sees."""
+"""The numbers of nearest landmarks and nearest agents that an agent sees."""
 
 
 @dataclass(frozen=True)
 class Size:
     agents: int
-    """There are as many landmarks."""
+    """Also the number of landmarks."""
     radius: float
 
     @property
@@ -65,7 +65,7 @@ def navigation(name: str) -> ParticleTask:
 
 
 def world(size: Size) -> World:
-    """Agents push each other; landmarks are places, not bodies."""
+    """Agents push each other. Landmarks do not collide with anything."""
     n = size.agents
     return World(
         size=np.array([AGENT] * n + [LANDMARK] * n, np.float32),
@@ -78,7 +78,7 @@ def world(size: Size) -> World:
 
 
 def reset(size: Size, key: PRNGKeyArray) -> State:
-    """Agents uniform in the square, landmarks on one of the layouts."""
+    """Agents start uniformly in the square, landmarks are at the points of a random layout."""
     agents_key, landmarks_key = jax.random.split(key)
     agents = jax.random.uniform(agents_key, (size.agents, 2), minval=-size.radius, maxval=size.radius)
     places = jnp.asarray(layouts(size.agents, size.radius, SEPARATION))
@@ -87,7 +87,7 @@ def reset(size: Size, key: PRNGKeyArray) -> State:
 
 
 def observe(size: Size, state: State) -> Float[Array, "agents observation"]:
-    """Own velocity and position, the nearest landmarks, the nearest other agents."""
+    """Each agent's own velocity and position, the nearest landmarks, and the nearest other agents."""
     landmarks = nearest(state.position, size.team, size.landmarks, SEEN_LANDMARKS)
     others = nearest(state.position, size.team, size.team, SEEN_AGENTS)
     return rows(

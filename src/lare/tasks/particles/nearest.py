@@ -1,4 +1,4 @@
-"""What an agent sees of others: where they are as seen from it, the nearest first."""
+"""An agent's view of other entities: their relative positions, nearest first."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 def distances(
     position: Float[Array, "entities 2"], observers: range, others: range
 ) -> Float[Array, "observers others"]:
-    """From the centre of each observer to that of each other one; infinite from an entity to itself."""
+    """The distances between the centres of observers and other entities; infinite from an entity to itself."""
     offset = span(position, others) - span(position, observers)[:, None]
     return jnp.where(same(observers, others), jnp.inf, jnp.sqrt(jnp.sum(offset**2, axis=-1)))
 
@@ -17,7 +17,7 @@ def distances(
 def nearest(
     position: Float[Array, "entities 2"], observers: range, others: range, count: int
 ) -> Int[Array, "observers count"]:
-    """The `count` others that are nearest to each observer, nearest first, by their numbers among all entities."""
+    """The indices of the `count` entities of `others` that are nearest to each observer, nearest first."""
     _, index = jax.lax.top_k(-distances(position, observers, others), count)
     return others.start + index
 
@@ -25,17 +25,17 @@ def nearest(
 def relative(
     position: Float[Array, "entities 2"], observers: range, seen: Int[Array, "observers count"]
 ) -> Float[Array, "observers count 2"]:
-    """The positions of those seen, less the observer's own."""
+    """The positions of the seen entities, minus the observer's own position."""
     return position[seen] - span(position, observers)[:, None]
 
 
 def span(values: Float[Array, "entities 2"], entities: range) -> Float[Array, "some 2"]:
-    """The rows of a stretch of entities."""
+    """The rows of a range of entities."""
     return values[entities.start : entities.stop]
 
 
 def same(observers: range, others: range) -> np.ndarray:
-    """Where observer and other are one entity."""
+    """Where observer and other are the same entity."""
     return np.asarray(observers)[:, None] == np.asarray(others)
 
 

@@ -1,4 +1,4 @@
-"""The particle tasks for PettingZoo, whose learners step one world at a time on the host."""
+"""The particle tasks as PettingZoo environments, for libraries that step one environment at a time on the host."""
 
 from copy import deepcopy
 from functools import partial
@@ -39,7 +39,7 @@ def advance(
 class ParticleEnv(ParallelEnv[str, Any, Any]):
     """A particle task as a PettingZoo environment, with individual rewards.
 
-    Agents are called after their team and numbered within it: `agent_0`, or `predator_0` and `prey_0`.
+    An agent's name consists of its team and its number within the team: `agent_0`, or `predator_0` and `prey_0`.
 
     >>> environment = ParticleEnv("CN-6")
     >>> observations, _ = environment.reset(seed=0)
@@ -59,7 +59,7 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
             f"{team.name}_{number}" for team in self.task.teams for number in range(team.stop - team.start)
         ]
         view, moves = Box(-np.inf, np.inf, (self.task.observation_size,), np.float32), Discrete(ACTIONS)
-        # Each its own: a space has a generator of random numbers.
+        # Each agent needs its own space, because a space has its own random number generator.
         self.observation_spaces: dict[str, Space[Any]] = {agent: deepcopy(view) for agent in self.possible_agents}
         self.action_spaces: dict[str, Space[Any]] = {agent: deepcopy(moves) for agent in self.possible_agents}
         self.agents: list[str] = []
@@ -75,7 +75,7 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
-        """Start an episode; with a seed, always the same one. Options are not looked at."""
+        """Start an episode. The same seed gives the same episode. Options are ignored."""
         if seed is not None:
             self.key = jax.random.key(seed)
         self.current, observation = start(self.task, self.next_key())
@@ -115,7 +115,7 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
         return np.concatenate([np.asarray(part).ravel() for part in self.now()])
 
     def now(self) -> State:
-        """The state of the world. Raises `LareError` where there is none yet."""
+        """The state of the world. Raises `LareError` before the first reset."""
         if self.current is None:
             raise LareError("there is no episode yet: reset the environment first")
         return self.current

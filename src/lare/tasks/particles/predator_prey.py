@@ -1,4 +1,4 @@
-"""Predator and prey: slow predators shall catch fast preys between obstacles.
+"""Predator and prey: slow predators should catch fast preys between obstacles.
 
     predator:  r_i = -0.1 * min_j |x_i - p_j| + 10 * #{j: |x_i - p_j| < PREDATOR + PREY}
     prey:      r_j = -10 * #{i: |x_i - p_j| < PREDATOR + PREY}
@@ -24,15 +24,15 @@ from lare.tasks.particles.world import State, World, at_rest
 PREDATOR_SENSITIVITY, PREY_SENSITIVITY = 3.0, 4.0
 PREDATOR_SPEED, PREY_SPEED = 1.0, 1.3
 CATCH = 10.0
-"""What a predator earns, and a prey loses, by each touch and step."""
+"""The reward of a predator, and the loss of a prey, for each touch in a step."""
 DISTANCE_WEIGHT = 0.1
 MARGIN = 0.1
-"""Obstacles lie that far within the square in which all others start."""
+"""Obstacles keep this distance from the border of the square in which all other entities start."""
 
 
 @dataclass(frozen=True)
 class Sees:
-    """How many of the nearest of each kind an agent sees."""
+    """The number of nearest entities of each kind that an agent sees."""
 
     landmarks: int
     predators: int
@@ -45,7 +45,7 @@ class Sees:
 
 @dataclass(frozen=True)
 class Size:
-    """Numbers of entities, radii, and what is seen."""
+    """Numbers of entities, their radii, and the numbers of entities that agents see."""
 
     predators: int
     preys: int
@@ -79,7 +79,7 @@ COMPETITIVE = Size(6, 2, 3, 1.5, 0.075, 0.05, 0.2, Sees(3, 5, 1), Sees(3, 5, 1))
 
 
 def predator_prey(name: str) -> ParticleTask:
-    """The predators learn."""
+    """The task in which only the predators learn."""
     size = SIZES[name]
     return ParticleTask(
         name=name,
@@ -95,7 +95,7 @@ def predator_prey(name: str) -> ParticleTask:
 
 
 def competitive() -> ParticleTask:
-    """Predators and preys learn. They see equally many numbers, so that one network can serve both."""
+    """The task in which predators and preys learn. Their observations have the same size, so that one network can serve both."""
     size = COMPETITIVE
     return ParticleTask(
         name="CompetitivePP-6",
@@ -110,9 +110,9 @@ def competitive() -> ParticleTask:
 
 
 def world(size: Size) -> World:
-    """All collide, and all pairs from the distance on at which two predators touch: that is how these tasks are defined.
+    """All entities collide, and all pairs at the distance at which two predators touch: so the published tasks are defined.
 
-    So obstacles are passed more closely than they are drawn, and a catch means to push a little way into a prey.
+    Entities can thus overlap the drawn obstacles, and a predator must push slightly into a prey to catch it.
     """
     moving, entities = size.hunted.stop, size.obstacles.stop
     kinds = [size.predators, size.preys]
@@ -127,7 +127,7 @@ def world(size: Size) -> World:
 
 
 def reset(size: Size, key: PRNGKeyArray) -> State:
-    """Everything uniform in its square; overlaps may happen."""
+    """All entities start uniformly in their squares, and may overlap."""
     reach = jnp.array([size.radius] * size.hunted.stop + [size.radius - MARGIN] * size.landmarks)
     return at_rest(reach[:, None] * jax.random.uniform(key, (len(reach), 2), minval=-1, maxval=1))
 
@@ -141,7 +141,7 @@ def observe_preys(size: Size, state: State) -> Float[Array, "preys observation"]
 
 
 def observe(size: Size, state: State, observers: range, sees: Sees) -> Float[Array, "observers observation"]:
-    """Own velocity and position; the nearest obstacles, predators, preys, none of them oneself; these preys' velocities."""
+    """Each observer's velocity and position; the nearest obstacles, other predators and other preys; these preys' velocities."""
     position = state.position
     preys = nearest(position, observers, size.hunted, sees.preys)
     return rows(
@@ -174,7 +174,9 @@ def flee(size: Size, layers: Layers, state: State, key: PRNGKeyArray) -> Int[Arr
 
 
 def chase(size: Size, state: State) -> Int[Array, " predators"]:
-    """The actions of greedy predators: along the axis on which the nearest prey is further away. A yardstick for preys."""
+    """The actions of greedy predators, which are used to evaluate preys. They move along the axis on which the nearest prey is
+    further away.
+    """
     prey = nearest(state.position, size.hunters, size.hunted, 1)
     x, y = jnp.moveaxis(relative(state.position, size.hunters, prey)[:, 0], -1, 0)
     return jnp.where(jnp.abs(x) > jnp.abs(y), jnp.where(x > 0, 2, 1), jnp.where(y > 0, 4, 3))

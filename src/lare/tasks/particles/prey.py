@@ -1,6 +1,6 @@
 """The scripted prey of predator and prey: a small policy network that ships with the package.
 
-logits = W_3 relu(W_2 relu(W_1 observation)), an action drawn from their softmax. `benchmarks/train_prey.py` trained it.
+logits = W_3 relu(W_2 relu(W_1 observation)), and an action is drawn from their softmax. `benchmarks/train_prey.py` trained it.
 """
 
 from functools import cache
@@ -16,7 +16,7 @@ Layers = tuple[tuple[Float[np.ndarray | Array, "_in _out"], Float[np.ndarray | A
 
 @cache
 def shipped_prey() -> Layers:
-    """The prey of the three sizes."""
+    """The prey's network, which is the same for PP-6, PP-15 and PP-30."""
     with files("lare.tasks.particles").joinpath("prey.npz").open("rb") as file, np.load(file) as arrays:
         return tuple((arrays[f"weight_{i}"], arrays[f"bias_{i}"]) for i in range(len(arrays) // 2))
 

@@ -20,7 +20,7 @@ def find_particle_task(name: str) -> ParticleTask:
     """The task of that name.
 
     Raises:
-        LareError: there is none; the message lists those there are.
+        LareError: no task has this name; the message lists all names.
     """
     if name in TASKS:
         return TASKS[name]

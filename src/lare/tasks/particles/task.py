@@ -1,4 +1,4 @@
-"""What a particle task is: a world, and pure functions on its states that know nothing of batches."""
+"""The definition of a particle task: a world, and pure functions on single states, without a batch axis."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,16 +10,16 @@ from lare.tasks.env import Team
 from lare.tasks.particles.world import State, World, move, push
 
 STEPS = 25
-"""Length of every episode. Nothing ends one earlier."""
+"""The length of every episode. No episode ends earlier."""
 ACTIONS = 5
 """Stay, left (-x), right (+x), down (-y), up (+y)."""
 
 
 @dataclass(frozen=True, eq=False)
 class ParticleTask:
-    """A task. Its functions may be compiled and mapped over states, actions and keys.
+    """A task. Its functions can be compiled and mapped over states, actions and keys.
 
-    The learning agents are the first entities of its world; entities that also move follow a script.
+    The learning agents are the first entities of its world. Other moving entities follow a script.
 
     >>> import jax
     >>> from lare.tasks.particles.table import find_particle_task
@@ -35,22 +35,22 @@ class ParticleTask:
     """All learning agents, in order."""
     observation_size: int
     radius: float
-    """Agents start within ±radius; nothing keeps them there."""
+    """Agents start within ±radius, but may leave this square."""
     world: World
     reset: Callable[[PRNGKeyArray], State]
-    """A state to start from."""
+    """The first state of an episode."""
     observe: Callable[[State], Float[Array, "agents observation"]]
-    """What each learning agent sees of a state."""
+    """Each learning agent's observation of a state."""
     reward: Callable[[State], Float[Array, " agents"]]
-    """What each learning agent earns by a step that led to this state."""
+    """Each learning agent's reward for a step that led to this state."""
     script: Callable[[State, PRNGKeyArray], Int[Array, " scripted"]] = lambda state, key: jnp.zeros(0, int)
-    """The actions of those that move but do not learn."""
+    """The actions of entities that move but do not learn."""
 
     @property
     def agents(self) -> int:
         return self.teams[-1].stop
 
     def step(self, state: State, action: Int[Array, " agents"], key: PRNGKeyArray) -> State:
-        """All act at once. The key is for the script; a task without one makes no use of it."""
+        """All agents act at once. The key is only used by the script."""
         every = jnp.concatenate([action, self.script(state, key)])
         return move(self.world, state, push(self.world, every))

@@ -1,9 +1,9 @@
-"""Triangle area: three agents shall span a large triangle and keep off three obstacles.
+"""Triangle area: three agents should form a large triangle and avoid three obstacles.
 
     R = sum_i (0.1 * area - #{l: |x_i - x_l| < AGENT + OBSTACLE})       the same for every agent
 
-after `simple_area` of LaRe. The area is half the cross product of two sides, where the published code takes Heron's
-formula, which rounding can bring to the root of a negative number.
+after `simple_area` of LaRe. The area is half the cross product of two sides. The published code uses Heron's formula, which may
+take the root of a negative number because of rounding.
 """
 
 import jax
@@ -40,7 +40,7 @@ def triangle_area() -> ParticleTask:
 
 
 def world() -> World:
-    """Agents and obstacles push where they touch."""
+    """Agents and obstacles push each other when they touch."""
     size = np.array([AGENT] * len(AGENTS) + [OBSTACLE] * len(OBSTACLES), np.float32)
     return World(
         size=size,
@@ -53,13 +53,13 @@ def world() -> World:
 
 
 def reset(key: PRNGKeyArray) -> State:
-    """An obstacle may lie on the agents, which then starts with a push."""
+    """An obstacle may overlap the agents at the start, and then pushes them away."""
     reach = jnp.array([START] * len(AGENTS) + [RADIUS] * len(OBSTACLES))
     return at_rest(reach[:, None] * jax.random.uniform(key, (len(reach), 2), minval=-1, maxval=1))
 
 
 def observe(state: State) -> Float[Array, "agents observation"]:
-    """Own velocity and position; the obstacles, always in the same order; the two others, by x and then by y."""
+    """Each agent's own velocity and position; the obstacles, in a fixed order; the two other agents, sorted by x and then y."""
     agents = span(state.position, AGENTS)
     obstacles = jnp.broadcast_to(jnp.array(OBSTACLES), (len(AGENTS), len(OBSTACLES)))
     others = jnp.array([[j for j in AGENTS if j != i] for i in AGENTS])

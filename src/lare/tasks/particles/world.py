@@ -1,14 +1,14 @@
 """The physics of the particle tasks: discs of mass 1 in a plane without walls (Lowe et al., MADDPG, 2017).
 
     F = sensitivity * direction + sum of contact forces
-    v <- (1 - DAMPING) v + TIME_STEP * F                  then shortened to max_speed
+    v <- (1 - DAMPING) v + TIME_STEP * F                  then scaled down to at most max_speed
     x <- x + TIME_STEP * v                                with the new velocity
 
 and, for two discs that collide, d apart, x_a - x_b = d * n,
 
     contact force on a = CONTACT_FORCE * CONTACT_MARGIN * log(1 + exp((d_min - d) / CONTACT_MARGIN)) * n
 
-which is CONTACT_FORCE * (d_min - d) where d < d_min, and next to nothing where they do not touch.
+which is close to CONTACT_FORCE * (d_min - d) if d < d_min, and close to 0 if they do not touch.
 """
 
 from dataclasses import dataclass
@@ -20,35 +20,35 @@ from jaxtyping import Array, Float, Int
 
 TIME_STEP = 0.1
 DAMPING = 0.25
-"""The share of its velocity that everything loses in a step."""
+"""The share of its velocity that each entity loses in a step."""
 CONTACT_FORCE = 100.0
 """Force for each unit of length by which two discs overlap."""
 CONTACT_MARGIN = 1e-3
-"""How softly contact sets in, as a length."""
+"""The distance over which the contact force sets in."""
 
 DIRECTIONS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)], np.float32)
-"""What the five actions push towards: nowhere, left, right, down, up."""
+"""The directions of the five actions: none, left, right, down, up."""
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What never changes. The first `moving` entities are agents and preys, the others landmarks, which stay."""
+    """The constants of a world. The first `moving` entities are agents and preys; the others are landmarks, which do not move."""
 
     size: Float[np.ndarray, " entities"]
     """Radii."""
     moving: int
     colliding: int
-    """The first so many entities push each other away: those that move, or all."""
+    """This many entities, from the first on, push each other away: the moving ones, or all."""
     sensitivity: Float[np.ndarray, " moving"]
     """The force of an action."""
     max_speed: Float[np.ndarray, " moving"]
-    """`inf` where there is no limit."""
+    """`inf` if there is no limit."""
     contact: Float[np.ndarray, "colliding colliding"]
-    """d_min: the distance of two centres below which they push."""
+    """d_min: the distance between two centres below which the entities push each other."""
 
 
 class State(NamedTuple):
-    """What a step changes."""
+    """The part of a world that a step changes."""
 
     position: Float[Array, "entities 2"]
     velocity: Float[Array, "entities 2"]
@@ -59,12 +59,12 @@ def at_rest(position: Float[Array, "entities 2"]) -> State:
 
 
 def push(world: World, action: Int[Array, " moving"]) -> Float[Array, "moving 2"]:
-    """The force by which each entity moves itself."""
+    """The force that each entity's own action applies to it."""
     return jnp.asarray(world.sensitivity)[:, None] * jnp.asarray(DIRECTIONS)[action]
 
 
 def contact_force(world: World, position: Float[Array, "entities 2"]) -> Float[Array, "moving 2"]:
-    """What all others push each moving entity with. Two centres in one place have no direction to part in: no force."""
+    """The sum of contact forces on each moving entity. Two entities with the same centre have no direction, and so no force."""
     bodies = position[: world.colliding]
     offset = bodies[: world.moving, None] - bodies
     distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
@@ -75,7 +75,7 @@ def contact_force(world: World, position: Float[Array, "entities 2"]) -> Float[A
 
 
 def move(world: World, state: State, force: Float[Array, "moving 2"]) -> State:
-    """One step of TIME_STEP. The contact forces are those of the positions before it."""
+    """One step of TIME_STEP. The contact forces are computed from the positions before it."""
     force = force + contact_force(world, state.position)
     velocity = (1 - DAMPING) * state.velocity[: world.moving] + TIME_STEP * force
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1))

@@ -1,9 +1,9 @@
-"""Battles of two small armies in JAX, after SMAX: see `scenarios.py` for who fights, `battle.py` for how.
+"""Battles of two small armies in JAX, after SMAX. `scenarios.py` defines the armies, `battle.py` the rules.
 
-Only names stand here: who lists tasks, or verifies a function, need not wait for JAX.
+This module contains only names, so that listing tasks and verifying functions do not import JAX.
 """
 
 NAMESPACE = "smax/"
-"""What the environment of such a task's spec begins with; the rest is its name in `scenarios.py`."""
+"""The prefix of such environments in a spec. The rest is a name in `scenarios.py`."""
 
 NAMES = ("2s3z", "3s_vs_5z", "1c3s5z")

@@ -1,4 +1,4 @@
-"""Pictures of battles: a state, and an episode as a film."""
+"""Pictures of battles: of a state, and of all steps of an episode."""
 
 from operator import itemgetter
 
@@ -18,7 +18,7 @@ OURS, THEIRS, FALLEN = "#0072b2", "#d55e00", "#bbbbbb"
 
 
 def draw(env: SMAX, state: State, before: State | None = None, credit: float | None = None) -> Figure:
-    """A state: each unit a disc, filled as far as it is in health. From that before it, lines say who hit whom in between."""
+    """A state. Each unit is a disc, filled in proportion to its health. With the state `before`, lines show the hits."""
     figure, axes = blank()
     last = None if before is None else before.battle
     paint(axes, env.scenario, state.battle, last, credit)
@@ -31,9 +31,9 @@ def frames(
     """An episode as pictures.
 
     Args:
-        env: what was played.
-        states: one for each picture, on a leading axis.
-        credit: of the step that led to each of them, shown as a number.
+        env: the environment.
+        states: one state for each picture, along a leading axis.
+        credit: for each state, the credit of the step that led to it. It is shown as a number.
     """
     figure, axes = blank()
     battles = jax.tree.map(np.asarray, states.battle)
@@ -54,7 +54,7 @@ def paint(axes: Axes, scenario: Scenario, battle: Battle, before: Battle | None,
     lives = np.asarray(battle.health > 0)
     share = np.asarray(battle.health) / scenario.each("health")
     names = (*scenario.ours, *scenario.theirs)
-    for unit in np.argsort(lives, kind="stable"):  # the dead below
+    for unit in np.argsort(lives, kind="stable"):  # dead units are drawn first, below the others
         x, y = map(float, battle.position[unit])
         if not lives[unit]:
             axes.plot(x, y, marker="x", color=FALLEN, markersize=5)
@@ -71,7 +71,7 @@ def paint(axes: Axes, scenario: Scenario, battle: Battle, before: Battle | None,
 
 
 def shots(scenario: Scenario, battle: Battle, before: Battle) -> list[tuple[int, int]]:
-    """Who hit whom in a step: those whose cooldowns rose, for without a hit they fall."""
+    """Pairs (unit, the unit that it hit) of a step. A unit has hit if its cooldown rose; without a hit, cooldowns fall."""
     place = np.asarray(battle.action) - ATTACK
     hit = np.where(scenario.enemy == 1, scenario.allies - 1 - place, scenario.allies + place)
     fired = np.asarray(battle.cooldown) > np.asarray(before.cooldown)

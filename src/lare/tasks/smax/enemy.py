@@ -1,8 +1,9 @@
 """The scripted enemy: JaxMARL's heuristic (`heuristic_enemy.py`, attack_mode "closest"), unit by unit.
 
-A unit attacks. It keeps to whom it attacked in the step before, where that one still lives and is in reach; else it takes the
-closest in reach. With nobody in reach it walks towards one of those it sees, drawn anew in each step, or else towards
-the mirror image of its own start in the middle of the field. It walks along the axis on which that is further away.
+A unit attacks if it can. It prefers the unit that it attacked in the previous step, if that unit is alive and in reach; else it
+attacks the closest unit in reach. If no unit is in reach, it walks towards a random one that it sees, drawn anew in each step. If
+it sees none, it walks towards the point reflection of its own start through the centre of the field. It walks along the axis on
+which the goal is further away.
 """
 
 from typing import NamedTuple
@@ -16,22 +17,22 @@ from lare.tasks.smax.scenarios import Scenario
 
 
 class Memory(NamedTuple):
-    """What each enemy unit keeps in mind."""
+    """The memory of each enemy unit."""
 
     goal: Float[Array, "enemies 2"]
-    """Where it walks as long as it sees nobody."""
+    """The point that it walks to while it sees no unit."""
     attacked: Int[Array, " enemies"]
-    """Which of our units it attacked in the step before, or -1."""
+    """The unit of ours that it attacked in the previous step, or -1."""
 
 
 def remember(scenario: Scenario, battle: Battle) -> Memory:
-    """At the start of a battle."""
+    """The memory at the start of a battle."""
     goal = FIELD - battle.position[scenario.allies :]
     return Memory(goal, jnp.full(scenario.enemies, -1, jnp.int32))
 
 
 def act(scenario: Scenario, battle: Battle, memory: Memory, key: PRNGKeyArray) -> tuple[Int[Array, " enemies"], Memory]:
-    """What each enemy unit chooses. It counts our units from the last to the first."""
+    """The choice of each enemy unit. Its attack choices count our units from the last to the first."""
     allies = scenario.allies
     reach, sight = scenario.each("reach")[allies:, None], scenario.each("sight")[allies:, None]
     lives = alive(battle)

@@ -1,8 +1,8 @@
-"""SMAX: StarCraft-like battles (Rutherford et al., JaxMARL, 2024) in JAX, as training meets them.
+"""SMAX: StarCraft-like battles (Rutherford et al., JaxMARL, 2024) in JAX, as a `JaxEnv`.
 
     reward = 10 * (sum of the enemy's health lost in the step, as shares, / enemies + 1 if the step won the battle)
 
-which is 10 times SMAX's own, so that the most an episode can pay is 20, as in SMAC (Samvelyan et al., 2019).
+which is 10 times the reward of SMAX, so that the largest return of an episode is 20, as in SMAC (Samvelyan et al., 2019).
 """
 
 from typing import NamedTuple
@@ -19,21 +19,21 @@ from lare.tasks.smax.observation import field, observation_size, observe, state_
 from lare.tasks.smax.scenarios import Scenario, find_scenario
 
 MOST = 20.0
-"""What an episode pays that is won."""
+"""The return of an episode that is won."""
 
 
 class State(NamedTuple):
-    """A battle, and what the enemy keeps in mind."""
+    """A battle, and the enemy's memory."""
 
     battle: Battle
     memory: Memory
 
 
 class SMAX:
-    """A battle in which we choose for all units of one side. A `JaxEnv`.
+    """A battle in which the agents are the units of one side. A `JaxEnv`.
 
-    The choices are up, right, down, left, stop, and to attack each of the enemy's units; one that is not available does nothing.
-    A unit that dies leaves. The living are all paid the same: what the side as a whole has earned.
+    The choices are up, right, down, left, stop, and one attack for each enemy unit. A choice that is not available does nothing.
+    A unit that dies leaves. All living units receive the same reward: the reward of their side.
 
     >>> env = SMAX("2s3z")
     >>> state, seen = env.reset(jax.random.key(0))
@@ -61,12 +61,12 @@ class SMAX:
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[State, Timestep]:
-        """Both armies at full health."""
+        """Start a battle. Both armies have full health."""
         battle = start(self.scenario, key)
         return State(battle, remember(self.scenario, battle)), self.show(battle, jnp.zeros(self.scenario.allies))
 
     def step(self, state: State, action: Float[Array, "agents action"], key: PRNGKeyArray) -> tuple[State, Timestep]:
-        """Both sides choose, from the same state, and the battle goes on for half a second."""
+        """Both sides choose from the same state, and the battle continues for half a second."""
         enemy_key, battle_key = jax.random.split(key)
         theirs, memory = act(self.scenario, state.battle, state.memory, enemy_key)
         ours = jnp.argmax(action, axis=1).astype(jnp.int32)
@@ -78,7 +78,7 @@ class SMAX:
         )
 
     def show(self, battle: Battle, paid: Float[Array, " agents"]) -> Timestep:
-        """What is seen of a battle after a step that paid so much."""
+        """The timestep of a battle after a step with the given rewards."""
         ours, theirs = defeated(self.scenario, battle)
         return Timestep(
             observation=observe(self.scenario, battle),
@@ -97,13 +97,13 @@ class SMAX:
         """An episode as pictures."""
         from lare.tasks.smax.drawing import frames
 
-        if credit is not None:  # the living are all paid the same, the dead nothing
+        if credit is not None:  # all living units have the same credit, dead units none
             credit = np.take_along_axis(credit, np.abs(credit).argmax(axis=1)[:, None], axis=1)[:, 0]
         return frames(self, states, credit)
 
 
 def reward(scenario: Scenario, before: Battle, after: Battle) -> Float[Array, ""]:
-    """What a step has earned our side. Who goes on after a win is not paid for it again."""
+    """The reward of our side for a step. The win is only paid once, even if the battle is continued after it."""
     lost = (before.health - after.health) / scenario.each("health")
     harm = jnp.sum(lost[scenario.allies :]) / scenario.enemies
     return MOST / 2 * (harm + (won(scenario, after) & ~won(scenario, before)))

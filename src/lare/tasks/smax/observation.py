@@ -1,4 +1,4 @@
-"""What is seen of a battle: by each of our units, and of the whole field. Both are laid out as in JaxMARL's SMAX."""
+"""The observations of our units, and the global state of a battle. Both have the layout of JaxMARL's SMAX."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,11 +21,11 @@ def one_hot_unit_types(scenario: Scenario) -> Float[np.ndarray, "units unit_type
 
 
 def observe(scenario: Scenario, battle: Battle) -> Float[Array, "allies observation"]:
-    """What each of our units sees: the others one by one, ours first, and then itself.
+    """The observation of each of our units: all other units one by one, ours first, and then the unit itself.
 
-    Of another: health as a share, offset in units of the own sight (x, y), its last move (x, y), its last attack as a share of
-    its choices (0 for none), cooldown as a share between 0 and 1, type as one-hot; zeros for who is dead or not in sight.
-    Of itself: health, position as a share of the field (x, y), cooldown, type. The dead observe zeros.
+    For another unit: health as a share, offset in units of the observer's sight (x, y), its last move (x, y), its last attack as a
+    share of its choices (0 for none), cooldown as a share between 0 and 1, type as one-hot; zeros if it is dead or not in sight.
+    For the unit itself: health, position as a share of the field (x, y), cooldown, type. Dead units observe zeros.
     """
     allies, units = scenario.allies, scenario.units
     lives, unit_types = alive(battle), one_hot_unit_types(scenario)
@@ -34,7 +34,7 @@ def observe(scenario: Scenario, battle: Battle) -> Float[Array, "allies observat
     last_choice = ATTACK - 1 + np.where(scenario.enemy == 1, allies, scenario.enemies).astype(np.float32)
     attack = (jnp.where(battle.action >= ATTACK, battle.action, 0) / last_choice)[:, None]
 
-    # Offsets differ from observer to observer; all else of a unit looks the same to everybody.
+    # Offsets differ between observers; all other values of a unit are the same for every observer.
     offset = battle.position - battle.position[:allies, None]
     sight = scenario.each("sight")[:allies, None]
     seen = (jnp.sqrt(jnp.sum(offset**2, axis=-1)) < sight) & lives[:allies, None] & lives
@@ -42,7 +42,7 @@ def observe(scenario: Scenario, battle: Battle) -> Float[Array, "allies observat
     parts = [health[None], offset / sight[..., None], rest[None]]
     others = jnp.concatenate([jnp.broadcast_to(part, (allies, units, part.shape[-1])) for part in parts], axis=2)
     others = jnp.where(seen[..., None], others, 0)
-    # Everybody but oneself: those before one, and from there on the next.
+    # Leave out the observer itself: its place and all later places hold the next unit.
     before = np.arange(units - 1) < np.arange(allies)[:, None]
     others = jnp.where(before[..., None], others[:, :-1], others[:, 1:])
 
@@ -52,10 +52,10 @@ def observe(scenario: Scenario, battle: Battle) -> Float[Array, "allies observat
 
 
 def field(scenario: Scenario, battle: Battle) -> Float[Array, " state"]:
-    """The state of the whole field.
+    """The global state.
 
-    Of each unit: health as a share, position (x, y), cooldown in seconds, type as one-hot, all zeros once it is dead. Then the side
-    of each unit, 1 for the enemy's, and each one's type as a number.
+    For each unit: health as a share, position (x, y), cooldown in seconds, type as one-hot; all are zeros once it is dead. Then the
+    side of each unit (1 for the enemy's), and the type of each unit as a number.
     """
     parts = [
         (battle.health / scenario.each("health"))[:, None],

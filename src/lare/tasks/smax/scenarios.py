@@ -1,8 +1,8 @@
-"""Who fights: the types of units, and the armies of each battle.
+"""The types of units, and the armies of each battle.
 
-All figures but the colossus's are the defaults of SMAX in JaxMARL 0.2.0 (Rutherford et al., 2024; `smax_env.py`,
-Apache-2.0); shields count as health there. JaxMARL has no colossus. Ours has StarCraft II's health (200, and a shield of
-150), its two attacks of 10 as one of 20, its range, cooldown and speed; its beam hits its target alone.
+All figures except those of the colossus are the defaults of SMAX in JaxMARL 0.2.0 (Rutherford et al., 2024; `smax_env.py`,
+Apache-2.0), where shields count as health. JaxMARL has no colossus. Its figures here are those of StarCraft II: health (200, and
+a shield of 150), range, cooldown and speed. Its two attacks of 10 are one attack of 20, which hits only the target.
 """
 
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ from lare.tasks.smax import NAMES
 
 
 class UnitType(NamedTuple):
-    """What all units of a type have in common. Lengths are those of the field, times are seconds."""
+    """The figures of all units of a type. Lengths are in units of the field, times in seconds."""
 
     speed: float
     damage: float
     reach: float
-    """An attack hits what is nearer than that, centre to centre."""
+    """An attack hits a unit whose centre is nearer than this."""
     sight: float
     radius: float
     health: float
     cooldown: float
-    """From one attack to the next, on average a little more."""
+    """The time between two attacks, without the random addition."""
 
 
 UNIT_TYPES = {
@@ -39,20 +39,20 @@ UNIT_TYPES = {
     "hydralisk": UnitType(3.15, 12, 5, 9, 0.625, 80, 0.59),
     "colossus": UnitType(3.15, 20, 7, 10, 1.0, 350, 1.07),
 }
-"""In the order of their numbers in observations and states."""
+"""The order defines the types' numbers in observations and states."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A battle. Our units come first wherever units have an axis."""
+    """A battle. Along an axis of units, ours come first."""
 
     name: str
     ours: tuple[str, ...]
     theirs: tuple[str, ...]
     limit: int
-    """The most steps."""
+    """The most steps of an episode."""
     unit_types: int = 6
-    """How many types observations and states tell apart."""
+    """The number of types in the one-hot encoding of observations and states."""
 
     @property
     def allies(self) -> int:
@@ -94,14 +94,14 @@ SCENARIOS = {
         Scenario("1c3s5z", army(1, 3, 5), army(1, 3, 5), 180, unit_types=7),
     )
 }
-"""With the time limits that these battles have in SMAC."""
+"""The battles, with their time limits in SMAC."""
 
 
 def find_scenario(name: str) -> Scenario:
     """The battle of that name.
 
     Raises:
-        LareError: there is none; the message lists those there are.
+        LareError: no battle has this name; the message lists all names.
     """
     if name in SCENARIOS:
         return SCENARIOS[name]

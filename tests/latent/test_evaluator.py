@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lare.errors import LareError
-from lare.latent.function import Evaluator, LatentRewardError
+from lare.latent.evaluator import Evaluator, LatentRewardError
 from lare.latent.language.program import Program
 from lare.latent.sandbox.isolation import around
 from lare.latent.sandbox.jailed import ROWS, SIZES, WorkerFailed
@@ -85,7 +85,7 @@ def test_a_call_without_rows_has_none_to_compute_again(evaluator):
 
 
 SENTINEL = (
-    "the latent function failed: the same steps have other factors when they are judged again, in a smaller batch"
+    "the latent function failed: the same steps have different factors when they are computed again in a smaller batch"
 )
 
 
@@ -125,12 +125,12 @@ def test_a_program_meets_only_sizes_that_it_was_verified_with(evaluator, rows):
 
 def test_an_offset_hides_no_other_rows(evaluator):
     body = "return [1e4 + 0.4 * np.roll(np.tanh(observation[:, 0:1]), 2, axis=0)]"
-    with pytest.raises(LatentRewardError, match="have other factors when they are judged again"):
+    with pytest.raises(LatentRewardError, match="have different factors when they are computed again"):
         evaluator(phi(body), ("a",))(*batch(50))
 
 
 def test_a_large_factor_hides_no_small_one(evaluator):
-    with pytest.raises(LatentRewardError, match="have other factors when they are judged again"):
+    with pytest.raises(LatentRewardError, match="have different factors when they are computed again"):
         evaluator(phi("return [1e7 * observation[:, 0:1], action + (len(action) == 4)]"), ("a", "b"))(*batch(50))
 
 
@@ -190,7 +190,9 @@ def test_a_worker_that_was_killed_is_a_failure_with_its_batch(evaluator):
 def test_what_the_gate_refuses_is_never_at_work():
     with pytest.raises(LareError) as error:
         Evaluator(phi("return [np.load('x')]"), ["a"], 2, 1)
-    assert str(error.value).startswith("the latent function has no verdict: E-NUMPY line 2: np.load is not available: ")
+    assert str(error.value).startswith(
+        "the latent function does not pass the gate: E-NUMPY line 2: np.load is not available: "
+    )
 
 
 def test_isolation(near, layers):
