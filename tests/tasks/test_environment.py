@@ -66,3 +66,11 @@ def test_many_numbers_for_one_are_a_line_too():
         number(np.zeros(40), "the reward")
     assert "\n" not in str(error.value)
     assert str(error.value).endswith("..., which is no number")
+
+
+@pytest.mark.filterwarnings("ignore:.*render_mode")  # Gymnasium warns first
+def test_an_environment_that_cannot_be_filmed_is_one_line():
+    with pytest.raises(LareError) as error:
+        make("misfits/step-v0", render_mode="rgb_array")
+    assert str(error.value).startswith("environment 'misfits/step-v0' cannot be made: ")
+    assert str(error.value).endswith(' (to be filmed, it must accept render_mode="rgb_array")')

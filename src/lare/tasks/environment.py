@@ -95,6 +95,8 @@ def make(environment: str, max_episode_steps: int | None = None, **kwargs: Any) 
                 hint = f" (for an environment of your own, write MODULE:{environment}, where MODULE registers it)"
             if isinstance(error, ModuleNotFoundError):
                 hint = " (a module in this folder is found with PYTHONPATH=.)"
+            if "render_mode" in kwargs and "render_mode" in str(error):
+                hint = ' (to be filmed, it must accept render_mode="rgb_array")'
             raise fault(f"environment {environment!r} cannot be made", error, hint) from error
 
 
