@@ -38,6 +38,7 @@ $(VENV)/installed: pyproject.toml
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@
+	@echo "set up; to use it: source $(BIN)/activate"
 
 clean:
 	rm -rf $(VENV) site .pytest_cache .ruff_cache .hypothesis

@@ -86,7 +86,7 @@ def test_a_recording_is_not_overwritten(serve, command, tmp_path):
     server = serve(recorded_answers)
     status, _, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--record", "talk.json")
     assert status == 2
-    assert "lare: talk.json exists, and is not overwritten; choose another file" in err
+    assert "lare: talk.json exists, and is not overwritten; choose another --record" in err
     assert (tmp_path / "talk.json").read_text() == "mine"
 
 

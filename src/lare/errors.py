@@ -99,14 +99,18 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 def first_problem(error: ValidationError, known: Iterable[str] = ()) -> str:
     """The first problem that pydantic found, in one line, and the number of others. Unknown keys get a hint at `known` ones."""
+    names = tuple(known)
     # Unknown keys come first, because a misspelt key is also a missing one.
     problems = sorted(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
     where, what = ".".join(str(part) for part in first["loc"]), first["msg"].removeprefix("Value error, ")
     if first["type"] == "missing":
         said = f"the key {where!r} is missing"
+    elif first["type"] == "extra_forbidden" and where in names:
+        table, _, key = where.rpartition(".")
+        said = f"there is no key {where!r}: write {table}={{{key!r}: ...}}"
     elif first["type"] == "extra_forbidden":
-        said = f"there is no key {where!r}{did_you_mean(where, known)}"
+        said = f"there is no key {where!r}{did_you_mean(where, names)}"
     elif where:
         said = f"{where} = {shortened(first['input'])}: {what.lower()}"
     else:

@@ -104,7 +104,7 @@ def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):
         find_runs([tmp_path / "nothing"])
 
 
-RANGE = "the bootstrap's interval can only be their range, which holds the true mean in"
+RANGE = "the bootstrap's interval can only be their range, which holds the true median in"
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ RANGE = "the bootstrap's interval can only be their range, which holds the true 
         (
             ["Walker2d-v4", "Reacher-v4"],
             [[1.0, 2.0, 3.0]],
-            "Intervals of two or three seeds, or draws, are too narrow: they hold the true mean in less than 95 of 100 cases.",
+            "Intervals of two or three seeds, or draws, are too narrow: they hold the true median in less than 95 of 100 cases.",
         ),
     ],
 )
@@ -149,10 +149,34 @@ def test_the_interval_of_three_seeds_is_their_range(made):
     assert (row.iqm.low, row.iqm.high) == (1.0, 6.0)
 
 
+def test_a_probability_of_one_has_its_chance_beside_it(made):
+    """Two seeds above two others: one of the six ways to deal four numbers."""
+    runs = [made("a", [1.0, 2.0]), made("b", [3.0, 4.0], method="rd"), made("c", [0.0, 0.5], method="rrdu")]
+    first, better, worse = statistics.compare(by_label(runs)).rows
+    assert first.p is None
+    assert (str(better.better), better.p) == ("1.000", pytest.approx(1 / 6))
+    assert (str(worse.better), worse.p) == ("0.000", pytest.approx(1 / 6))
+    assert cells(statistics.compare(by_label(runs)))[1][-1] == "0.17"
+
+
+def test_a_run_that_is_given_twice_counts_once(made):
+    first, second = made("a", [1.0]), made("b", [2.0], method="rd")
+    found = find_runs([second.directory, first.directory.parent])
+    assert [run.directory for run in found] == [second.directory, first.directory]
+
+
+def test_a_table_is_not_a_run(tmp_path):
+    (tmp_path / "results.csv").touch()
+    with pytest.raises(
+        LareError, match=r"results.csv is not a run, and contains none; give the directory that it is in$"
+    ):
+        find_runs([tmp_path / "results.csv"])
+
+
 def test_single_seeds_have_no_intervals(made):
     compared = statistics.compare(by_label([made("a", [-347.3176]), made("b", [2.0], method="rd")]))
     assert cells(compared) == [
-        ("dense", "1", "1", "-347.3", "-347.3", "-", "-"),
-        ("rd", "1", "1", "2.000", "2.000", "-", "-"),
+        ("dense", "1", "1", "-347.3", "-347.3", "-", "-", "-"),
+        ("rd", "1", "1", "2.000", "2.000", "-", "-", "-"),
     ]
     assert what_scores_are(compared).endswith(" at step 100, the last at which all runs were evaluated.")

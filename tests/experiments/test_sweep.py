@@ -253,6 +253,7 @@ def test_how_a_process_ended(file, monkeypatch):
     [
         (("tasks", "task"), "there is no key 'task' (did you mean 'tasks'?) (and 1 more)"),
         (('"dense"', '"dence"'), "no method 'dence' (did you mean 'dense'?); the methods are "),
+        (("tasks = ", "seeds = 3\ntasks = "), "seeds is a setting: put it into the table [settings]"),
         (('["Reacher-v4"]', "[]"), "tasks = []: tuple should have at least 1 item after validation, not 0"),
         (("seeds = 2", "seed = -1"), "seed = -1: input should be greater than or equal to 0"),
         (("steps = 200", "steps = 201"), "steps = 201 is not a multiple of rollout_steps = 50: take 200"),

@@ -38,7 +38,7 @@ def said(returns, random=CHANCE, **facts):
             [
                 "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 0.816.",
                 "Its proxy rewards, from factors and raw features, explain next to nothing of the score: R² of the last returns, "
-                "before they were learned from, is 0.00.",
+                "before they were learned from, is -3.00.",
                 "Next: the score depends on something else. `lare design Toy --reflect 2 --model NAME` asks for another phi; "
                 "`--method bayes` needs no phi.",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
@@ -73,6 +73,26 @@ def said(returns, random=CHANCE, **facts):
                 "It got worse than random actions. The return is -949 after 8,000 steps; random actions get 0 ± 0.816.",
                 "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
+            ],
+        ),
+        (
+            np.vstack([FLAT - 50, FLAT - 50]),
+            {"return_r2": -0.93, "usual_r2": 0.98, "latent": True},
+            [
+                "It has not learned yet. The return is 1 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 0.816.",
+                "Its proxy rewards, from factors and raw features, usually explain the score (median R² of returns: 0.98), but not "
+                "the last episodes (R² -0.93): the policy has changed, and the decoder has to adapt.",
+                "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
+            ],
+        ),
+        (
+            np.vstack([FLAT - 50, [[0, 0, 38, 0, 1, 0, 1, 0]]]),
+            {},
+            [
+                "It has not learned yet. The return is 0.5 ± 0.707 after 8,000 steps (mean over 2 seeds); random actions get "
+                "0 ± 0.816.",
+                "Next: one seed was better than random actions at step 3,000 (38). `lare evaluate runs/x --best` plays the best "
+                "policy of each seed. To continue: more `--steps`, or another `--algorithm`.",
             ],
         ),
         (np.full((1, 8), np.nan), {}, ["Nothing can be said: the last evaluation gave no return."]),

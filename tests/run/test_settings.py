@@ -40,10 +40,17 @@ def test_options_of_the_decoder_are_checked(credit, message):
         Settings(credit=credit)
 
 
-def test_a_key_of_a_table_within_is_hinted_at():
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("gamma", "there is no key 'gamma' (did you mean 'td3.gamma'?)"),
+        ("td3.gamma", "there is no key 'td3.gamma': write td3={'gamma': ...}"),
+    ],
+)
+def test_a_key_of_a_table_within_is_hinted_at(key, message):
     with pytest.raises(LareError) as error:
-        Settings(gamma=0.9)
-    assert str(error.value) == "there is no key 'gamma' (did you mean 'td3.gamma'?)"
+        Settings(**{key: 0.9})
+    assert str(error.value) == message
 
 
 def test_tables_within_tables():

@@ -116,6 +116,7 @@ def test_a_run_is_explained(method, small, tmp_path):
     lines = explanation_of(run)
     assert any("of the variation of the returns of" in line for line in lines)
     assert ear.heard[-len(lines) :] == lines
+    assert (f"not the decoder of {method}" in lines[0]) == (method != "lare-bayes")
     assert ("The factors explain" in " ".join(lines)) == (method != "rrdu")
     assert "What the returns say" in lare.write_report([run.directory]).read_text()
 

@@ -72,7 +72,9 @@ def test_a_run_says_what_is_random_and_what_is_done_already(small, tmp_path):
     ]
     heard = At(-1, None)
     lare.train(toy_spec(), small(steps=24, evaluate_every=24, method="dense"), out=tmp_path / "few", listeners=[heard])
-    assert heard.messages == ["all 24 steps are random (td3.warmup): the policy is not trained yet"]
+    assert heard.messages == [
+        "all 24 steps are random, and the policy is not trained: td3.warmup is 36; take more steps or a smaller td3.warmup"
+    ]
 
 
 def test_a_run_says_what_was_set_in_vain(small, tmp_path):

@@ -35,6 +35,9 @@ def sweep(
     from lare.experiments.tables import rows_of, write_table
 
     wanted, jobs = read_sweep(file)
+    for job in jobs:
+        if warning := job.resolved.untrained:
+            progress(f"{job.name}: {warning}")
 
     def tabulate() -> None:
         rows = rows_of(job.directory for job in jobs)
@@ -61,12 +64,16 @@ def compare(runs: RunDirectories, out: Path = Path("compare.html")) -> None:
             that the others are compared with.
         out: the page to write.
     """
-    from lare.experiments.compare import HEAD, cells, find_runs, what_scores_are, write_comparison
+    from lare.experiments.compare import HEAD, MEANINGS, cells, find_runs, what_scores_are, write_comparison
     from lare.experiments.statistics import too_few
 
-    comparison = write_comparison(find_runs(runs), out)
+    found = find_runs(runs)
+    for run in found:
+        if warning := run.config.settings.untrained:
+            progress(f"{run.directory}: {warning}")
+    comparison = write_comparison(found, out)
     show(HEAD, cells(comparison))
-    say(f"{what_scores_are(comparison)} {too_few(comparison)}".rstrip())
+    say(f"{what_scores_are(comparison)} {MEANINGS} {too_few(comparison)}".rstrip())
     say(f"wrote {out}")
 
 

@@ -11,7 +11,7 @@ from lare.experiments.scores import REFERENCES, by_label
 from lare.experiments.statistics import REPETITIONS, Band, Comparison, compare, plus_minus, too_few
 from lare.run.directory import CONFIG, Run, read_measured
 
-HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "better than first [95%]")
+HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "better than first [95%]", "p")
 
 
 def find_runs(places: Sequence[Path]) -> list[Run]:
@@ -22,14 +22,17 @@ def find_runs(places: Sequence[Path]) -> list[Run]:
     """
     if not places:
         raise LareError("say which runs to compare")
-    runs = []
+    directories: dict[Path, Path] = {}
+    """By their resolved paths: a run that is given twice counts once, at its first place."""
     for place in places:
         # A name that begins with a dot is the directory of a run that was killed before its directory was complete.
         found = sorted(path.parent for depth in ("", "[!.]*/", "[!.]*/[!.]*/") for path in place.glob(depth + CONFIG))
         if not found:
-            raise LareError(f"{place} is not a run, and contains none")
-        runs += map(read_measured, found)
-    return runs
+            hint = "; give the directory that it is in" if place.is_file() else ""
+            raise LareError(f"{place} is not a run, and contains none{hint}")
+        for directory in found:
+            directories.setdefault(directory.resolve(), directory)
+    return [read_measured(directory) for directory in directories.values()]
 
 
 def cells(comparison: Comparison) -> list[tuple[str, ...]]:
@@ -43,6 +46,7 @@ def cells(comparison: Comparison) -> list[tuple[str, ...]]:
             plus_minus(row.mean, row.deviation),
             "-" if row.over_draws is None else str(row.over_draws),
             "-" if row.better is None else str(row.better),
+            "-" if row.p is None else f"{row.p:.2g}",
         )
         for row in comparison.rows
     ]
@@ -56,6 +60,14 @@ def what_scores_are(comparison: Comparison) -> str:
         return f"Scores are true returns on {comparison.tasks[0]} {when}."
     ends = (f"{task}: 0 is {REFERENCES[task][0]:g}, 1 is {REFERENCES[task][1]:g}" for task in comparison.tasks)
     return f"Scores are true returns {when}, scaled linearly between two fixed returns. {'; '.join(ends)}."
+
+
+MEANINGS = (
+    "IQM: interquartile mean; of fewer than four seeds it is the mean. sd: standard deviation over the seeds (n - 1). Better than "
+    "first: the probability that a run scores more than a run of the first method; of a single seed it is not given, and a "
+    "probability of 0 or 1 has no interval. p: the probability of at least so many won (or lost) pairs of runs by chance (exact "
+    "Mann-Whitney test)."
+)
 
 
 def write_comparison(runs: Sequence[Run], out: Path) -> Comparison:
@@ -75,10 +87,8 @@ def body(title: str, comparison: Comparison) -> Iterable[str]:
     yield table(HEAD, cells(comparison), range(1, len(HEAD)))
     yield note(
         what_scores_are(comparison)
-        + f" IQM: interquartile mean. Intervals: stratified bootstrap over the seeds, {REPETITIONS} "
-        "repetitions; in the column with draws, over the draws of the language model. sd: standard deviation over the seeds. "
-        "Better than first: the probability that a run scores more than a run of the first method. A single seed has no interval, "
-        f"and neither has a probability of 0 or 1. {too_few(comparison)}"
+        + f" {MEANINGS} Intervals: stratified bootstrap over the seeds, {REPETITIONS} repetitions; in the column with draws, over "
+        f"the draws of the language model. {too_few(comparison)}"
     )
     score = "score" if comparison.normalised else "true return"
     yield from figure("Learning", comparison.curves, "environment steps", f"IQM of the {score}", steps=True)

@@ -22,14 +22,14 @@ from lare.experiments.credit import credit_of, factor_labels
 from lare.experiments.html import factor_table, function_text, note, table, write_page
 from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN, RETURN_R2, RETURN_STD
 from lare.experiments.statistics import mean_and_deviation, plus_minus
-from lare.experiments.verdict import Facts, last_known, verdict
+from lare.experiments.verdict import Facts, last_known, median_of_known, verdict
 from lare.experiments.video import record_video
 from lare.run.directory import Run, open_run, read_config
 from lare.run.settings import Settings
 from lare.run.usual import resolve
 from lare.source import source
 from lare.tasks.play import episode_of
-from lare.tasks.spec import TaskSpec
+from lare.tasks.spec import TaskSpec, shipped_tasks
 from lare.tasks.table import env_spec, make_host_env
 from lare.tasks.trust import TRUSTED, is_trusted, module_of
 from lare.training.explain import explanation_of
@@ -128,9 +128,10 @@ def verdicts(runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> It
             *(name, *found, random),
             at_the_end=next((at_the_end[one] for one in without if one != name), None),
             return_r2=None if predicted is None else last_known(predicted[1]),
+            usual_r2=None if predicted is None else median_of_known(predicted[1]),
             latent=method.latent,
             directory=str(run.directory),
-            task=run.config.task.name,
+            task=run.config.task.name if run.config.task.name in shipped_tasks() else f"{run.config.task.name}.toml",
         )
         said = COMMAND.sub(r"<code>\1</code>", escape(" ".join(verdict(facts))))
         yield f'<p class="verdict"><strong>{escape(name)}.</strong> {said}</p>'

@@ -23,6 +23,8 @@ from lare.run.directory import Run
 
 REPETITIONS = 2000
 """Samples of the bootstrap."""
+MOST_SPLITS = 20_000
+"""The most ways to split runs into two groups for which an exact test is computed: 8 seeds of each have 12,870."""
 
 FEW = {2: ("two", "one of two"), 3: ("three", "three of four")}
 """Numbers n of seeds, or of draws, that are too few for a 95% interval: one bootstrap sample in n^n has the lowest seed n times,
@@ -81,6 +83,11 @@ class Row:
     """The mean, and its interval over the draws; None if there is one draw."""
     better: Estimate | None
     """Probability that a run scores more than a run of the first method; None for the first method, and for single seeds."""
+    p: float | None
+    """Probability of at least so many won pairs of runs by chance, or of so few if fewer than half were won (`mann_whitney_p`).
+
+    None like `better`, and for more than `MOST_SPLITS` ways to split the runs, where the interval says enough.
+    """
 
 
 class Band(NamedTuple):
@@ -112,9 +119,9 @@ def too_few(comparison: Comparison) -> str:
     counts = {"seeds": {row.seeds for row in comparison.rows}, "draws": {row.draws for row in comparison.rows}}
     found = [(FEW[count], what) for what, some in counts.items() for count in sorted(some & FEW.keys())]
     if found and len(comparison.tasks) > 1:
-        return "Intervals of two or three seeds, or draws, are too narrow: they hold the true mean in less than 95 of 100 cases."
+        return "Intervals of two or three seeds, or draws, are too narrow: they hold the true median in less than 95 of 100 cases."
     return " ".join(
-        f"Of {count} {what} the bootstrap's interval can only be their range, which holds the true mean in {cases} cases, not in "
+        f"Of {count} {what} the bootstrap's interval can only be their range, which holds the true median in {cases} cases, not in "
         "95 of 100."
         for (count, cases), what in found
     )
@@ -149,13 +156,16 @@ def compare(runs: Mapping[str, Sequence[Run]], key: str = RETURN) -> Comparison:
 def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:
     metrics, mine = rliable()[1], last[group.label]
     (iqm,) = estimates(mine, lambda scores: np.array([metrics.aggregate_iqm(scores)]))
-    over_draws = better = None
+    over_draws = better = p = None
     if len(group.draws) > 1:
         (over_draws,) = estimates(group.scores[..., -1].mean(axis=1), lambda scores: np.array([np.mean(scores)]))
     if group.label != first and min(len(mine), len(last[first])) > 1:
         (better,) = estimates((mine, last[first]), lambda *both: np.array([metrics.probability_of_improvement(*both)]))
+        if math.comb(len(mine) + len(last[first]), len(mine)) <= MOST_SPLITS:
+            pairs = list(zip(mine.T, last[first].T, strict=True))
+            p = min(mann_whitney_p(pairs), mann_whitney_p([(theirs, ours) for ours, theirs in pairs]))
     mean, deviation = mean_and_deviation(mine.mean(axis=1))
-    return Row(group.label, len(group.seeds), len(group.draws), iqm, mean, deviation, over_draws, better)
+    return Row(group.label, len(group.seeds), len(group.draws), iqm, mean, deviation, over_draws, better, p)
 
 
 def mann_whitney_p(pairs: Sequence[tuple[Float[np.ndarray, " ours"], Float[np.ndarray, " theirs"]]]) -> float:

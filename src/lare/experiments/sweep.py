@@ -5,12 +5,12 @@ command completes a sweep that was killed, and extends one whose file lists more
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from lare.algorithms.table import Name
 from lare.credit.methods import find_method
@@ -52,6 +52,14 @@ class Sweep(Share):
     """Other settings of `lare train`, such as steps and seeds."""
     out: Path | None = None
     """The directory for all runs. The default is `runs/NAME` beside the file NAME.toml."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def settings_in_their_table(cls, values: Any) -> Any:
+        for name in values.keys() - cls.model_fields.keys() if isinstance(values, Mapping) else ():
+            if name in Settings.model_fields:
+                raise ValueError(f"{name} is a setting: put it into the table [settings]")
+        return values
 
     @field_validator("settings")
     @classmethod

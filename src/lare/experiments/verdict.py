@@ -28,10 +28,13 @@ class Facts:
     """The last return of another run, which was trained on the return at the end alone; None without such a run."""
     return_r2: float | None = None
     """How well returns were predicted before anything was fitted to them; None if the method predicts none."""
+    usual_r2: float | None = None
+    """The median of the same over all evaluations and seeds."""
     latent: bool = False
     """Whether the method has a phi."""
     directory: str = "RUN"
     task: str = "TASK"
+    """The name of a shipped task, or the name of a task file."""
 
     @property
     def last(self) -> float:
@@ -84,7 +87,12 @@ def told(run: Facts) -> list[str]:
     """Whether the proxy rewards explain the score."""
     if run.return_r2 is None or not np.isfinite(run.return_r2):
         return []
-    share, by = max(run.return_r2, 0.0), "factors and raw features" if run.latent else "raw features"
+    share, by = run.return_r2, "factors and raw features" if run.latent else "raw features"
+    if not explains_nothing(run) and share < NEXT_TO_NOTHING:
+        return [
+            f"Its proxy rewards, from {by}, usually explain the score (median R² of returns: {run.usual_r2:.2f}), but not the last "
+            f"episodes (R² {share:.2f}): the policy has changed, and the decoder has to adapt."
+        ]
     how = "next to nothing" if share < NEXT_TO_NOTHING else "nearly all" if share > MOSTLY else "a part"
     return [
         f"Its proxy rewards, from {by}, explain {how} of the score: R² of the last returns, before they were learned from, "
@@ -92,16 +100,29 @@ def told(run: Facts) -> list[str]:
     ]
 
 
+def explains_nothing(run: Facts) -> bool:
+    """Whether returns are known to be explained neither at the end nor in most evaluations before."""
+    if run.return_r2 is None or not np.isfinite(run.return_r2):
+        return False
+    usual = -np.inf if run.usual_r2 is None or not np.isfinite(run.usual_r2) else run.usual_r2
+    return max(run.return_r2, usual) < NEXT_TO_NOTHING
+
+
 def todo(run: Facts) -> list[str]:
     """What to do next."""
     found = []
-    known = run.return_r2 is not None and np.isfinite(run.return_r2)
-    if known and (run.return_r2 or 0) < NEXT_TO_NOTHING:
+    if explains_nothing(run):
         other = f"`lare design {run.task} --reflect 2 --model NAME` asks for another phi; " if run.latent else ""
         found.append(f"Next: the score depends on something else. {other}`--method bayes` needs no phi.")
     elif is_rising(run):
         found.append(
             f"Next: it was still rising. To continue: `lare train --resume {run.directory} --steps {2 * int(run.steps[-1])}`."
+        )
+    elif (best := seed_above_chance(run)) is not None:
+        step, value = best
+        found.append(
+            f"Next: one seed was better than random actions at step {step:,} ({shown(value)}). `lare evaluate {run.directory} "
+            "--best` plays the best policy of each seed. To continue: more `--steps`, or another `--algorithm`."
         )
     elif (best := fell_from(run)) is not None:
         step, value = best
@@ -110,7 +131,7 @@ def todo(run: Facts) -> list[str]:
             "policy of each seed."
         )
     elif len(run.random) and not better_than_chance(run):
-        good = known and (run.return_r2 or 0) > MOSTLY
+        good = (run.return_r2 or 0) > MOSTLY
         what = "the proxy rewards are good, so it depends on the algorithm" if good else "it may need more steps"
         found.append(f"Next: {what}: more `--steps`, or another `--algorithm` (`lare algorithms`).")
     if len(run.returns) == 1:
@@ -147,9 +168,25 @@ def fell_from(run: Facts) -> tuple[int, float] | None:
     return (int(run.steps[best]), top) if fell else None
 
 
+def seed_above_chance(run: Facts) -> tuple[int, float] | None:
+    """Step and value of the best evaluation of any seed, if it beats random actions and the mean at the end does not."""
+    if not len(run.random) or better_than_chance(run):
+        return None
+    place, best = np.unravel_index(np.nanargmax(run.returns), run.returns.shape)
+    top = float(run.returns[place, best])
+    above = top > run.random.mean() + 3 * max(float(run.random.std()), 1e-9)
+    return (int(run.steps[best]), top) if above else None
+
+
 def shown(value: float) -> str:
     """A return as text, as a whole number if it is large."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def median_of_known(values: Float[np.ndarray, "seeds evaluations"]) -> float | None:
+    """The median of all known values."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else None
 
 
 def last_known(values: Float[np.ndarray, "seeds evaluations"]) -> float | None:

@@ -181,6 +181,17 @@ class ResolvedSettings(Checked):
         return getattr(self.hyperparameters, "warmup", 0)
 
     @property
+    def untrained(self) -> str | None:
+        """A warning if all steps are random, so that the policy is never updated."""
+        if self.warmup < self.steps:
+            return None
+        warmup = f"{self.algorithm}.warmup"
+        return (
+            f"all {self.steps:,} steps are random, and the policy is not trained: {warmup} is {self.warmup:,}; take more steps or "
+            f"a smaller {warmup}"
+        )
+
+    @property
     def rereads(self) -> bool:
         """Whether steps are read again after the policy has learned from them."""
         return ALGORITHMS[self.algorithm].consumes is not Consumes.ROLLOUTS or find_method(self.method).fit is not None

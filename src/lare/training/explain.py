@@ -78,6 +78,10 @@ def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
         )
         team = f"{config.env.teams[place].name}: " if len(roles) > 1 else ""
         lines += [team + line for line in words(found, form, factors, entries)]
+    if lines and config.method.descends:
+        lines.insert(
+            0, f"By a closed-form fit to the stored returns, which is not the decoder of {config.method.name}:"
+        )
     return lines
 
 

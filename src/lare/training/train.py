@@ -283,9 +283,12 @@ def introduce(session: Session, listener: Listener, messages: Sequence[str]) -> 
         listener.said(message)
     if run.function is not None:
         listener.said(f"the latent function runs in {isolation(run.config.task, run.function)}")
-    if session.step < settings.warmup:
-        which = f"the first {settings.warmup:,}" if settings.warmup < settings.steps else f"all {settings.steps:,}"
-        listener.said(f"{which} steps are random ({settings.algorithm}.warmup): the policy is not trained yet")
+    if settings.untrained:
+        listener.said(settings.untrained)
+    elif session.step < settings.warmup:
+        listener.said(
+            f"the first {settings.warmup:,} steps are random ({settings.algorithm}.warmup): the policy is not trained yet"
+        )
     if session.step >= settings.steps:
         listener.said(
             f"nothing is left to do: it has made its {settings.steps:,} steps; more --steps (steps=... in Python) make it longer"
