@@ -327,6 +327,15 @@ def test_a_report_imports_nothing_that_a_file_names(run, neighbour, environment)
     assert module not in {*sys.modules} - before
 
 
+def test_the_command_says_what_a_report_leaves_out(run, neighbour, command):
+    status, _, noted = command("report", run({"environment": "a_neighbours_file:X-v0"}))
+    assert (status, noted) == (
+        0,
+        "the module a_neighbours_file was not imported, so credit and factors are not drawn: "
+        "set LARE_TRUST=a_neighbours_file to allow it\n",
+    )
+
+
 def test_what_is_installed_or_here_already_is_no_neighbours_file(run):
     assert open_run(run({"environment": "toys:toys/Chase-v0"})).functions == ()
     assert open_run(run({"environment": "json:X"})).functions == ()

@@ -524,7 +524,7 @@ def test_a_time_limit_is_needed():
     with pytest.raises(LareError) as error:
         host(Toy(cycles=None))
     assert str(error.value) == (
-        f"task 'toy': {TOY} has no time limit, so an episode may never pay; set max_episode_steps in the spec"
+        f"task 'toy': {TOY} has no time limit, so an episode may never pay; set max_episode_steps in the task file"
     )
 
 

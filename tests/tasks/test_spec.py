@@ -121,7 +121,7 @@ def test_like_over_two_generations(spec_file, tmp_path):
         (
             {"environment": "misfits/Endless-v0"},
             "task 'Chase': misfits/Endless-v0 has no time limit, so an episode may never pay; "
-            "set max_episode_steps in the spec",
+            "set max_episode_steps in the task file",
         ),
         (
             {"teams": ["Reacher-v4"]},
@@ -168,7 +168,7 @@ def test_an_unknown_environment_is_refused(spec_file, environment):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"name = ", "task '{file}' is not valid TOML: Invalid value (at end of document)"),
+        (b"name = ", "task '{file}' is not valid TOML: Invalid value (at end of document); a text needs quotes"),
         (
             b"Dear reader",
             "task '{file}' is not valid TOML: Expected '=' after a key in a key/value pair (at line 1, column 6)",

@@ -187,11 +187,17 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = False) ->
         out: the file to write; the default is report.html in the (first) run's directory.
         film: film an episode of each run too, and show it in the page. Without a graphics card that may take minutes.
     """
-    from lare.experiments.report import write_report
+    from lare.experiments.report import unknown_module, write_report
+    from lare.run.directory import read_config
+    from lare.tasks.trust import TRUSTED
 
     if film:
         draw_without_a_screen()
     say(f"wrote {write_report(list(runs), out, film)}")
+    for module in sorted({one for run in runs if (one := unknown_module(read_config(run).task)) is not None}):
+        progress(
+            f"the module {module} was not imported, so credit and factors are not drawn: set {TRUSTED}={module} to allow it"
+        )
 
 
 def export(

@@ -188,7 +188,8 @@ def read_values(task: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     try:
         values = read_toml(text)
     except ValueError as error:  # TOMLDecodeError, or a number with too many digits
-        raise LareError(f"task {task!r} is not valid TOML: {error}") from error
+        hint = "; a text needs quotes" if str(error).startswith("Invalid value") else ""
+        raise LareError(f"task {task!r} is not valid TOML: {error}{hint}") from error
     like, teams = values.get("like"), values.get("teams")
 
     def other(name: Any) -> bool:

@@ -132,7 +132,10 @@ def check_keys(task: TaskSpec, family: Family) -> None:
     for role in (task, *task.teams):
         for key in NOT_FOR_ALL:
             if getattr(role, key) and key not in family.reads:
-                raise LareError(f"task {role.name!r}: {key} makes no difference to {task.environment}: leave it out")
+                own = "" if family is not GYMNASIUM or key != "arguments" else ", and give kwargs where you register it"
+                raise LareError(
+                    f"task {role.name!r}: {key} makes no difference to {task.environment}: leave it out{own}"
+                )
     if not task.teams:
         return
     for key in ("agents", "team"):
