@@ -123,9 +123,9 @@ class TensorBoard:
         writer = summary_writer()
         # Events that an earlier process wrote after the checkpoint are purged, because they are written again.
         purge = step + 1 if step else None
-        self.writers = {
-            seed: writer(str(directory / f"seed-{seed}"), purge_step=purge, flush_secs=10) for seed in seeds
-        }
+        # Files are named by the second: a run that is resumed within the same second must not overwrite its own events.
+        options = {"purge_step": purge, "flush_secs": 10, "filename_suffix": f".{step}"}
+        self.writers = {seed: writer(str(directory / f"seed-{seed}"), **options) for seed in seeds}
 
     def started(self, name: str, step: int, steps: int) -> None: ...
     def stepped(self, step: int) -> None: ...
