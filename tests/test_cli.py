@@ -45,6 +45,7 @@ def test_tasks_are_listed(command):
         ("train Task --step 9", "unrecognized options: --step, 9 (did you mean '--steps'?); see lare train --help"),
         ("trian", "unrecognized options: trian (did you mean 'train'?); see lare --help"),
         ("evaluate a b", "unrecognized options: b; see lare evaluate --help"),
+        ("evaluate a --seed 3", "unrecognized options: --seed, 3; see lare evaluate --help"),
         ("evaluate", "lare evaluate needs RUN (a run directory); see lare evaluate --help"),
         ("design Task --price 1", "--price 1: not of the kind {FLOAT FLOAT}; see lare design --help"),
         ("train Task --seeds", "--seeds needs a value; see lare train --help"),

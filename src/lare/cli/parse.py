@@ -59,9 +59,13 @@ def in_one_line(box: str, commands: Mapping[str, object]) -> str:
     """The error that a box of tyro's reports."""
     said, *more = sections(box)
     said = said.split(" Got errors:")[0].rstrip(".")
+    if said.startswith("Unrecognized or misplaced options: "):
+        misplaced = re.findall(r"(\S+) \(applied to", said)
+        said = f"Unrecognized options: {', '.join(misplaced)}"
     if found := re.fullmatch(r"Unrecognized options: (\S+?)(,.*)?", said):
         known = [*re.findall(r"(?<!\S)--[\w.-]+", " ".join(more)), *commands]
-        return f"unrecognized options: {found[1]}{found[2] or ''}{did_you_mean(found[1], known)}"
+        hint = "" if found[1] in known else did_you_mean(found[1], known)  # tyro also names options of other commands
+        return f"unrecognized options: {found[1]}{found[2] or ''}{hint}"
     if found := re.fullmatch(r"Error parsing (\S+): no type matching (.+) could be instantiated from \['(.*)'\]", said):
         kind = found[2].replace("{None}|", "")
         return f"{found[1]} {found[3]}: {NUMBERS.get(kind, f'not of the kind {kind}')}"
