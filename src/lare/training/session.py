@@ -180,7 +180,7 @@ drop = jax.jit(jax.vmap(forget_episodes))
 def load_learner(run: Run) -> tuple[TrainConfig, Learner, dict[str, Any], dict[str, np.ndarray]]:
     """The training state of a run's last checkpoint, and the data that were saved with it."""
     config = config_for(run)
-    return config, *checkpoint.load(run.checkpoint, learner_shape(run, config))
+    return config, *checkpoint.load(run.checkpoint, learner_shape(run, compiled(config)))
 
 
 def load_actor(run: Run, of_best: bool = False) -> tuple[TrainConfig, Any, Int[np.ndarray, " seeds"]]:
@@ -199,18 +199,19 @@ def load_actor(run: Run, of_best: bool = False) -> tuple[TrainConfig, Any, Int[n
 
 def actor_shape(run: Run, config: TrainConfig) -> Any:
     """An actor, with shapes instead of arrays."""
-    return jax.eval_shape(lambda learner: compiled(config).actor(learner, 0), learner_shape(run, config))
+    functions = compiled(config)
+    return jax.eval_shape(lambda learner: functions.actor(learner, 0), learner_shape(run, functions))
 
 
-def learner_shape(run: Run, config: TrainConfig) -> Learner:
+def learner_shape(run: Run, functions: Compiled) -> Learner:
     """A learner, with shapes instead of arrays."""
-    return jax.eval_shape(compiled(config).init, seed_keys(jnp.asarray(run.seeds), 0))
+    return jax.eval_shape(functions.init, seed_keys(jnp.asarray(run.seeds), 0))
 
 
-def new_learner(run: Run, config: TrainConfig) -> Learner:
+def new_learner(run: Run, functions: Compiled) -> Learner:
     """An untrained learner."""
     keys = seed_keys(jnp.asarray(run.seeds), 0)
-    made = ahead(compiled(config).init, keys)
+    made = ahead(functions.init, keys)
     give_memory_back()
     return made(keys)
 
@@ -218,13 +219,13 @@ def new_learner(run: Run, config: TrainConfig) -> Learner:
 def start(run: Run) -> Session:
     """A session before its first step."""
     config = config_for(run)
-    return begin(run, config, partial(new_learner, run, config))
+    return begin(run, config, partial(new_learner, run))
 
 
 def restore(run: Run) -> tuple[Session, list[str]]:
     """A session at the last checkpoint, and messages for the user."""
     config, learner, host, arrays = load_learner(run)
-    session = begin(run, config, lambda: learner)
+    session = begin(run, config, lambda _: learner)
     try:
         return session, session.return_to(host, arrays)
     except checkpoint.DAMAGED as error:
@@ -233,14 +234,14 @@ def restore(run: Run) -> tuple[Session, list[str]]:
         raise LareError(f"the checkpoint in {run.checkpoint} does not fit its environments: {said}") from error
 
 
-def begin(run: Run, config: TrainConfig, make_learner: Callable[[], Learner]) -> Session:
+def begin(run: Run, config: TrainConfig, make_learner: Callable[[Compiled], Learner]) -> Session:
     """A session with compiled functions, environments and a learner, which is made after the functions were compiled.
 
     The compiler needs hundreds of megabytes for a while. They are given back before the replay needs them.
     """
     functions = compile_ahead(run, config, compiled(config))
     give_memory_back()
-    learner = make_learner()
+    learner = make_learner(functions)
     if config.env.in_jax:
         env = make_env(run.config.task)
         assert isinstance(env, JaxEnv)
@@ -274,7 +275,7 @@ def compile_ahead(run: Run, config: TrainConfig, functions: Compiled) -> Compile
     taken = shape(env.agents, env.action_size, dtype=np.float32 if env.discrete else env.low.dtype)
     steps = Trajectory(shown, action, taken, shown)
     factors = shape(config.judged_rows, max(config.factors, default=0))
-    learner, keys = learner_shape(run, config), jax.eval_shape(seed_keys, jnp.asarray(run.seeds), 0)
+    learner, keys = learner_shape(run, functions), jax.eval_shape(seed_keys, jnp.asarray(run.seeds), 0)
     return functions._replace(
         store=ahead(functions.store, learner, steps, factors),
         improve=ahead(functions.improve, learner, steps, keys, 0),
