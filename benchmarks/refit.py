@@ -4,7 +4,8 @@
 
 For each run (of a method with a decoder, first seed) there are three fits: the method's own, the same with targets in the units of
 the environment, and RRD's biased loss. After every 5,000 of 20,000 updates: the correlation with the true rewards and the mean
-error on the last 5,000 stored steps. The ceiling is the best linear map from the features to the true rewards of those steps.
+error on the last 5,000 stored steps. The best possible result (`ceiling`) is that of a linear map that is fitted to the true
+rewards of the same steps.
 """
 
 import sys

@@ -368,8 +368,9 @@ def test_from_training_to_report(command, spec_file, phi):
 
     status, out, err = command("evaluate", run, "--episodes", 2)
     assert (status, err) == (0, "")
-    assert out.startswith("seed 0: return -")
-    assert out.endswith(" over 2 episodes\n")
+    evaluated, by_chance = out.splitlines()
+    assert re.fullmatch(r"seed 0: return -\S+ ± \S+ over 2 episodes", evaluated)
+    assert re.fullmatch(r"random actions: return -\S+ ± \S+ over 10 episodes", by_chance)
 
     assert command("report", run) == (0, f"wrote {run / 'report.html'}\n", "")
     assert "f_near" in (run / "report.html").read_text(encoding="utf-8")
@@ -380,9 +381,11 @@ def test_from_training_to_report(command, spec_file, phi):
         "lare: film.avi is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]\n",
     )
 
-    # There is nothing left to do, and nothing is done again.
+    # There is nothing left to do, and nothing is done again. A page that was watched is brought up to date.
+    (run / "watch.html").write_text("stale")
     status, out, _ = command("train", "--resume", run)
     assert status == 0
+    assert "Step 200 of 200; not running" in (run / "watch.html").read_text(encoding="utf-8")
     assert out.endswith(f"finished {run}; to see it: lare report {run}\n")
     assert (run / "metrics.jsonl").read_bytes() == metrics
 

@@ -12,7 +12,7 @@ from lare.experiments.statistics import (
     Band,
     Comparison,
     compare,
-    mann_whitney_p,
+    mann_whitney,
     mann_whitney_u,
     mean_and_deviation,
     plus_minus,
@@ -196,8 +196,7 @@ def claimed(claim: Claim, other: str, exhibit: Exhibit, found: Mapping[str, Comp
         pairs = [(-ours, -theirs) for ours, theirs in pairs]
     won = [mann_whitney_u(ours, theirs) for ours, theirs in pairs]
     of = [len(ours) * len(theirs) for ours, theirs in pairs]
-    chance = mann_whitney_p(pairs)
-    contrary = mann_whitney_p([(theirs, ours) for ours, theirs in pairs])
+    chance, contrary = mann_whitney(pairs)
     everywhere = all(2 * count >= all_of_them for count, all_of_them in zip(won, of, strict=True))
     says = "errs less than" if exhibit.measure == ERROR else "is at least as good as" if claim.at_least else "is above"
     return [

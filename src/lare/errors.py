@@ -1,7 +1,7 @@
 """Errors for the user, about input that cannot be used."""
 
 import difflib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 LONGEST_VALUE = 100
 """The largest number of characters that a message quotes of a value."""
+
+MOST_PROBLEMS = 3
+"""The largest number of problems that a message lists."""
 
 
 class LareError(Exception):
@@ -58,7 +61,7 @@ class Checked(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise LareError(first_problem(error, keys_of(type(self)))) from None
+            raise LareError(problems_of(error, keys_of(type(self)))) from None
 
 
 def keys_of(settings: type[Checked]) -> Iterator[str]:
@@ -97,22 +100,33 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-def first_problem(error: ValidationError, known: Iterable[str] = ()) -> str:
-    """The first problem that pydantic found, in one line, and the number of others. Unknown keys get a hint at `known` ones."""
+def problems_of(error: ValidationError, known: Iterable[str] = ()) -> str:
+    """The first problems that pydantic found, in one line, and the number of others. Unknown keys get a hint at `known` ones."""
     names = tuple(known)
     # Unknown keys come first, because a misspelt key is also a missing one.
     problems = sorted(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
-    first = problems[0]
-    where, what = ".".join(str(part) for part in first["loc"]), first["msg"].removeprefix("Value error, ")
-    if first["type"] == "missing":
-        said = f"the key {where!r} is missing"
-    elif first["type"] == "extra_forbidden" and where in names:
+    missing = [place_of(problem) for problem in problems if problem["type"] == "missing"]
+    said = [in_words(problem, names) for problem in problems if problem["type"] != "missing"]
+    if missing:
+        listed = ", ".join(map(repr, missing))
+        said.append(f"the key {listed} is missing" if len(missing) == 1 else f"the keys {listed} are missing")
+    more = f" (and {len(said) - MOST_PROBLEMS} more)" if len(said) > MOST_PROBLEMS else ""
+    return "; ".join(said[:MOST_PROBLEMS]) + more
+
+
+def place_of(problem: Mapping[str, Any]) -> str:
+    """The key of a problem, such as `td3.gamma`."""
+    return ".".join(str(part) for part in problem["loc"])
+
+
+def in_words(problem: Mapping[str, Any], names: Sequence[str]) -> str:
+    """A problem that pydantic found."""
+    where, said = place_of(problem), problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "extra_forbidden" and where in names:
         table, _, key = where.rpartition(".")
-        said = f"there is no key {where!r}: write {table}={{{key!r}: ...}}"
-    elif first["type"] == "extra_forbidden":
-        said = f"there is no key {where!r}{did_you_mean(where, names)}"
-    elif where:
-        said = f"{where} = {shortened(first['input'])}: {what.lower()}"
-    else:
-        said = what
-    return said + (f" (and {len(problems) - 1} more)" if len(problems) > 1 else "")
+        return f"there is no key {where!r}: write {table}={{{key!r}: ...}}"
+    if problem["type"] == "extra_forbidden":
+        return f"there is no key {where!r}{did_you_mean(where, names)}"
+    if problem["type"] == "model_type":
+        said = "should be a table of settings, such as {'KEY': VALUE}"
+    return f"{where} = {shortened(problem['input'])}: {said[0].lower()}{said[1:]}" if where else said

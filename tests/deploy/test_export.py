@@ -279,3 +279,14 @@ def test_what_an_exported_function_is_not_given_is_named(run, tmp_path):
         exported.load("nope")
     with pytest.raises(ValueError, match="policy needs the inputs observation: observation is missing"):
         exported.load("policy")(obs=np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="policy needs the inputs observation: there is no input obs"):
+        exported.load("policy")(observation=np.zeros((1, 2)), obs=np.zeros((1, 2)))
+
+
+def test_an_exported_function_refuses_arrays_of_other_sizes(run, tmp_path):
+    lare.export(run, tmp_path / "out")
+    exported = loaded(tmp_path / "out")
+    with pytest.raises(ValueError, match=r"^observation must have the shape \(batch, 2\), and has \(5, 3\)$"):
+        exported.load("policy")(observation=np.zeros((5, 3)))
+    with pytest.raises(ValueError, match=r"^action must have the shape \(batch, 1\), and has \(\)$"):
+        exported.reward(np.zeros((1, 2)), 0.5, np.zeros((1, 2)))

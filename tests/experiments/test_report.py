@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 import lare
-from lare.experiments import live, report
+from lare.experiments import evaluation, live
+from lare.experiments.evaluation import random_returns
 from lare.experiments.live import LivePage
-from lare.experiments.report import random_returns
 from toys import toy_spec
 
 CHROMIUM = next(
@@ -42,8 +42,8 @@ def test_a_verdict_stands_on_top(runs, tmp_path):
 
 
 def test_random_play_is_bounded(monkeypatch):
-    assert len(random_returns(toy_spec())) == report.RANDOM_EPISODES
-    monkeypatch.setattr(report, "PATIENCE", -1.0)
+    assert len(random_returns(toy_spec())) == evaluation.RANDOM_EPISODES
+    monkeypatch.setattr(evaluation, "PATIENCE", -1.0)
     assert len(random_returns(toy_spec())) == 0
     assert len(random_returns(toy_spec(environment="no-such-environment"))) == 0
 

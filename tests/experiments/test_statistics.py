@@ -7,7 +7,7 @@ import pytest
 
 from lare.errors import LareError
 from lare.experiments import statistics
-from lare.experiments.compare import cells, find_runs, what_scores_are, write_comparison
+from lare.experiments.compare import cells, comparable, find_runs, what_scores_are, write_comparison
 from lare.experiments.scores import by_label
 from lare.experiments.statistics import too_few
 
@@ -45,11 +45,11 @@ def test_the_curve_of_interquartile_means_is_rliables():
 def test_mann_and_whitneys_test_by_hand():
     """By the tables of Mann and Whitney: of 3 against 3, all nine pairs 1 in 20, eight or more 2 in 20."""
     low, high = np.array([1.0, 2, 3]), np.array([4.0, 5, 6])
-    assert statistics.mann_whitney_p([(high, low)]) == pytest.approx(1 / 20)
-    assert statistics.mann_whitney_p([(np.array([3.0, 5, 6]), np.array([1.0, 2, 4]))]) == pytest.approx(2 / 20)
-    assert statistics.mann_whitney_p([(low, high)]) == pytest.approx(1)
-    assert statistics.mann_whitney_p([(high, low), (high, low)]) == pytest.approx(1 / 400)
-    assert statistics.mann_whitney_p([(low, low)]) > 0.5
+    assert statistics.mann_whitney([(high, low)]) == pytest.approx((1 / 20, 1))
+    assert statistics.mann_whitney([(np.array([3.0, 5, 6]), np.array([1.0, 2, 4]))])[0] == pytest.approx(2 / 20)
+    assert statistics.mann_whitney([(low, high)]) == pytest.approx((1, 1 / 20))
+    assert statistics.mann_whitney([(high, low), (high, low)])[0] == pytest.approx(1 / 400)
+    assert min(statistics.mann_whitney([(low, low)])) > 0.5
 
 
 def test_intervals_hold_what_they_promise():
@@ -102,6 +102,21 @@ def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):
     assert [run.directory for run in find_runs([tmp_path / "runs" / "Chase"])] == [run.directory for run in found]
     with pytest.raises(LareError, match=r"nothing is not a run, and contains none$"):
         find_runs([tmp_path / "nothing"])
+
+
+def test_runs_without_an_evaluation_are_left_out_and_unfinished_ones_named(made):
+    ended, begun, killed = (
+        made(name, [1.0], method=method, steps=steps, td3={"warmup": 10})
+        for name, method, steps in (("a", "dense", (50, 100)), ("b", "rd", (25, 50)), ("c", "dense", ()))
+    )
+    found, remarks = comparable(find_runs([run.directory for run in (ended, begun, killed)]))
+    assert [run.directory for run in found] == [ended.directory, begun.directory]
+    assert remarks == [
+        f"{begun.directory} has only reached step 50 of 100, so no run is compared at a later step",
+        f"{killed.directory} has no evaluation yet, and is left out",
+    ]
+    with pytest.raises(LareError, match=r"runs/Chase/c: no run has an evaluation yet$"):
+        comparable([killed])
 
 
 RANGE = "the bootstrap's interval can only be their range, which holds the true median in"

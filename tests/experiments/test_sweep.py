@@ -251,7 +251,7 @@ def test_how_a_process_ended(file, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("tasks", "task"), "there is no key 'task' (did you mean 'tasks'?) (and 1 more)"),
+        (("tasks", "task"), "there is no key 'task' (did you mean 'tasks'?); the key 'tasks' is missing"),
         (('"dense"', '"dence"'), "no method 'dence' (did you mean 'dense'?); the methods are "),
         (("tasks = ", "seeds = 3\ntasks = "), "seeds is a setting: put it into the table [settings]"),
         (('["Reacher-v4"]', "[]"), "tasks = []: tuple should have at least 1 item after validation, not 0"),

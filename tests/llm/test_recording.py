@@ -92,7 +92,10 @@ def test_an_unknown_draw_is_refused(kind, draw, message):
     [
         ("", "recording X.json is not JSON: Expecting value: line 1 column 1 (char 0)"),
         ('{"task": ', "recording X.json is not JSON: Expecting value: line 1 column 10 (char 9)"),
-        ("{}", "recording X.json: the key 'task' is missing (and 6 more)"),
+        (
+            "{}",
+            "recording X.json: the keys 'task', 'kind', 'draw', 'model', 'recorded', 'temperature', 'exchanges' are missing",
+        ),
         (RECORDING | {"note": "mine"}, "recording X.json: there is no key 'note'"),
         (RECORDING | {"kind": "poems"}, "recording X.json: kind = 'poems': input should be 'factors' or 'reward'"),
         (RECORDING | {"exchanges": 3}, "recording X.json: exchanges = 3: input should be a valid list"),

@@ -29,12 +29,15 @@ def test_a_reply_is_read():
         ('{"Understand": "u"', "the reply is not one JSON object: Expecting ',' delimiter: line 1 column 19 (char 18)"),
         (
             '{"a": "\n"}',
-            "the reply's JSON object is not as asked for: the key 'Understand' is missing (and 2 more)",
+            "the reply's JSON object is not as asked for: the keys 'Understand', 'Analyze', 'Functions' are missing",
         ),
         ("[]", "the reply is JSON, but not an object: '[]'"),
         ("null", "the reply is JSON, but not an object: 'null'"),
         (json.dumps("x" * 99), "the reply is JSON, but not an object: '\"" + "x" * 39 + "'"),
-        ("{}", "the reply's JSON object is not as asked for: the key 'Understand' is missing (and 2 more)"),
+        (
+            "{}",
+            "the reply's JSON object is not as asked for: the keys 'Understand', 'Analyze', 'Functions' are missing",
+        ),
         (
             '{"Understand": "u", "Analyze": "a", "functions": "f"}',
             "the reply's JSON object is not as asked for: the key 'Functions' is missing",

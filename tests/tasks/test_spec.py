@@ -87,7 +87,7 @@ def test_like_over_two_generations(spec_file, tmp_path):
     ("changes", "message"),
     [
         ({"action": None}, "task '{file}': the key 'action' is missing"),
-        ({"action": None, "observation": None}, "task '{file}': the key 'observation' is missing (and 1 more)"),
+        ({"action": None, "observation": None}, "task '{file}': the keys 'observation', 'action' are missing"),
         ({"reward": "1 a step"}, "task '{file}': there is no key 'reward'"),
         ({"judge": "after"}, "task '{file}': there is no key 'judge' (did you mean 'judges'?)"),
         ({"description": "  "}, "task '{file}': description = '  ': string should have at least 1 character"),
@@ -174,7 +174,11 @@ def test_an_unknown_environment_is_refused(spec_file, environment):
             "task '{file}' is not valid TOML: Expected '=' after a key in a key/value pair (at line 1, column 6)",
         ),
         (b"\xff", "{file} cannot be read: 'utf-8' codec can't decode byte 0xff in position 0: invalid start byte"),
-        (b"", "task '{file}': the key 'name' is missing (and 6 more)"),
+        (
+            b"",
+            "task '{file}': the keys 'name', 'environment', 'observation_size', 'action_size', 'description', 'observation', "
+            "'action' are missing",
+        ),
     ],
 )
 def test_a_file_that_is_no_spec_is_refused(tmp_path, content, message):

@@ -64,7 +64,7 @@ def train(
             )
         config = open_run(resume).config
         asked = model_of(model, base_url, config.task.name)
-        listeners = listeners_of(wandb, mlflow, config.settings, resume if watch else None)
+        listeners = [*listeners_of(wandb, mlflow, config.settings), *page_of(resume, watch)]
         run = lare.resume(resume, steps=settings.steps, model=asked, tensorboard=tensorboard, listeners=listeners)
     elif task is None:
         raise LareError("say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR")
@@ -90,15 +90,13 @@ def train(
             model=asked,
             out=out,
             tensorboard=tensorboard,
-            listeners=listeners_of(wandb, mlflow, resolved, out if watch else None),
+            listeners=[*listeners_of(wandb, mlflow, resolved), *page_of(out, watch)],
         )
     say(f"finished {run.directory}; to see it: lare report {run.directory}")
 
 
-def listeners_of(
-    wandb: str | None, mlflow: str | None, settings: ResolvedSettings, watched: Path | None
-) -> "list[Listener]":
-    """The terminal, and the tracking services and the page that the user asked for."""
+def listeners_of(wandb: str | None, mlflow: str | None, settings: ResolvedSettings) -> "list[Listener]":
+    """The terminal, and the tracking services that the user asked for."""
     from lare.training.progress import Terminal
     from lare.training.trackers import MLflow, WeightsAndBiases
 
@@ -108,12 +106,19 @@ def listeners_of(
         told.append(WeightsAndBiases(project=wandb, config=kept))
     if mlflow is not None:
         told.append(MLflow(mlflow, parameters=kept))
-    if watched is not None:
-        from lare.experiments.live import PAGE, LivePage
-
-        told.append(LivePage(watched))
-        progress(f"to watch it: {watched / PAGE}")
     return told
+
+
+def page_of(directory: Path, watch: bool) -> "list[Listener]":
+    """The page that shows the run, if the user asks for it, or asked for it before the run was stopped."""
+    if not watch and not directory.exists():
+        return []
+    from lare.experiments.live import PAGE, LivePage
+
+    page = directory / PAGE
+    if watch:
+        progress(f"to watch it: {page}")
+    return [LivePage(directory, browser=watch)] if watch or page.exists() else []
 
 
 def model_of(model: str | None, base_url: str | None, task: str) -> "Model | None":
@@ -140,7 +145,7 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
         best: play the policy of each seed's best evaluation, instead of the last policy.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
-    from lare.experiments.evaluation import evaluation_of
+    from lare.experiments.evaluation import evaluation_of, random_returns
     from lare.experiments.statistics import mean_and_deviation, plus_minus
     from lare.experiments.video import check_video, record_video
     from lare.run.directory import open_run
@@ -166,6 +171,8 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
             of_seed = plus_minus(*mean_and_deviation(found.returns[place, :, team]))
             of_best = "" if since is None else f" (the policy of step {since[place]:,})"
             say(f"{named}seed {seed}: return {of_seed} over {counted}{of_best}")
+    if len(roles) == 1 and len(by_chance := random_returns(opened.config.task)):
+        say(f"random actions: return {plus_minus(*mean_and_deviation(by_chance))} over {len(by_chance)} episodes")
     for name, values in found.measures.items():
         for seed, of_seed in zip(opened.seeds, values, strict=True):
             say(f"seed {seed}: {name} {plus_minus(*mean_and_deviation(of_seed))}")
@@ -187,9 +194,9 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = False) ->
         out: the file to write; the default is report.html in the (first) run's directory.
         film: film an episode of each run too, and show it in the page. Without a graphics card that may take minutes.
     """
-    from lare.experiments.report import unknown_module, write_report
+    from lare.experiments.report import write_report
     from lare.run.directory import read_config
-    from lare.tasks.trust import TRUSTED
+    from lare.tasks.trust import TRUSTED, unknown_module
 
     if film:
         draw_without_a_screen()

@@ -64,13 +64,12 @@ def compare(runs: RunDirectories, out: Path = Path("compare.html")) -> None:
             that the others are compared with.
         out: the page to write.
     """
-    from lare.experiments.compare import HEAD, MEANINGS, cells, find_runs, what_scores_are, write_comparison
+    from lare.experiments.compare import HEAD, MEANINGS, cells, comparable, find_runs, what_scores_are, write_comparison
     from lare.experiments.statistics import too_few
 
-    found = find_runs(runs)
-    for run in found:
-        if warning := run.config.settings.untrained:
-            progress(f"{run.directory}: {warning}")
+    found, remarks = comparable(find_runs(runs))
+    for remark in remarks:
+        progress(remark)
     comparison = write_comparison(found, out)
     show(HEAD, cells(comparison))
     say(f"{what_scores_are(comparison)} {MEANINGS} {too_few(comparison)}".rstrip())

@@ -85,15 +85,28 @@ def load(name):
         constants = dict(file)
 
     def function(**inputs):
+        needed = ", ".join(graph["inputs"])
         if missing := [key for key in graph["inputs"] if key not in inputs]:
-            raise ValueError(f"{name} needs the inputs {', '.join(graph['inputs'])}: {', '.join(missing)} is missing")
-        values = constants | {key: np.asarray(inputs[key], graph["inputs"][key]["type"]) for key in graph["inputs"]}
+            raise ValueError(f"{name} needs the inputs {needed}: {', '.join(missing)} is missing")
+        if unknown := [key for key in inputs if key not in graph["inputs"]]:
+            raise ValueError(f"{name} needs the inputs {needed}: there is no input {', '.join(unknown)}")
+        values = constants | {key: as_input(key, inputs[key], like) for key, like in graph["inputs"].items()}
         for operation, arguments, result, axis in graph["operations"]:
             more = {} if axis is None else {"axis": axis}
             values[result] = OPERATIONS[operation](*(values[argument] for argument in arguments), **more)
         return {key: values[key] for key in graph["outputs"]}
 
     return function
+
+
+def as_input(key, given, like):
+    """The given numbers as an array. All axes but the first, the batch, must have the sizes that `export.json` lists."""
+    array = np.asarray(given, like["type"])
+    sizes = tuple(like["shape"][1:])
+    if array.shape[array.ndim - len(sizes) :] != sizes:
+        expected = ", ".join(map(str, like["shape"]))
+        raise ValueError(f"{key} must have the shape ({expected}), and has {array.shape}")
+    return array
 
 
 def reward(before, action, after, name="reward", **more):

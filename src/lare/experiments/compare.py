@@ -35,6 +35,30 @@ def find_runs(places: Sequence[Path]) -> list[Run]:
     return [read_measured(directory) for directory in directories.values()]
 
 
+def comparable(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """The runs that have an evaluation, and remarks on runs that were not trained to their end.
+
+    Raises:
+        LareError: no run has an evaluation.
+    """
+    found, remarks = [], []
+    for run in runs:
+        if not (lines := run.metrics()):
+            remarks.append(f"{run.directory} has no evaluation yet, and is left out")
+            continue
+        found.append(run)
+        if (reached := lines[-1]["step"]) < run.config.settings.steps:
+            remarks.append(
+                f"{run.directory} has only reached step {reached:,} of {run.config.settings.steps:,}, so no run is compared at a "
+                "later step"
+            )
+        if warning := run.config.settings.untrained:
+            remarks.append(f"{run.directory}: {warning}")
+    if not found:
+        raise LareError(f"{', '.join(str(run.directory) for run in runs)}: no run has an evaluation yet")
+    return found, remarks
+
+
 def cells(comparison: Comparison) -> list[tuple[str, ...]]:
     """The table, as text."""
     return [

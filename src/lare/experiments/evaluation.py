@@ -1,6 +1,7 @@
-"""The evaluation of a finished (or stopped) run."""
+"""The evaluation of a finished (or stopped) run, and the returns of random actions."""
 
-from contextlib import closing
+import time
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 
@@ -10,8 +11,10 @@ from jaxtyping import Float
 from lare.errors import LareError
 from lare.run.directory import Run, as_run
 from lare.tasks.env import HostEnv
-from lare.tasks.spec import check_against_environment
+from lare.tasks.play import episode_of
+from lare.tasks.spec import TaskSpec, check_against_environment
 from lare.tasks.table import make_env, make_host_env
+from lare.tasks.trust import unknown_module
 from lare.tasks.workers import LocalEnvs
 from lare.training.collect_device import DeviceCollector
 from lare.training.collect_host import evaluate, policy
@@ -21,6 +24,9 @@ from lare.training.session import load_actor
 
 AT_A_TIME = 20
 """Environments of a seed that are open at the same time."""
+
+RANDOM_EPISODES, PATIENCE = 10, 5.0
+"""The largest number of episodes with random actions, and the seconds within which they begin."""
 
 
 def evaluate_run(
@@ -63,3 +69,17 @@ def evaluation_of(run: Run, episodes: int, best: bool = False) -> Evaluation:
             act = policy(functions, config, actor, run.seeds, some)
             parts.append(evaluate(envs, act, run.seeds, some, first))
     return together(parts)
+
+
+def random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
+    """True returns of random actions: up to ten episodes, or as many as begin within some seconds.
+
+    Empty if the environment must not be imported for a report, or does not run.
+    """
+    found, until = [], time.monotonic() + PATIENCE
+    if unknown_module(task) is None:
+        with suppress(LareError), closing(make_host_env(task.roles[0])) as env:
+            while len(found) < RANDOM_EPISODES and time.monotonic() < until:
+                random = np.random.default_rng(len(found))
+                found.append(episode_of(env, task.roles[0], None, random, len(found)).total)
+    return np.array(found)

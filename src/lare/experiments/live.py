@@ -6,8 +6,9 @@ from html import escape
 from pathlib import Path
 
 from lare.errors import LareError
+from lare.experiments.evaluation import random_returns
 from lare.experiments.html import note, write_page
-from lare.experiments.report import learning, random_returns, verdicts
+from lare.experiments.report import learning, verdicts
 from lare.run.directory import read_measured
 from lare.training.progress import Metrics
 
@@ -19,15 +20,16 @@ REFRESH = 10
 
 
 class LivePage:
-    """Writes the page, and opens it in the browser when training begins. Errors of writing are ignored."""
+    """Writes the page, and opens it in the browser when training begins if `browser`. Errors of writing are ignored."""
 
-    def __init__(self, directory: Path):
-        self.directory, self.running, self.random = directory, False, None
+    def __init__(self, directory: Path, browser: bool = True):
+        self.directory, self.browser, self.running, self.random = directory, browser, False, None
 
     def started(self, name: str, step: int, steps: int) -> None:
         self.running = True
         self.draw()
-        webbrowser.open((self.directory / PAGE).resolve().as_uri())
+        if self.browser:
+            webbrowser.open((self.directory / PAGE).resolve().as_uri())
 
     def stepped(self, step: int) -> None: ...
     def said(self, message: str) -> None: ...

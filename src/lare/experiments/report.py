@@ -3,9 +3,7 @@
 import base64
 import json
 import re
-import time
 from collections.abc import Iterable, Sequence
-from contextlib import closing, suppress
 from html import escape
 from itertools import groupby
 from pathlib import Path
@@ -19,6 +17,7 @@ from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
 from lare.experiments.credit import credit_of, factor_labels
+from lare.experiments.evaluation import random_returns
 from lare.experiments.html import factor_table, function_text, note, table, write_page
 from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN, RETURN_R2, RETURN_STD
 from lare.experiments.statistics import mean_and_deviation, plus_minus
@@ -28,10 +27,9 @@ from lare.run.directory import Run, open_run, read_config
 from lare.run.settings import Settings
 from lare.run.usual import resolve
 from lare.source import source
-from lare.tasks.play import episode_of
 from lare.tasks.spec import TaskSpec, shipped_tasks
-from lare.tasks.table import env_spec, make_host_env
-from lare.tasks.trust import TRUSTED, is_trusted, module_of
+from lare.tasks.table import env_spec
+from lare.tasks.trust import TRUSTED, unknown_module
 from lare.training.explain import explanation_of
 
 FILM, LARGEST_FILM = "film.gif", 64 << 20
@@ -39,9 +37,6 @@ FILM, LARGEST_FILM = "film.gif", 64 << 20
 
 COMMAND = re.compile(r"`([^`]*)`")
 """A command within a sentence."""
-
-RANDOM_EPISODES, PATIENCE = 10, 5.0
-"""The largest number of episodes with random actions, and the seconds within which they begin."""
 
 TOP = "In public benchmarks, a million steps of TD3 on true rewards"
 """Explains the upper ends of `REFERENCES`."""
@@ -93,26 +88,6 @@ def read_run(directory: Path) -> Run:
     """A run. If only its files name the module of its environment, it comes without functions: a report imports no such module."""
     config = read_config(directory)
     return open_run(directory) if unknown_module(config.task) is None else Run(directory, config, ())
-
-
-def unknown_module(task: TaskSpec) -> str | None:
-    """The module that a task's environment would import, unless this process has imported it, or the user trusts it."""
-    module = module_of(task)
-    return None if module is None or is_trusted(module) else module
-
-
-def random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
-    """True returns of random actions: up to ten episodes, or as many as begin within some seconds.
-
-    Empty if the environment must not be imported for a report, or does not run.
-    """
-    found, until = [], time.monotonic() + PATIENCE
-    if unknown_module(task) is None:
-        with suppress(LareError), closing(make_host_env(task.roles[0])) as env:
-            while len(found) < RANDOM_EPISODES and time.monotonic() < until:
-                random = np.random.default_rng(len(found))
-                found.append(episode_of(env, task.roles[0], None, random, len(found)).total)
-    return np.array(found)
 
 
 def verdicts(runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> Iterable[str]:

@@ -84,7 +84,7 @@ class Row:
     better: Estimate | None
     """Probability that a run scores more than a run of the first method; None for the first method, and for single seeds."""
     p: float | None
-    """Probability of at least so many won pairs of runs by chance, or of so few if fewer than half were won (`mann_whitney_p`).
+    """Probability of at least so many won pairs of runs by chance, or of so few if fewer than half were won (`mann_whitney`).
 
     None like `better`, and for more than `MOST_SPLITS` ways to split the runs, where the interval says enough.
     """
@@ -163,13 +163,15 @@ def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:
         (better,) = estimates((mine, last[first]), lambda *both: np.array([metrics.probability_of_improvement(*both)]))
         if math.comb(len(mine) + len(last[first]), len(mine)) <= MOST_SPLITS:
             pairs = list(zip(mine.T, last[first].T, strict=True))
-            p = min(mann_whitney_p(pairs), mann_whitney_p([(theirs, ours) for ours, theirs in pairs]))
+            p = min(mann_whitney(pairs))
     mean, deviation = mean_and_deviation(mine.mean(axis=1))
     return Row(group.label, len(group.seeds), len(group.draws), iqm, mean, deviation, over_draws, better, p)
 
 
-def mann_whitney_p(pairs: Sequence[tuple[Float[np.ndarray, " ours"], Float[np.ndarray, " theirs"]]]) -> float:
-    """The probability that at least so many pairs are won by chance: the exact Mann-Whitney test, over several tasks.
+def mann_whitney(
+    pairs: Sequence[tuple[Float[np.ndarray, " ours"], Float[np.ndarray, " theirs"]]],
+) -> tuple[float, float]:
+    """The probabilities that by chance at least so many, and at most so many, pairs are won: the exact test, over several tasks.
 
     U = sum over tasks and over all pairs of [ours > theirs] + [ours = theirs] / 2. If both had the same distribution, all ways to
     split the values of each task into two groups would be equally likely.
@@ -184,7 +186,9 @@ def mann_whitney_p(pairs: Sequence[tuple[Float[np.ndarray, " ours"], Float[np.nd
         for (before, chance), one in itertools.product(chances.items(), dealt):
             grown[before + one] = grown.get(before + one, 0.0) + chance / len(ways)
         chances = grown
-    return min(1.0, sum(chance for total, chance in chances.items() if total >= won))
+    more = sum(chance for total, chance in chances.items() if total >= won)
+    fewer = sum(chance for total, chance in chances.items() if total <= won)
+    return min(1.0, more), min(1.0, fewer)
 
 
 def mann_whitney_u(ours: Float[np.ndarray, " ours"], theirs: Float[np.ndarray, " theirs"]) -> float:

@@ -55,3 +55,9 @@ def installed_places() -> set[Path]:
     paths = sysconfig.get_paths()
     known = [*(paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")), *site.getsitepackages()]
     return {Path(place).resolve() for place in (*known, site.getusersitepackages())}
+
+
+def unknown_module(task: TaskSpec) -> str | None:
+    """The module that a task's environment would import, unless this process has imported it, or the user trusts it."""
+    module = module_of(task)
+    return None if module is None or is_trusted(module) else module
