@@ -149,6 +149,21 @@ def test_a_later_fit_goes_on_where_the_earlier_one_ended():
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("count", [4, 6, 12, 18])
+@pytest.mark.parametrize("share_of_noise", [1e-9, 0.999])
+def test_a_fit_leaves_a_maximum_in_which_the_earlier_one_was_caught(share_of_noise, count):
+    """Nothing was noise to the earlier fit, or everything was. The later one is no worse than one from the beginning."""
+    means, returns, length, _ = episodes(count=count, noise=0.3)
+    sums = summed(means, returns, length)
+    afresh = fit(sums)
+    given = evidence.problem(sums, 0, GROUP)
+    caught = afresh._replace(
+        alpha=given.equal * (1e4 if share_of_noise > 0.5 else 1e-4), beta=given.free / given.q / share_of_noise
+    )
+    found = fitted(sums, 0, tuple(GROUP.tolist()), 100, caught)
+    assert float(found.log_evidence) >= float(afresh.log_evidence) - 0.01
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_deviation_is_as_large_as_the_error(seed):
     """Of all features, two deviations cover nineteen of twenty errors, about; and more episodes make them smaller."""

@@ -44,6 +44,8 @@ ROUNDING = 1e-10
 factorised if features are collinear."""
 GAIN = 1e-3
 """The iteration to the fixed point ends when a round changes the log evidence by less than this."""
+ENOUGH = 2
+"""With more episodes than this for each feature, a fit is not made from the beginning again."""
 LEAST_NOISE = 1e-10
 """Smallest variance of the noise, relative to that of the returns. Float32 features and returns cannot resolve less."""
 
@@ -143,17 +145,37 @@ def fit(
 ) -> Posterior:
     """The posterior under the precisions that the iteration to the fixed point gives.
 
+    The evidence may have several maxima while episodes are few: one where all variation is noise, and one where none is and the
+    features interpolate the returns. An iteration that starts near such a maximum stays there, however many episodes follow. So
+    there are two iterations: from `start`, and from equal shares of the groups with half of the variation as noise. The one that
+    reaches the larger evidence is taken. With more than `ENOUGH` episodes for each feature the second one has a single round.
+
     Args:
         sums: the sums over episodes.
         form: 0 if the score is a sum over the steps, 1 if it is an average.
         group: the index of each feature's group.
         start: an earlier fit, whose precisions start the iteration; or `unknown`.
-        rounds: the maximum number of rounds. The iteration ends earlier if the evidence stops changing.
+        rounds: the maximum number of rounds of each iteration.
     """
     given = problem(sums, form, group)
-    alpha = jnp.where(start.alpha > 0, start.alpha, given.equal)
-    beta = jnp.where(start.beta > 0, start.beta, 2 * given.free / given.q)
-    first = one_round(given, alpha, beta)
+    known = start.beta > 0
+    equal = given.equal, 2 * given.free / given.q
+    before = tuple(jnp.where(known, old, new) for old, new in zip((start.alpha, start.beta), equal, strict=True))
+    starts = jax.tree.map(lambda *leaves: jnp.stack(leaves), before, equal)
+    most = jnp.stack([jnp.array(rounds), jnp.where(known & (given.free < ENOUGH * len(group)), rounds, 1)])
+    of_each = jax.lax.map(lambda one: fixed_point(given, *one), (*starts, most))
+    found = jax.tree.map(lambda leaf: leaf[jnp.argmax(jnp.nan_to_num(of_each.log_evidence, nan=-jnp.inf))], of_each)
+    enough = (given.free > 0) & (given.unit > 0)
+    found = jax.tree.map(lambda new, old: jnp.where(enough, new, old), found, start)
+    weight = jnp.where(enough, given.unit * found.weight, 0)
+    bias = sums.mean[len(group) + form] - weight @ sums.mean[: len(group)]
+    return found._replace(weight=weight, bias=bias)
+
+
+def fixed_point(
+    given: Problem, alpha: Float[Array, " groups"], beta: Float[Array, ""], rounds: int | Int[Array, ""]
+) -> Posterior:
+    """The iteration from some precisions on, at most `rounds` rounds. It ends earlier if the evidence stops changing."""
 
     def unsettled(state: tuple[Int[Array, ""], Float[Array, ""], Posterior]) -> Bool[Array, ""]:
         done, before, known = state
@@ -165,13 +187,9 @@ def fit(
         done, _, known = state
         return done + 1, known.log_evidence, one_round(given, known.alpha, known.beta)
 
+    first = one_round(given, alpha, beta)
     begin = jnp.array(1), jnp.full_like(first.log_evidence, -jnp.inf), first
-    found = jax.lax.while_loop(unsettled, again, begin)[2]
-    enough = (given.free > 0) & (given.unit > 0)
-    found = jax.tree.map(lambda new, old: jnp.where(enough, new, old), found, start)
-    weight = jnp.where(enough, given.unit * found.weight, 0)
-    bias = sums.mean[len(group) + form] - weight @ sums.mean[: len(group)]
-    return found._replace(weight=weight, bias=bias)
+    return jax.lax.while_loop(unsettled, again, begin)[2]
 
 
 def within(
