@@ -25,7 +25,7 @@ def said(returns, random=CHANCE, **facts):
             np.vstack([RISING, RISING + 2]),
             {"return_r2": 0.97, "latent": True, "at_the_end": 12.0},
             [
-                "It learned. The return is 71 ± 1.41 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 0.816.",
+                "It learned. The return is 71 ± 1.41 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1.",
                 "That is more than training on the return at the end alone gives here (12).",
                 "Its proxy rewards, from factors and raw features, explain nearly all of the score: R² of the last returns, before "
                 "they were learned from, is 0.97.",
@@ -36,7 +36,7 @@ def said(returns, random=CHANCE, **facts):
             FLAT - 50,
             {"return_r2": -3.0, "latent": True},
             [
-                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 0.816.",
+                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1.",
                 "Its proxy rewards, from factors and raw features, explain next to nothing of the score: R² of the last returns, "
                 "before they were learned from, is -3.00.",
                 "Next: the score depends on something else. `lare design Toy --reflect 2 --model NAME` asks for another phi; "
@@ -48,11 +48,12 @@ def said(returns, random=CHANCE, **facts):
             FLAT - 50,
             {"return_r2": 0.9},
             [
-                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 0.816.",
+                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1.",
                 "Its proxy rewards, from raw features, explain nearly all of the score: R² of the last returns, before they were "
                 "learned from, is 0.90.",
-                "Next: the proxy rewards are good, so it depends on the algorithm: more `--steps`, or another `--algorithm` "
+                "Next: returns are predicted well, so it may depend on the algorithm: more `--steps`, or another `--algorithm` "
                 "(`lare algorithms`).",
+                "A score that depends on products of entries, such as price times power, needs a phi (`lare prompt`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),
@@ -60,7 +61,7 @@ def said(returns, random=CHANCE, **facts):
             FELL,
             {"at_the_end": 40.0},
             [
-                "It learned. The return is 31 after 8,000 steps; random actions get 0 ± 0.816.",
+                "It learned. The return is 31 after 8,000 steps; random actions get 0 ± 1.",
                 "That is no more than training on the return at the end alone gives here (40).",
                 "Next: it was better before, 92 at step 4,000. `lare evaluate runs/x --best` plays the best policy of each seed.",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
@@ -70,7 +71,7 @@ def said(returns, random=CHANCE, **facts):
             FLAT - 1000,
             {},
             [
-                "It got worse than random actions. The return is -949 after 8,000 steps; random actions get 0 ± 0.816.",
+                "It got worse than random actions. The return is -949 after 8,000 steps; random actions get 0 ± 1.",
                 "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
@@ -79,7 +80,7 @@ def said(returns, random=CHANCE, **facts):
             np.vstack([FLAT - 50, FLAT - 50]),
             {"return_r2": -0.93, "usual_r2": 0.98, "latent": True},
             [
-                "It has not learned yet. The return is 1 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 0.816.",
+                "It has not learned yet. The return is 1 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1.",
                 "Its proxy rewards, from factors and raw features, usually explain the score (median R² of returns: 0.98), but not "
                 "the last episodes (R² -0.93): the policy has changed, and the decoder has to adapt.",
                 "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
@@ -90,7 +91,7 @@ def said(returns, random=CHANCE, **facts):
             {},
             [
                 "It has not learned yet. The return is 0.5 ± 0.707 after 8,000 steps (mean over 2 seeds); random actions get "
-                "0 ± 0.816.",
+                "0 ± 1.",
                 "Next: one seed was better than random actions at step 3,000 (38). `lare evaluate runs/x --best` plays the best "
                 "policy of each seed. To continue: more `--steps`, or another `--algorithm`.",
             ],
@@ -100,6 +101,18 @@ def said(returns, random=CHANCE, **facts):
 )  # fmt: skip
 def test_what_is_said(returns, facts, sentences):
     assert said(returns, **facts) == sentences
+
+
+def test_a_policy_that_was_never_updated_has_learned_nothing():
+    assert said(RISING, untrained="all 8,000 steps are random") == [
+        "Nothing was learned: all 8,000 steps are random.",
+    ]
+
+
+def test_better_than_chance_is_not_learned_if_the_policy_was_so_before_training():
+    began = "after 8,000 steps; random actions get 0 ± 1, the policy before training"
+    assert said(FLAT, before=51.0)[0] == f"It has not learned yet. The return is 51 {began} 51."
+    assert said(FLAT, before=30.0)[0] == f"It learned. The return is 51 {began} 30."
 
 
 def test_without_random_play_the_return_alone_is_said():

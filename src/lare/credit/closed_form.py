@@ -38,7 +38,7 @@ GROWTH_OF_SUMS = 1.5
 GROWTH_OF_FIT = 1.05
 """The decoder is fitted again when the number of episodes has grown by this factor."""
 ROUNDS = 20
-"""Maximum number of rounds of the evidence's fixed point in each fit. A fit starts from the result of the last one."""
+"""Maximum number of rounds of the evidence's fixed point from each of its starts."""
 
 
 class LinearDecoder(eqx.Module):

@@ -105,11 +105,23 @@ def verdicts(runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> It
             return_r2=None if predicted is None else last_known(predicted[1]),
             usual_r2=None if predicted is None else median_of_known(predicted[1]),
             latent=method.latent,
+            untrained=run.config.settings.untrained,
+            before=before_training(run),
             directory=str(run.directory),
             task=run.config.task.name if run.config.task.name in shipped_tasks() else f"{run.config.task.name}.toml",
         )
         said = COMMAND.sub(r"<code>\1</code>", escape(" ".join(verdict(facts))))
         yield f'<p class="verdict"><strong>{escape(name)}.</strong> {said}</p>'
+
+
+def before_training(run: Run) -> float | None:
+    """The return of the policy before its first update, if it was evaluated."""
+    found = [
+        line[RETURN]
+        for line in run.metrics()
+        if line["step"] <= run.config.settings.warmup and line.get(RETURN) is not None
+    ]
+    return float(np.mean(found)) if found else None
 
 
 def labels(runs: Sequence[Run]) -> list[str]:

@@ -32,6 +32,10 @@ class Facts:
     """The median of the same over all evaluations and seeds."""
     latent: bool = False
     """Whether the method has a phi."""
+    untrained: str | None = None
+    """Why the policy was never trained; None if it was."""
+    before: float | None = None
+    """The return of the policy before its first update; None if it was not evaluated."""
     directory: str = "RUN"
     task: str = "TASK"
     """The name of a shipped task, or the name of a task file."""
@@ -51,28 +55,42 @@ def verdict(run: Facts) -> list[str]:
     """A few sentences, the most important first; commands are in backticks."""
     if not np.isfinite(run.returns[:, -1]).any():
         return ["Nothing can be said: the last evaluation gave no return."]
+    if run.untrained is not None:
+        return [f"Nothing was learned: {run.untrained}."]
     return [learned(run), *compared(run), *told(run), *todo(run)]
 
 
 def learned(run: Facts) -> str:
-    """Whether it is better than random actions."""
+    """Whether it is better than random actions, and than the policy before training."""
     reached = f"The return is {shown(run.last)}" + (f" ± {shown(run.spread)}" if run.spread else "")
     reached += f" after {int(run.steps[-1]):,} steps"
     reached += f" (mean over {len(run.returns)} seeds)" if len(run.returns) > 1 else ""
     if not len(run.random):
         return f"{reached}."
-    by_chance = f"random actions get {shown(float(run.random.mean()))} ± {shown(float(run.random.std()))}"
-    if better_than_chance(run):
+    by_chance = f"random actions get {shown(float(run.random.mean()))} ± {shown(deviation(run.random))}"
+    if run.before is not None:
+        by_chance += f", the policy before training {shown(run.before)}"
+    if better_than_chance(run) and (run.before is None or run.last > run.before + 2 * noise(run)):
         return f"It learned. {reached}; {by_chance}."
-    if run.last < run.random.mean() - 2 * run.random.std():
+    if run.last < run.random.mean() - 2 * noise(run):
         return f"It got worse than random actions. {reached}; {by_chance}."
     return f"It has not learned yet. {reached}; {by_chance}."
 
 
 def better_than_chance(run: Facts) -> bool:
-    """Whether the return is above nearly all that random actions get, in the mean over the seeds."""
-    noise = max(float(run.random.std()), run.spread / math.sqrt(len(run.returns)), 1e-9)
-    return run.last > float(run.random.mean()) + 2 * noise
+    """Whether the mean return over the seeds is above that of random actions by two standard errors."""
+    return run.last > float(run.random.mean()) + 2 * noise(run)
+
+
+def noise(run: Facts) -> float:
+    """The larger one of two standard errors: of the mean return of random actions, and of the mean over the seeds."""
+    of_random = deviation(run.random) / math.sqrt(max(1, len(run.random)))
+    return max(of_random, run.spread / math.sqrt(len(run.returns)), 1e-9)
+
+
+def deviation(values: Float[np.ndarray, " episodes"]) -> float:
+    """The standard deviation (n - 1); 0 for fewer than two values."""
+    return float(values.std(ddof=1)) if len(values) > 1 else 0.0
 
 
 def compared(run: Facts) -> list[str]:
@@ -132,8 +150,12 @@ def todo(run: Facts) -> list[str]:
         )
     elif len(run.random) and not better_than_chance(run):
         good = (run.return_r2 or 0) > MOSTLY
-        what = "the proxy rewards are good, so it depends on the algorithm" if good else "it may need more steps"
+        what = "returns are predicted well, so it may depend on the algorithm" if good else "it may need more steps"
         found.append(f"Next: {what}: more `--steps`, or another `--algorithm` (`lare algorithms`).")
+        if good and not run.latent:
+            found.append(
+                "A score that depends on products of entries, such as price times power, needs a phi (`lare prompt`)."
+            )
     if len(run.returns) == 1:
         found.append("One seed says little: another one may reach a different return (`--seeds 3`).")
     return found
@@ -174,7 +196,7 @@ def seed_above_chance(run: Facts) -> tuple[int, float] | None:
         return None
     place, best = np.unravel_index(np.nanargmax(run.returns), run.returns.shape)
     top = float(run.returns[place, best])
-    above = top > run.random.mean() + 3 * max(float(run.random.std()), 1e-9)
+    above = top > run.random.mean() + 3 * max(deviation(run.random), 1e-9)
     return (int(run.steps[best]), top) if above else None
 
 

@@ -29,6 +29,7 @@ SENTENCE = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
 FIGURE = re.compile(r"^```\{.*?^```|<[^<>\n]+>", re.MULTILINE | re.DOTALL)
 NOISE = re.compile(r"^!\[|^:?-{3,}|^```|^\s*$")
+JUDGES = 'judges = "after" # phi sees the observation after the step; "before": the one in which the agent acts; "both"'
 SCORE = '# score = "average" # a mean over the steps, or a grade; "sum": a sum over the steps. If unset, training determines it'
 ELSEWHERE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.IGNORECASE)
 """References to figures, which are useless outside the original page."""
@@ -109,7 +110,7 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
         f'environment = "{full_id}"',
         f"observation_size = {observation_size}",
         f"action_size = {action_size}",
-        'judges = "after"',
+        JUDGES,
         SCORE,
         *([] if limit else ["max_episode_steps = 1000 # the environment has no limit of its own"]),
         *bodies(texts, heads),

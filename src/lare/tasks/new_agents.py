@@ -13,6 +13,7 @@ from lare.tasks.agents import Agent, kind
 from lare.tasks.construct import construct, limit_of
 from lare.tasks.env import Team
 from lare.tasks.new import (
+    JUDGES,
     SCORE,
     Draft,
     bodies,
@@ -72,7 +73,7 @@ def draft_of_agents(environment_id: str) -> Draft:
         f'environment = "{environment_id}"',
         *head,
         *sizes,
-        'judges = "after"',
+        JUDGES,
         SCORE,
         *([] if limit else ["max_episode_steps = 1000 # the environment does not state its own limit"]),
         *([f"# arguments = {{ {arguments} }} # the defaults, unless they are set here"] if arguments else []),
@@ -137,7 +138,7 @@ def write_team(
         f'environment = "{environment_id}"',
         f"agents = {json.dumps([one for one in patterns(team.name) if matched(one, members)])}",
         *sizes,
-        'judges = "after"',
+        JUDGES,
         *bodies(own, heads_of(host, team)),
     ]
     return "\n".join(lines) + "\n"
