@@ -1,0 +1,124 @@
+"""What it is worth to make each closed-form fit from the beginning too, and not only from the last fit.
+
+    python benchmarks/two_starts.py RUN
+
+RUN is a finished run of HalfCheetah-v4 that still has its replay. Its stored episodes get new scores, in the eight ways of
+`basis.py`. They come one after the other: each return is predicted before the decoder is fitted to it. The results have, for both
+ways to fit and for every score: R^2 of the returns that were predicted so, over several ranges of episodes, mean over the seeds;
+and in how many fits the evidence was smaller by more than 1 if only the last fit was continued.
+"""
+
+import sys
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from basis import SPEED, scores
+from lare.credit import evidence
+from lare.credit.basis import Basis, expand
+from lare.credit.closed_form import ROUNDS
+from lare.credit.evidence import Posterior, Sums
+from lare.data import replay
+from lare.run.directory import open_run
+from lare.training.seeds import of_seed
+from lare.training.session import load_learner
+from measure import write
+
+RANGES = ((10, 20), (20, 40), (40, 60))
+
+
+def continued(sums: Sums, basis: Basis, start: Posterior) -> Posterior:
+    """A fit from the last one alone."""
+    given = evidence.problem(sums, 0, basis.group)
+    known = start.beta > 0
+    alpha = jnp.where(known, start.alpha, given.equal)
+    found = evidence.fixed_point(given, alpha, jnp.where(known, start.beta, 2 * given.free / given.q), ROUNDS)
+    enough = given.free > 0
+    found = jax.tree.map(lambda new, old: jnp.where(enough, new, old), found, start)
+    weight = jnp.where(enough, given.unit * found.weight, 0)
+    return found._replace(weight=weight, bias=sums.mean[basis.size] - weight @ sums.mean[: basis.size])
+
+
+def from_both(sums: Sums, basis: Basis, start: Posterior) -> Posterior:
+    return evidence.fit(sums, 0, basis.group, start, ROUNDS)
+
+
+WAYS = {"from the last fit alone": continued, "from both starts": from_both}
+
+
+@partial(jax.jit, static_argnames=("way", "basis"))
+def learn(
+    sums: Sums, known: Posterior, mean: Array, total: Array, length: Array, way: str, basis: Basis
+) -> tuple[Sums, Posterior]:
+    sums = evidence.add_episodes(sums, mean[None], total[None], length[None])
+    return sums, WAYS[way](sums, basis, known)
+
+
+def predicted(means: np.ndarray, returns: np.ndarray, length: np.ndarray, way: str, basis: Basis) -> list[Any]:
+    """Of each episode: its prediction, and the log evidence of the fit that follows it."""
+    state = evidence.no_sums(basis.size), evidence.unknown(basis.size, len(basis.sizes))
+    sums, known = jax.tree.map(lambda leaf: leaf.astype(float), state)
+    found = []
+    for mean, total, steps in zip(means, returns, length, strict=True):
+        guess = float(steps * (mean @ known.weight + known.bias))
+        sums, known = learn(sums, known, jnp.asarray(mean), jnp.asarray(total), jnp.asarray(steps), way, basis)
+        found.append((guess, float(known.log_evidence)))
+    return found
+
+
+def of_each_seed(directory: str) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray], np.ndarray, Basis]]:
+    """Mean features of the episodes, the returns of each score, the lengths, and the basis."""
+    run = open_run(directory)
+    learner = load_learner(run)[1]
+    for place in range(len(run.seeds)):
+        one = of_seed(learner, place)
+        steps = replay.read(one.replay, replay.newest(one.replay, int(one.replay.transitions[0])))
+        after, action, z = (
+            np.asarray(part)[0, :, 0]
+            for part in (steps.after["observation"], steps.before["action"], steps.before["factors"])
+        )
+        ends = np.flatnonzero(np.asarray(steps.last)[0]) + 1
+        inputs = np.concatenate([z, after, np.clip(action, -1, 1)], axis=1)[: ends[-1]]
+        basis = Basis(z.shape[1], inputs.shape[1] - z.shape[1], True)
+        # The first ten episodes are random, and standardise all of them here; in training the statistics follow the policy.
+        first = inputs[: ends[9]]
+        features = np.asarray(expand(basis, jnp.asarray((inputs - first.mean(axis=0)) / first.std(axis=0))), np.float64)
+        begins, length = np.append(0, ends[:-1]), np.diff(np.append(0, ends))
+        means = np.add.reduceat(features, begins) / length[:, None]
+        reward = np.asarray(steps.before["reward"])[0, : ends[-1], 0]
+        truths = scores(after[: ends[-1]], action[: ends[-1]], reward, SPEED[run.config.task.name])
+        yield means, {name: np.add.reduceat(one, begins) for name, one in truths.items()}, length, basis
+
+
+def r2(returns: np.ndarray, guesses: np.ndarray) -> float:
+    return float(1 - np.sum((returns - guesses) ** 2) / np.sum((returns - returns.mean()) ** 2))
+
+
+def main(directory: str) -> None:
+    table: dict[str, dict[str, Any]] = {}
+    fits = 0
+    seeds = list(of_each_seed(directory))
+    with jax.enable_x64(True):
+        for means, totals, length, basis in seeds:
+            for score, returns in totals.items():
+                of_way = {way: np.array(predicted(means, returns, length, way, basis)) for way in WAYS}
+                row = table.setdefault(score, {way: [] for way in WAYS} | {"caught": 0})
+                for way, found in of_way.items():
+                    row[way].append([r2(returns[a:b], found[a:b, 0]) for a, b in RANGES])
+                lower = of_way["from both starts"][10:, 1] - of_way["from the last fit alone"][10:, 1]
+                row["caught"] += int(np.sum(lower > 1))
+                fits += len(lower)
+    print(f"R^2 of returns {', '.join(f'{a + 1} to {b}' for a, b in RANGES)}, mean over seeds")
+    for score, row in table.items():
+        shown = "; ".join(f"{way}: {np.round(np.mean(row[way], axis=0), 3).tolist()}" for way in WAYS)
+        print(f"{score:28} {shown}; caught in {row['caught']} fits")
+    write("two_starts", {"run": directory, "ranges": RANGES, "fits": fits, "scores": table})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
