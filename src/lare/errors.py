@@ -129,4 +129,6 @@ def in_words(problem: Mapping[str, Any], names: Sequence[str]) -> str:
         return f"there is no key {where!r}{did_you_mean(where, names)}"
     if problem["type"] == "model_type":
         said = "should be a table of settings, such as {'KEY': VALUE}"
+    if problem["type"] == "tuple_type":
+        said = "should be a list"
     return f"{where} = {shortened(problem['input'])}: {said[0].lower()}{said[1:]}" if where else said

@@ -90,7 +90,7 @@ MEANINGS = (
     "IQM: interquartile mean; of fewer than four seeds it is the mean. sd: standard deviation over the seeds (n - 1). Better than "
     "first: the probability that a run scores more than a run of the first method; of a single seed it is not given, and a "
     "probability of 0 or 1 has no interval. p: the probability of at least so many won (or lost) pairs of runs by chance (exact "
-    "Mann-Whitney test)."
+    "Mann-Whitney test, one-sided: a two-sided p is twice as large)."
 )
 
 
