@@ -117,7 +117,7 @@ def main(directory: str) -> None:
     for score, row in table.items():
         shown = "; ".join(f"{way}: {np.round(np.mean(row[way], axis=0), 3).tolist()}" for way in WAYS)
         print(f"{score:28} {shown}; caught in {row['caught']} fits")
-    write("two_starts", {"run": directory, "ranges": RANGES, "fits": fits, "scores": table})
+    write("two_starts", {"ranges": RANGES, "fits": fits, "scores": table})
 
 
 if __name__ == "__main__":
