@@ -11,6 +11,7 @@ those steps and of the mean error (in their standard deviations), and the median
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +19,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lare.credit import evidence
-from lare.data import replay
-from lare.run.directory import open_run
-from lare.training.seeds import of_seed
-from lare.training.session import load_learner
+from lare.run.directory import read_config
 from measure import write
+from stored import of_each_seed
 
 EPISODES = (8, 15, 25, 40, 60)
 ASKED = 5
@@ -105,6 +104,8 @@ def bases(z: Array, x: Array) -> Iterator[tuple[str, list[Array]]]:
     yield "entries, shapes", [x, CHOSEN(x)]
     yield "factors, pairs, entries", [z, pairs(z), x]
     yield "factors, entries, shapes of both; 3 frequencies, no pairs", [z, CHOSEN(z), x, CHOSEN(x)]
+    yield "entries, shapes, pairs", [x, CHOSEN(x), pairs(x)]
+    yield "all: pairs of entries too", [z, CHOSEN(z), pairs(z), x, CHOSEN(x), pairs(x)]
     for name, shape in SHAPES.items():
         yield f"all: {name}", [z, shape(z), pairs(z), x, shape(x)]
 
@@ -125,20 +126,10 @@ def standardised(rows: np.ndarray, known: int, until: int) -> Array:
 
 
 def main(directory: str) -> None:
-    run = open_run(directory)
-    learner = load_learner(run)[1]
+    task = read_config(Path(directory)).task.name
     found: dict[str, list[tuple[float, float]]] = {}
-    for place in range(len(run.seeds)):
-        one = of_seed(learner, place)
-        number = int(one.replay.transitions[0])
-        steps = replay.read(one.replay, replay.newest(one.replay, number))
-        after, action, z = (
-            np.asarray(part)[0, :, 0]
-            for part in (steps.after["observation"], steps.before["action"], steps.before["factors"])
-        )
-        action = np.clip(action, -1, 1)
-        ends = np.flatnonzero(np.asarray(steps.last)[0]) + 1
-        truths = scores(after, action, np.asarray(steps.before["reward"])[0, :, 0], SPEED[run.config.task.name])
+    for after, action, z, paid, ends in of_each_seed(directory):
+        truths = scores(after, action, paid, SPEED[task])
         for count in (n for n in EPISODES if n + ASKED <= len(ends)):
             known, until = ends[count - 1], ends[count + ASKED - 1]
             standard = [standardised(rows, known, until) for rows in (z, np.concatenate([after, action], axis=1))]
@@ -166,7 +157,7 @@ def main(directory: str) -> None:
             "fits": len(each),
         }
         print(f"{name:62s} {table[name]}")
-    write("basis", {"task": run.config.task.name, "episodes": EPISODES, "asked": ASKED, "bases": table})
+    write("basis", {"task": task, "episodes": EPISODES, "asked": ASKED, "bases": table})
 
 
 if __name__ == "__main__":

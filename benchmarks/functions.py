@@ -19,12 +19,10 @@ from jax import Array
 
 import lare
 from basis import ASKED, CHOSEN, fitted, pairs, scores, standardised
-from lare.data import replay
-from lare.run.directory import open_run
-from lare.training.seeds import of_seed
-from lare.training.session import load_learner
+from lare.run.directory import read_config
 from measure import write
 from missing_factors import FACTORS, source
+from stored import of_each_seed
 
 TASK, SPEED = "HalfCheetah-v4", 8
 EPISODES = (15, 30, 55)
@@ -51,17 +49,10 @@ def groups_of(z: Array | None, x: Array) -> Iterator[tuple[str, list[Array]]]:
 
 
 def main(directory: str) -> None:
-    run = open_run(directory)
-    learner = load_learner(run)[1]
     chosen: dict[str, lare.LatentFunction | None] = {**dict(functions()), "none": None}
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for place in range(len(run.seeds)):
-        one = of_seed(learner, place)
-        steps = replay.read(one.replay, replay.newest(one.replay, int(one.replay.transitions[0])))
-        after, action = (np.asarray(part)[0, :, 0] for part in (steps.after["observation"], steps.before["action"]))
-        action = np.clip(action, -1, 1)
-        ends = np.flatnonzero(np.asarray(steps.last)[0]) + 1
-        truths = scores(after, action, np.asarray(steps.before["reward"])[0, :, 0], SPEED)
+    for after, action, _, paid, ends in of_each_seed(directory):
+        truths = scores(after, action, paid, SPEED)
         x = np.concatenate([after, action], axis=1)
         for name, function in chosen.items():
             z = None if function is None else np.asarray(function(after, action))
@@ -89,7 +80,10 @@ def main(directory: str) -> None:
             "fits": len(each),
         }
         print(f"{name + ', ' + kind:44s} {table[f'{name}, {kind}']}")
-    write("functions", {"task": run.config.task.name, "episodes": EPISODES, "asked": ASKED, "functions": table})
+    write(
+        "functions",
+        {"task": read_config(Path(directory)).task.name, "episodes": EPISODES, "asked": ASKED, "functions": table},
+    )
 
 
 if __name__ == "__main__":

@@ -23,11 +23,8 @@ from lare.credit import evidence
 from lare.credit.basis import Basis, expand
 from lare.credit.closed_form import ROUNDS
 from lare.credit.evidence import Posterior, Sums
-from lare.data import replay
-from lare.run.directory import open_run
-from lare.training.seeds import of_seed
-from lare.training.session import load_learner
 from measure import write
+from stored import of_each_seed
 
 RANGES = ((10, 20), (20, 40), (40, 60))
 
@@ -38,10 +35,7 @@ def continued(sums: Sums, basis: Basis, start: Posterior) -> Posterior:
     known = start.beta > 0
     alpha = jnp.where(known, start.alpha, given.equal)
     found = evidence.fixed_point(given, alpha, jnp.where(known, start.beta, 2 * given.free / given.q), ROUNDS)
-    enough = given.free > 0
-    found = jax.tree.map(lambda new, old: jnp.where(enough, new, old), found, start)
-    weight = jnp.where(enough, given.unit * found.weight, 0)
-    return found._replace(weight=weight, bias=sums.mean[basis.size] - weight @ sums.mean[: basis.size])
+    return evidence.in_units(sums, 0, given, found, otherwise=start)
 
 
 def from_both(sums: Sums, basis: Basis, start: Posterior) -> Posterior:
@@ -71,27 +65,17 @@ def predicted(means: np.ndarray, returns: np.ndarray, length: np.ndarray, way: s
     return found
 
 
-def of_each_seed(directory: str) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray], np.ndarray, Basis]]:
-    """Mean features of the episodes, the returns of each score, the lengths, and the basis."""
-    run = open_run(directory)
-    learner = load_learner(run)[1]
-    for place in range(len(run.seeds)):
-        one = of_seed(learner, place)
-        steps = replay.read(one.replay, replay.newest(one.replay, int(one.replay.transitions[0])))
-        after, action, z = (
-            np.asarray(part)[0, :, 0]
-            for part in (steps.after["observation"], steps.before["action"], steps.before["factors"])
-        )
-        ends = np.flatnonzero(np.asarray(steps.last)[0]) + 1
-        inputs = np.concatenate([z, after, np.clip(action, -1, 1)], axis=1)[: ends[-1]]
+def episodes(directory: str) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray], np.ndarray, Basis]]:
+    """For each seed: mean features of the episodes, the returns of each score, the lengths, and the basis."""
+    for after, action, z, paid, ends in of_each_seed(directory):
+        inputs = np.concatenate([z, after, action], axis=1)[: ends[-1]]
         basis = Basis(z.shape[1], inputs.shape[1] - z.shape[1], True)
         # The first ten episodes are random, and standardise all of them here; in training the statistics follow the policy.
         first = inputs[: ends[9]]
         features = np.asarray(expand(basis, jnp.asarray((inputs - first.mean(axis=0)) / first.std(axis=0))), np.float64)
         begins, length = np.append(0, ends[:-1]), np.diff(np.append(0, ends))
         means = np.add.reduceat(features, begins) / length[:, None]
-        reward = np.asarray(steps.before["reward"])[0, : ends[-1], 0]
-        truths = scores(after[: ends[-1]], action[: ends[-1]], reward, SPEED[run.config.task.name])
+        truths = scores(*(part[: ends[-1]] for part in (after, action, paid)), SPEED["HalfCheetah-v4"])
         yield means, {name: np.add.reduceat(one, begins) for name, one in truths.items()}, length, basis
 
 
@@ -102,7 +86,7 @@ def r2(returns: np.ndarray, guesses: np.ndarray) -> float:
 def main(directory: str) -> None:
     table: dict[str, dict[str, Any]] = {}
     fits = 0
-    seeds = list(of_each_seed(directory))
+    seeds = list(episodes(directory))
     with jax.enable_x64(True):
         for means, totals, length, basis in seeds:
             for score, returns in totals.items():

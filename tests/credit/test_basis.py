@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit.basis import LARGEST, Basis, cosine_and_sine, expand, shapes
+from lare.credit.basis import LARGEST, MOST_PAIRED, Basis, cosine_and_sine, expand, shapes
 
 U = np.array([0.5, -1.0, 2.0, 9.0, -0.3], np.float32)
 """Three factors and two entries, one of which is far out."""
@@ -18,17 +18,24 @@ def series(u):
 
 def test_all_groups_by_hand():
     basis = Basis(3, 2, extended=True)
-    pairs = [0.5 * -1.0, 0.5 * 2.0, -1.0 * 2.0]
-    want = np.concatenate([U[:3], series(U[:3]), pairs, U[3:], series(U[3:])])
+    pairs, of_entries = [0.5 * -1.0, 0.5 * 2.0, -1.0 * 2.0], [4.0 * -0.3]
+    want = np.concatenate([U[:3], series(U[:3]), pairs, U[3:], series(U[3:]), of_entries])
     np.testing.assert_allclose(expand(basis, jnp.asarray(U)), want, rtol=1e-5, atol=1e-6)
-    assert list(basis.sizes.values()) == [3, 18, 3, 2, 12]
+    assert list(basis.sizes.values()) == [3, 18, 3, 2, 12, 1]
     assert basis.size == len(want) == len(basis.group)
-    assert basis.group.tolist() == [0] * 3 + [1] * 18 + [2] * 3 + [3] * 2 + [4] * 12
+    assert basis.group.tolist() == [0] * 3 + [1] * 18 + [2] * 3 + [3] * 2 + [4] * 12 + [5]
 
 
-def test_pairs_are_of_factors_within_four_deviations():
-    got = expand(Basis(2, 0, extended=True), jnp.array([3.0, 9.0]))
+@pytest.mark.parametrize("factors", [2, 0])
+def test_pairs_are_of_inputs_within_four_deviations(factors):
+    got = expand(Basis(factors, 2 - factors, extended=True), jnp.array([3.0, 9.0]))
     assert float(got[-1]) == 12
+
+
+def test_many_entries_get_no_pairs():
+    assert Basis(0, MOST_PAIRED, extended=True).sizes["pairs of entries"] == MOST_PAIRED * (MOST_PAIRED - 1) / 2
+    assert "pairs of entries" not in Basis(0, MOST_PAIRED + 1, extended=True).sizes
+    assert "pairs of entries" not in Basis(0, MOST_PAIRED, extended=False).sizes
 
 
 @pytest.mark.parametrize("extended", [False, True])

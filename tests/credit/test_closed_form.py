@@ -76,6 +76,22 @@ def test_rewards_are_found_whatever_the_factors_are_standardised_by():
     assert float(found.fitted) == 60
 
 
+@pytest.mark.parametrize("factors", [0, 2])
+def test_a_product_of_raw_entries_is_found(factors):
+    """Price times power: without pairs of entries, half of the variation of the rewards at most would be explained."""
+    random = np.random.default_rng(0)
+    rows = [random.normal(size=(12, 2 + factors)) for _ in range(150)]  # a phi, if any, of noise
+    paid = [one[:, -1] * (0.7 + one[:, -2]) for one in rows]
+    every, length = np.concatenate(rows), np.full(len(rows), 12)
+    with jax.enable_x64(True):
+        state = closed_form.init(Basis(factors, 2, extended=True), 1)
+        state = closed_form.begin_again(state, observe(new_mean_std(2 + factors), jnp.asarray(every, jnp.float32)))
+        state = with_episodes(state, rows, length, np.array([one.sum() for one in paid]))
+        found = closed_form.fit(state, (0,), rounds=60)
+        r_hat = closed_form.of_form(found.decoder, 0)(jnp.asarray(every, jnp.float32)).r_hat
+    assert np.corrcoef(r_hat, np.concatenate(paid))[0, 1] > 0.99
+
+
 def test_when_it_is_fitted_again():
     state = closed_form.init(PLAIN, 1)
     told = state.summed._replace(episodes=jnp.array([100.0, 0.0]))

@@ -53,7 +53,8 @@ def said(returns, random=CHANCE, **facts):
                 "learned from, is 0.90.",
                 "Next: returns are predicted well, so it may depend on the algorithm: more `--steps`, or another `--algorithm` "
                 "(`lare algorithms`).",
-                "A score that depends on products of entries, such as price times power, needs a phi (`lare prompt`).",
+                "If state and action have more than 12 entries together, a score that depends on products of them, such as price "
+                "times power, needs a phi (`lare prompt`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),

@@ -604,3 +604,18 @@ def test_ppo_must_learn_to_choose(method, tmp_path):
     run = lare.train(spec, settings, function=needed(method, function), out=tmp_path / "run", listeners=[])
     assert sessions.config_for(run).env.discrete
     assert run.metrics()[-1]["evaluation/return"] > 17
+
+
+def test_a_run_whose_state_has_another_structure_names_the_version_that_trained_it(small, tmp_path, monkeypatch):
+    """A version with pairs of entries, after one without."""
+    monkeypatch.setattr("lare.credit.basis.MOST_PAIRED", 0)
+    monkeypatch.setattr("lare.run.directory.source", lambda: "0.1.0")
+    run = lare.train(toy_spec(), small(method="bayes"), out=tmp_path / "run", listeners=[])
+    monkeypatch.undo()
+    jax.clear_caches()
+    with pytest.raises(LareError) as error:
+        lare.resume(run, steps=996)
+    assert str(error.value) == (
+        f"the checkpoint {run.checkpoint / 'state.npz'} cannot be read: .credit[0].decoder.weight has shape (2, 21), not (2, 24); "
+        f"the run is of LaRe 0.1.0, and this is LaRe {source()}"
+    )

@@ -7,10 +7,11 @@ With u = (x - mean) / deviation over all steps, where x is one of the factors z 
     pairs of factors    u_i u_j,  i < j
     entries             u_i
     shapes of entries   as those of the factors
+    pairs of entries    as those of the factors, if there are at most 12 entries
 
 Shapes are the first terms of the Fourier series of a function of one number, within four standard deviations of its mean.
 They can express "more is better up to this value", "near this value" or "beyond this value". Pairs express interactions of
-two factors. The returns decide which groups are needed (`evidence.py`).
+two factors or entries: price times power. The returns decide which groups are needed (`evidence.py`).
 
 The entries [s', a] are the state that a step led to and the action. The published s - s' would carry almost no information:
 its mean over an episode is close to zero, because the differences cancel.
@@ -27,6 +28,8 @@ HALF_PERIOD = 4.0
 """In standard deviations. Shapes are constant beyond this distance from the mean."""
 LARGEST = 512
 """Limit on the number of features. If the shapes of the entries would exceed it, entries get fewer frequencies, or none."""
+MOST_PAIRED = 12
+"""With more raw entries, there are no pairs of them: their number grows with the square of that of the entries."""
 MOST_ENTRIES = 1024
 """Limit on the number of raw entries. If there are more (images, for example), none is used: the time of a fit grows with the
 cube of the number of features."""
@@ -49,13 +52,13 @@ class Basis:
     @property
     def sizes(self) -> dict[str, int]:
         """The number of features in each group that is not empty, in order."""
-        pairs = self.factors * (self.factors - 1) // 2
         sizes = {"factors": self.factors}
         if self.extended:
-            sizes |= {"shapes of factors": 2 * FREQUENCIES * self.factors, "pairs of factors": pairs}
+            sizes |= {"shapes of factors": 2 * FREQUENCIES * self.factors, "pairs of factors": pairs_of(self.factors)}
         sizes["entries"] = self.used_entries
         if self.extended:
             sizes["shapes of entries"] = 2 * self.frequencies_of_entries * self.used_entries
+            sizes["pairs of entries"] = pairs_of(self.paired_entries)
         return {name: size for name, size in sizes.items() if size}
 
     @property
@@ -64,9 +67,14 @@ class Basis:
         return self.entries if self.entries <= MOST_ENTRIES else 0
 
     @property
+    def paired_entries(self) -> int:
+        """How many of the entries are in pairs: all or none."""
+        return self.entries if self.entries <= MOST_PAIRED else 0
+
+    @property
     def frequencies_of_entries(self) -> int:
         """The number of frequencies for each entry."""
-        factors = self.factors * (1 + 2 * FREQUENCIES) + self.factors * (self.factors - 1) // 2
+        factors = self.factors * (1 + 2 * FREQUENCIES) + pairs_of(self.factors)
         left = max(0, LARGEST - factors - self.entries)
         return min(FREQUENCIES, left // max(1, 2 * self.entries))
 
@@ -84,6 +92,18 @@ class Basis:
     def of_factors(self) -> Bool[np.ndarray, " features"]:
         """Which features are made of factors alone."""
         return np.repeat(["factors" in name for name in self.sizes], list(self.sizes.values()))
+
+
+def pairs_of(inputs: int) -> int:
+    """The number of pairs of different inputs."""
+    return inputs * (inputs - 1) // 2
+
+
+def pairs(u: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
+    """u_i u_j for i < j, each within four deviations."""
+    one, other = np.triu_indices(u.shape[-1], 1)
+    within = jnp.clip(u, -HALF_PERIOD, HALF_PERIOD)
+    return within[..., one] * within[..., other]
 
 
 def shapes(u: Float[Array, "*batch inputs"], frequencies: int) -> Float[Array, "*batch features"]:
@@ -118,15 +138,14 @@ def expand(basis: Basis, u: Float[Array, "*batch inputs"]) -> Float[Array, "*bat
     factors, entries = u[..., : basis.factors], u[..., basis.factors : basis.factors + basis.used_entries]
     if not basis.extended:
         return jnp.concatenate([factors, entries], axis=-1)
-    one, other = np.triu_indices(basis.factors, 1)
-    within = jnp.clip(factors, -HALF_PERIOD, HALF_PERIOD)
     return jnp.concatenate(
         [
             factors,
             shapes(factors, FREQUENCIES),
-            within[..., one] * within[..., other],
+            pairs(factors),
             entries,
             shapes(entries, basis.frequencies_of_entries),
+            pairs(entries[..., : basis.paired_entries]),
         ],
         axis=-1,
     )

@@ -165,10 +165,20 @@ def fit(
     most = jnp.stack([jnp.array(rounds), jnp.where(known & (given.free < ENOUGH * len(group)), rounds, 1)])
     of_each = jax.lax.map(lambda one: fixed_point(given, *one), (*starts, most))
     found = jax.tree.map(lambda leaf: leaf[jnp.argmax(jnp.nan_to_num(of_each.log_evidence, nan=-jnp.inf))], of_each)
+    return in_units(sums, form, given, found, otherwise=start)
+
+
+def in_units(
+    sums: Sums, form: Int[Array, ""] | int, given: Problem, found: Posterior, otherwise: Posterior
+) -> Posterior:
+    """A fixed point with weights in the unit of y, and b = y' - mu . m'. With fewer than two episodes, or if all returns are
+    equal, the weights are 0 and the precisions those of `otherwise`.
+    """
     enough = (given.free > 0) & (given.unit > 0)
-    found = jax.tree.map(lambda new, old: jnp.where(enough, new, old), found, start)
+    found = jax.tree.map(lambda new, old: jnp.where(enough, new, old), found, otherwise)
     weight = jnp.where(enough, given.unit * found.weight, 0)
-    bias = sums.mean[len(group) + form] - weight @ sums.mean[: len(group)]
+    features = len(given.group)
+    bias = sums.mean[features + form] - weight @ sums.mean[:features]
     return found._replace(weight=weight, bias=bias)
 
 

@@ -70,7 +70,7 @@ class Decoder(StrEnum):
     LINEAR = "linear"
     """A weighted sum of the inputs."""
     ADDITIVE = "additive"
-    """A weighted sum of the inputs, of functions of each input, and of pairs of factors (`basis.py`)."""
+    """A weighted sum of the inputs, of functions of each input, and of pairs of inputs (`basis.py`)."""
 
 
 class Reward(StrEnum):

@@ -165,9 +165,12 @@ def additive(graph: Graph, x: str, decoder: LinearDecoder) -> str:
         for wave, weight in (("Cos", cosine), ("Sin", sine)):
             if weight.any():
                 said = graph.apply("Add", said, graph.apply("MatMul", graph.apply(wave, angle), weight / k))
-    if "pairs of factors" in weights:
-        pairs = np.zeros((basis.inputs, basis.inputs), np.float32)
-        pairs[np.triu_indices(basis.factors, 1)] = weights["pairs of factors"]
+    pairs = np.zeros((basis.inputs, basis.inputs), np.float32)
+    for name, columns in (("pairs of factors", factors), ("pairs of entries", entries)):
+        if name in weights:
+            size = columns.stop - columns.start
+            pairs[columns, columns][np.triu_indices(size, 1)] = weights[name]
+    if pairs.any():
         products = graph.apply("Mul", within, graph.apply("MatMul", within, pairs.T))
         said = graph.apply("Add", said, graph.apply("MatMul", products, np.ones(basis.inputs, np.float32)))
     return said

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from lare.credit.basis import MOST_PAIRED
+
 NEXT_TO_NOTHING, MOSTLY = 0.1, 0.8
 """R^2 of returns: proxy rewards below the first explain next to nothing of the score, above the second nearly all."""
 
@@ -154,7 +156,8 @@ def todo(run: Facts) -> list[str]:
         found.append(f"Next: {what}: more `--steps`, or another `--algorithm` (`lare algorithms`).")
         if good and not run.latent:
             found.append(
-                "A score that depends on products of entries, such as price times power, needs a phi (`lare prompt`)."
+                f"If state and action have more than {MOST_PAIRED} entries together, a score that depends on products of them, "
+                "such as price times power, needs a phi (`lare prompt`)."
             )
     if len(run.returns) == 1:
         found.append("One seed says little: another one may reach a different return (`--seeds 3`).")

@@ -111,7 +111,9 @@ def load(directory: Path) -> CreditAssigner:
         credit = CreditAssigner.__new__(CreditAssigner)
         restore(credit, text, arrays, phi)
     except (*DAMAGED, TypeError, RecursionError) as error:
-        raise LareError(f"{directory} holds no credit assigner, or a damaged one: {shortened(error)}") from error
+        raise LareError(
+            f"{directory} holds no credit assigner, or one that is damaged or of another version: {shortened(error)}"
+        ) from error
     return credit
 
 

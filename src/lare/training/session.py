@@ -22,6 +22,7 @@ from lare.run import checkpoint
 from lare.run.best import Best
 from lare.run.directory import Run
 from lare.run.settings import ResolvedSettings
+from lare.source import source
 from lare.tasks.env import JaxEnv, Timestep
 from lare.tasks.table import env_spec, make_env
 from lare.training import first_fit, renew
@@ -178,9 +179,18 @@ drop = jax.jit(jax.vmap(forget_episodes))
 
 
 def load_learner(run: Run) -> tuple[TrainConfig, Learner, dict[str, Any], dict[str, np.ndarray]]:
-    """The training state of a run's last checkpoint, and the data that were saved with it."""
+    """The training state of a run's last checkpoint, and the data that were saved with it.
+
+    Raises:
+        LareError: there is no checkpoint, it is damaged, or it is of a version of LaRe whose state has another structure.
+    """
     config = config_for(run)
-    return config, *checkpoint.load(run.checkpoint, learner_shape(run, compiled(config)))
+    try:
+        return config, *checkpoint.load(run.checkpoint, learner_shape(run, compiled(config)))
+    except LareError as error:
+        if run.config.lare == source():
+            raise
+        raise LareError(f"{error}; the run is of LaRe {run.config.lare}, and this is LaRe {source()}") from error
 
 
 def load_actor(run: Run, of_best: bool = False) -> tuple[TrainConfig, Any, Int[np.ndarray, " seeds"]]:

@@ -1,0 +1,92 @@
+"""What pairs of raw entries bring: a task whose best action depends on the state only through a product.
+
+    python benchmarks/battery.py OUT
+
+A battery buys and sells at a price that changes during the day: r = -price * power - 0.02 power^2. `bayes` is trained with pairs of
+raw entries and without them, beside true rewards and the return at the end of an episode. A battery that does nothing scores 0.
+"""
+
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+
+import lare
+from lare.credit import basis
+from measure import write
+
+STEPS, WARMUP, SEEDS = 10_000, 2_000, 5
+HALF_HOURS = 96
+CAPACITY = 10.0
+ROWS = {
+    "true rewards": ("dense", basis.MOST_PAIRED),
+    "bayes": ("bayes", basis.MOST_PAIRED),
+    "bayes without pairs": ("bayes", 0),
+    "rrdu": ("rrdu", basis.MOST_PAIRED),
+    "return at the end": ("episodic", basis.MOST_PAIRED),
+}
+"""For each row, its method and the largest number of entries that get pairs."""
+
+KEYS = "evaluation/return", "credit/correlation", "credit/return_r2"
+
+
+class Battery(gymnasium.Env):
+    """Two days in half hours: the observation is the price, the charge (0 to 1), and sine and cosine of the time of day."""
+
+    observation_space = Box(-np.inf, np.inf, (4,), np.float32)
+    action_space = Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.charge, self.drift, self.shift = 0, CAPACITY / 2, 0.0, self.np_random.normal()
+        return self.observe(), {}
+
+    def observe(self) -> np.ndarray:
+        day = 2 * np.pi * self.t / 48
+        self.price = 1 + 0.5 * np.sin(day + 0.3 * self.shift) + self.drift
+        return np.array([self.price, self.charge / CAPACITY, np.sin(day), np.cos(day)], np.float32)
+
+    def step(self, action):
+        power = float(np.clip(action[0], -self.charge, CAPACITY - self.charge))
+        reward = -self.price * power - 0.02 * power**2
+        self.charge += power
+        self.drift += 0.04 * self.np_random.normal()
+        self.t += 1
+        return self.observe(), reward, False, False, {}
+
+
+gymnasium.register("benchmarks/Battery-v0", entry_point=Battery, max_episode_steps=HALF_HOURS)
+
+
+def task() -> lare.TaskSpec:
+    """The task without texts for a language model: no row has a `phi`."""
+    return lare.TaskSpec(
+        name="Battery",
+        environment="benchmarks/Battery-v0",
+        observation_size=4,
+        action_size=1,
+        description="Buy and sell electricity at a price that changes.",
+        observation="0: price. 1: charge. 2: sine of the time of day. 3: cosine of the time of day.",
+        action="0: power.",
+    )
+
+
+def main(out: str) -> None:
+    table = {}
+    for name, (method, most) in ROWS.items():
+        basis.MOST_PAIRED = most
+        settings = lare.Settings(
+            method=method, algorithm="sac", steps=STEPS, seeds=SEEDS, evaluate_every=STEPS // 10, sac={"warmup": WARMUP}
+        )
+        run = lare.train(task(), settings, out=Path(out) / name.replace(" ", "-"), listeners=[])
+        last = [line for line in run.metrics() if line["step"] == STEPS]
+        table[name] = {key: [line[key] for line in last] for key in KEYS if key in last[0]}
+        for key, each in table[name].items():
+            print(f"{name:20s} {key:20s} {np.mean(each):8.3f} ± {np.std(each, ddof=1):.3f}", flush=True)
+    write("battery", {"steps": STEPS, "warmup": WARMUP, "algorithm": "sac", "rows": table})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
