@@ -39,6 +39,7 @@ def config_of(name: str) -> TrainConfig:
     return TrainConfig(
         env=ENV.spec,
         judged_from="observation",
+        judges="after",
         method=find_method(name),
         algorithm=ippo,
         hyperparameters=ippo.settings,

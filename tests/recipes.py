@@ -48,6 +48,7 @@ def config_of(method, algorithm="td3", env=ALONE, **changes):
         "credit": CreditSettings(hidden=(8,), drawn_steps=4, steps=24),
         "scale_rewards": False,
         "factors": tuple(2 + place for place in range(len(env.teams))) if METHODS[method].latent else (),
+        "judges": "after",
         "environments": 1,
         "rollout_steps": 4,
         "capacity": 100,

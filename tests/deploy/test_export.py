@@ -36,6 +36,7 @@ CASES = [
     long("td3", "diaster"),
     long("sac", "dense"),
     ("ppo", "lare-linear"),
+    long("ppo", "bayes"),
     long("ppo", "llm-reward"),
     long("ppo", "rrdu-next"),
     long("ippo", "lare-bayes"),
@@ -227,11 +228,11 @@ def test_phi_and_decoder_are_one_function_without_lare(run, tmp_path, phi):
     )
     config, learner, _, _ = load_learner(run)
     # What the decoder sees: the toy's actions are from -2 to 2, the trainer's from -1 to 1.
-    rows = np.concatenate([phi(before, action), after, action / 2], axis=1)
+    rows = np.concatenate([phi(before, action), before, action / 2], axis=1)
     wanted = decomposition.proxy_rewards(of_seed(learner).credit[0], jnp.asarray(rows), config.credit)
     np.testing.assert_allclose(json.loads(done.stdout), wanted, rtol=1e-4, atol=1e-6)
     assert np.std(wanted) > 0
-    assert set(loaded(tmp_path / "out").described("reward")["inputs"]) == {"before", "action", "after"}
+    assert set(loaded(tmp_path / "out").described("reward")["inputs"]) == {"before", "action"}
 
 
 def test_a_phi_without_translation_runs_beside_the_decoder(small, command, tmp_path):

@@ -375,6 +375,17 @@ def test_factors_judge_the_observation_that_they_should(judges, phi):
     np.testing.assert_array_equal(credit.store.features[:4], phi.of_steps(*one[:3], judges))
 
 
+@pytest.mark.parametrize("judges", ["before", "after", "both"])
+def test_so_do_the_raw_entries_of_closed_forms(judges):
+    credit, (one,) = assigner("bayes", judges=judges), episodes([4])
+    credit.add_episode(*one)
+    credit.look()
+    before, _, after, *_ = one
+    states = {"before": [before], "after": [after], "both": [before, after]}[judges]
+    np.testing.assert_array_equal(credit.store.features[:4, :-1], np.concatenate(states, axis=1))
+    assert credit.config.entries == credit.store.features.shape[1] == 2 * len(states) + 1
+
+
 @pytest.mark.parametrize("score", ["sum", "average"])
 @pytest.mark.parametrize("given", ["auto", "sum", "average"])
 def test_the_form_of_a_score_is_found_out_and_rewards_add_up_to_it(score, given, phi):

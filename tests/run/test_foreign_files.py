@@ -339,8 +339,8 @@ def test_the_command_says_what_a_report_leaves_out(run, neighbour, command):
     status, _, noted = command("report", run({"environment": "a_neighbours_file:X-v0"}))
     assert (status, noted) == (
         0,
-        "the module a_neighbours_file was not imported, so credit and factors are not drawn: "
-        "set LARE_TRUST=a_neighbours_file to allow it\n",
+        "the module a_neighbours_file was not imported, so random play, credit and factors are left out: "
+        "set LARE_TRUST=a_neighbours_file to allow the import\n",
     )
 
 

@@ -76,6 +76,7 @@ def test_what_is_decided_is_read_back_as_it_was():
         ("CN-6", {"method": "lare-rd", "credit": {"steps": 800}}, []),
         ("CN-6", {"fit_every": 3, "method": "rd"}, []),
         ("Reacher-v4", {"method": "dense", "judges": "after", "draw": 1}, ["judges", "draw"]),
+        ("Reacher-v4", {"method": "bayes", "judges": "after"}, []),
         ("Reacher-v4", {"method": "rd", "credit": {"drawn_steps": 10}}, ["credit.drawn_steps"]),
         ("Reacher-v4", {"method": "rrd", "credit": {"drawn_steps": 10}}, []),
         ("Reacher-v4", {"method": "lare-linear", "credit": {"sum_form": True, "score": "sum"}}, ["credit.sum_form"]),

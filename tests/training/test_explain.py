@@ -54,7 +54,8 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             FACTORS,
             ENTRIES,
             [
-                "The score is taken for an average over the steps of an episode: longer episodes do not score more.",
+                "The score is taken for an average over the steps of an episode: so far, this predicts returns better than a sum. "
+                'If you know that it is a sum, write `score = "sum"` into the task file.',
                 "The factors explain 5% of the variation of the returns of 40 episodes.",
                 "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of.",
             ],
@@ -65,7 +66,8 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             FACTORS,
             [],
             [
-                "The score is taken for a sum over the steps of an episode.",
+                "The score is taken for a sum over the steps of an episode: so far, this predicts returns better than an average. "
+                'If you know that it is an average, write `score = "average"` into the task file.',
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
                 SHARES,
                 "- speed: 99%, +1 ± 0.1",
@@ -95,13 +97,18 @@ def test_sentences(given, form, factors, entries, said):
 
 def test_entries_have_the_names_that_the_tasks_text_gives_them():
     task = read_task("HalfCheetah-v4")
-    names = entry_names(task.observation, task.action, 23, task.action_size)
+    names = entry_names(task.observation, task.action, 23, task.action_size, both=False)
     assert names[7] == "entry 7 of the observation (angle of the front foot (rad))"
     assert names[17].startswith("entry 0 of the action")
     assert len(names) == 23
-    assert entry_names("", "", 3, 1) == [
+    assert entry_names("", "", 3, 1, both=False) == [
         "entry 0 of the observation",
         "entry 1 of the observation",
+        "entry 0 of the action",
+    ]
+    assert entry_names("0: price", "", 3, 1, both=True) == [
+        "entry 0 of the observation before the step (price)",
+        "entry 0 of the observation after the step (price)",
         "entry 0 of the action",
     ]
 

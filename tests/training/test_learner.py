@@ -85,12 +85,16 @@ def test_state_and_action_alone():
     assert want.shape[-1] == config.bases[0].inputs == 5
 
 
+@pytest.mark.parametrize("judges", ["before", "after", "both"])
 @pytest.mark.parametrize("method", ["rd-linear", "bayes", "lare-linear", "lare-bayes"])
-def test_closed_forms_see_the_factors_and_the_state_that_the_step_led_to(method):
-    config, steps = config_of(method), steps_of()
+def test_closed_forms_see_the_factors_and_the_states_that_the_task_judges(method, judges):
+    config, steps = config_of(method, judges=judges), steps_of()
     drawn = every_step(stored(config))
-    led_to = [drawn.after["observation"], np.clip(drawn.before["action"], -1, 1)] if method != "lare-linear" else []
-    want = np.concatenate([*([factors_for(config, steps)[:, 0]] if "lare" in method else []), *led_to], axis=-1)
+    states = {"before": [drawn.before], "after": [drawn.after], "both": [drawn.before, drawn.after]}[judges]
+    want = [factors_for(config, steps)[:, 0]] if "lare" in method else []
+    if method != "lare-linear":
+        want += [*(state["observation"] for state in states), np.clip(drawn.before["action"], -1, 1)]
+    want = np.concatenate(want, axis=-1)
     np.testing.assert_array_equal(common.features(drawn, config, 0), want)
     assert want.shape[-1] == config.bases[0].inputs
     assert config.bases[0].extended == (method in ("bayes", "lare-bayes"))

@@ -106,7 +106,7 @@ def test_where_all_returns_are_the_same_nothing_is_better(episodes):
     alike = [replace(one, team_reward=np.zeros(20)) for one in episodes]
     function, said = design(toy_spec(), model=Says(WRONG), candidates=1), []
     assert reflect(function, toy_spec(), Says(RIGHT), episodes=alike, said=said.append).source == WRONG
-    assert said[-1] == "reflection 1: R^2 = nan, not better" or said[-1].endswith("not better")
+    assert said[-1] == "reflection 1: R² = nan, not better" or said[-1].endswith("not better")
 
 
 def test_a_better_function_is_kept_and_a_worse_one_is_not():

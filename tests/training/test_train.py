@@ -550,6 +550,7 @@ def test_config_says_what_the_run_depends_on(small, phi, tmp_path):
     [
         ("td3", "lare-bayes"),
         *(long("td3", method) for method in ("dense", "lare-rrdu", "rd")),
+        ("td3", "bayes"),
         ("ddpg", "lare-linear"),
         ("sac", "dense"),
     ],

@@ -205,7 +205,8 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = False) ->
     say(f"wrote {write_report(list(runs), out, film)}")
     for module in sorted({one for run in runs if (one := unknown_module(read_config(run).task)) is not None}):
         progress(
-            f"the module {module} was not imported, so credit and factors are not drawn: set {TRUSTED}={module} to allow it"
+            f"the module {module} was not imported, so random play, credit and factors are left out: set {TRUSTED}={module} to "
+            "allow the import"
         )
 
 

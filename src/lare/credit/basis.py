@@ -1,6 +1,6 @@
 """The features of a step, in groups. A closed-form decoder is linear in these features.
 
-With u = (x - mean) / deviation over all steps, where x is one of the factors z or of the raw entries [s', a] of a step:
+With u = (x - mean) / deviation over all steps, where x is one of the factors z or of the raw entries of a step:
 
     factors             u_i
     shapes of factors   cos(k pi u_i / 4) / k,  sin(k pi u_i / 4) / k,   k = 1, 2, 3
@@ -13,8 +13,8 @@ Shapes are the first terms of the Fourier series of a function of one number, wi
 They can express "more is better up to this value", "near this value" or "beyond this value". Pairs express interactions of
 two factors or entries: price times power. The returns decide which groups are needed (`evidence.py`).
 
-The entries [s', a] are the state that a step led to and the action. The published s - s' would carry almost no information:
-its mean over an episode is close to zero, because the differences cancel.
+The raw entries are those of the state by which the task judges a step, and of the action: [s', a], [s, a], or [s, s', a]. The
+published s - s' would carry almost no information: its mean over an episode is close to zero, because the differences cancel.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ cube of the number of features."""
 
 @dataclass(frozen=True)
 class Basis:
-    """The set of features. An input row is [z, s', a], or only the parts that the method uses."""
+    """The set of features. An input row has the factors and then the raw entries, or only the parts that the method uses."""
 
     factors: int
     entries: int

@@ -50,7 +50,7 @@ def judge(
     """Judge the factors of some episodes, which must be in the order of play.
 
     Args:
-        rows: for each episode, [z, s', a] of each step and agent.
+        rows: for each episode, factors and raw entries of each step and agent.
         alive: for each episode, which agents acted at each step.
         returns: R of each episode.
         basis: the features that are computed from the rows.

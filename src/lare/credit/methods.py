@@ -21,10 +21,12 @@ class Encoder(StrEnum):
     """[s, a]."""
     NEXT = "next state and action"
     """[s', a]."""
+    JUDGED = "judged state and action"
+    """[s', a], [s, a] or [s, s', a]: whichever states the task judges a step by."""
     LATENT = "latent"
-    """The factors z = phi(s, a), and nothing else."""
-    LATENT_AND_NEXT = "latent, next state and action"
-    """[z, s', a]."""
+    """The factors z, and nothing else."""
+    LATENT_AND_JUDGED = "latent, judged state and action"
+    """The factors z, and the entries of `JUDGED`."""
 
 
 class Fit(StrEnum):
@@ -113,7 +115,12 @@ class Method:
     @property
     def latent(self) -> bool:
         """Whether it needs a function that a language model wrote."""
-        return self.encoder in (Encoder.LATENT, Encoder.LATENT_AND_NEXT)
+        return self.encoder in (Encoder.LATENT, Encoder.LATENT_AND_JUDGED)
+
+    @property
+    def judges(self) -> bool:
+        """Whether it matters by which states the task judges a step."""
+        return self.latent or self.encoder is Encoder.JUDGED
 
     @property
     def descends(self) -> bool:
@@ -196,18 +203,18 @@ TABLE = (
     Method(
         "rd-linear",
         Reward.PROXY,
-        Encoder.NEXT,
+        Encoder.JUDGED,
         Fit.EVIDENCE,
-        "linear regression on the next state and the action",
+        "linear regression on the state and the action",
         BAYES,
         Decoder.LINEAR,
     ),
     Method(
         "bayes",
         Reward.PROXY,
-        Encoder.NEXT,
+        Encoder.JUDGED,
         Fit.EVIDENCE,
-        "regression on functions of each entry of the next state and the action",
+        "regression on functions of the entries of the state and the action",
         BAYES,
         Decoder.ADDITIVE,
     ),
@@ -270,7 +277,7 @@ TABLE = (
     Method(
         "lare-bayes",
         Reward.PROXY,
-        Encoder.LATENT_AND_NEXT,
+        Encoder.LATENT_AND_JUDGED,
         Fit.EVIDENCE,
         "regression on latent rewards and, if the returns require them, on functions of them and of raw features",
         BAYES,

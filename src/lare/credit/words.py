@@ -16,16 +16,18 @@ STRIKING = 0.3
 """A raw entry is reported if its correlation with the residual of the factors is larger than this."""
 FORMS = ("sum", "average")
 """The names of the forms of a score, by index."""
+WITH_ARTICLE = {"sum": "a sum", "average": "an average"}
 
 
-def entry_names(observation: str, action: str, entries: int, action_size: int) -> list[str]:
-    """Names of the entries of [s', a], from a task's texts: the line `7: angle of the foot` names entry 7.
+def entry_names(observation: str, action: str, entries: int, action_size: int, both: bool) -> list[str]:
+    """Names of the raw entries, from a task's texts: the line `7: angle of the foot` names entry 7.
 
     Args:
         observation: the text that describes the observation.
         action: the text that describes the action.
-        entries: the number of entries of [s', a]: 0, or at least `action_size`.
-        action_size: the number of entries of a, which come last.
+        entries: the number of raw entries: 0, or at least `action_size`.
+        action_size: the number of entries of the action, which come last.
+        both: whether there are the entries of two observations, first those of the one before the step.
     """
 
     def named(text: str, count: int, kind: str) -> list[str]:
@@ -36,7 +38,9 @@ def entry_names(observation: str, action: str, entries: int, action_size: int) -
         ]
 
     shown = max(0, entries - action_size)
-    return named(observation, shown, "observation") + named(action, entries - shown, "action")
+    kinds = ["observation before the step", "observation after the step"] if both else ["observation"]
+    of_observations = [name for kind in kinds for name in named(observation, shown // len(kinds), kind)]
+    return of_observations + named(action, entries - shown, "action")
 
 
 def is_bent(found: Explanation, factor: int) -> bool:
@@ -58,11 +62,10 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
         return []
     said = []
     if form is not None:
+        other = FORMS[1 - FORMS.index(form)]
         said.append(
-            {
-                "sum": "The score is taken for a sum over the steps of an episode.",
-                "average": "The score is taken for an average over the steps of an episode: longer episodes do not score more.",
-            }[form]
+            f"The score is taken for {WITH_ARTICLE[form]} over the steps of an episode: so far, this predicts returns better than "
+            f'{WITH_ARTICLE[other]}. If you know that it is {WITH_ARTICLE[other]}, write `score = "{other}"` into the task file.'
         )
     if not factors:
         return [*said, f"Raw features explain {found.by_all:.0%} of the variation of the returns of {count} episodes."]
@@ -84,6 +87,10 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
             + (" (its effect is curved)" if is_bent(found, i) else "")
             for i in np.argsort(-found.share, kind="stable").tolist()
         ]
+        if any(name.endswith("(before)") for name in factors):
+            said.append(
+                "A factor before a step and after it are nearly the same: only the sums of their shares and weights mean something."
+            )
     if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:
         place = int(np.argmax(np.abs(found.left)))
         way = "large" if found.left[place] > 0 else "small"

@@ -25,6 +25,7 @@ from lare.experiments.policy import choices
 from lare.files import write_atomically
 from lare.run.directory import Run, as_run, function_file
 from lare.source import source
+from lare.tasks.spec import judged_states
 from lare.training.compiled import compiled
 from lare.training.seeds import of_seed
 from lare.training.session import load_actor, load_learner
@@ -82,7 +83,7 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
         phi, decoder = run.functions[team] if run.functions else None, credit[team] if credit else None
         files[name] = function_file(run.config.task, role)
         try:
-            graphs[name] = reward(decoder, config, team, phi, run.judges)
+            graphs[name] = reward(decoder, config, team, phi)
         except Untranslatable as error:
             apart[name] = str(error)
             graphs[name] = reward(decoder, config, team)
@@ -103,8 +104,7 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
     for name, graph in graphs.items():
         text[name] = described(graph)
         if name in apart:
-            judges = ["before", "after"] if run.judges == "both" else [run.judges]
-            text[name] |= {"phi": files[name], "judges": judges}
+            text[name] |= {"phi": files[name], "judges": judged_states(run.judges, "before", "after")}
         write_arrays(out / f"{name}.npz", graph)
         if onnx.is_installed():
             onnx.write(graph, out / f"{name}.onnx", name)

@@ -2,7 +2,7 @@
 
     import exported
     action = exported.load("policy")(observation=observation)["action"]
-    r_hat = exported.reward(before, action, after)
+    r_hat = exported.reward(before, action, after)  # and length=STEPS of the episode, if `export.json` lists it
 
 `export.json` lists the inputs and outputs of each function, with their shapes. The first axis of all of them is the batch.
 """
@@ -15,6 +15,7 @@ from runpy import run_path
 import numpy as np
 
 HERE = Path(__file__).parent
+LENGTH = "length is the number of steps of the whole episode, because the score is an average over the steps"
 OPERATIONS = {
     "Add": np.add,
     "Sub": np.subtract,
@@ -87,7 +88,10 @@ def load(name):
     def function(**inputs):
         needed = ", ".join(graph["inputs"])
         if missing := [key for key in graph["inputs"] if key not in inputs]:
-            raise ValueError(f"{name} needs the inputs {needed}: {', '.join(missing)} is missing")
+            raise ValueError(
+                f"{name} needs the inputs {needed}: {', '.join(missing)} is missing"
+                + (f" ({LENGTH})" if "length" in missing else "")
+            )
         if unknown := [key for key in inputs if key not in graph["inputs"]]:
             raise ValueError(f"{name} needs the inputs {needed}: there is no input {', '.join(unknown)}")
         values = constants | {key: as_input(key, inputs[key], like) for key, like in graph["inputs"].items()}

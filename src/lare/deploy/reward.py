@@ -23,7 +23,7 @@ from lare.deploy.policy import first
 from lare.deploy.rows import Rows, joined
 from lare.latent.function import LatentFunction
 from lare.normalise import CLIP, deviation
-from lare.tasks.spec import Judges
+from lare.tasks.spec import judged_states
 from lare.training.config import TrainConfig
 
 STEP_DECODERS = (StepDecoder, Bottleneck, LinearDecoder)
@@ -47,7 +47,6 @@ def reward(
     config: TrainConfig,
     place: int,
     phi: LatentFunction | None = None,
-    judges: Judges = "after",
 ) -> Graph:
     """The graph of a team's proxy rewards, without optimism.
 
@@ -56,7 +55,6 @@ def reward(
         config: the configuration of its run.
         place: the index of the team.
         phi: the function to make a part of the graph. Without it, the factors are an input, if the method needs any.
-        judges: which observations phi judges.
 
     Raises:
         Untranslatable: phi has code that cannot be translated.
@@ -65,7 +63,7 @@ def reward(
     rows = () if config.of_state or team.size == 1 else (team.size,)
     seen = []
     if phi is not None:
-        seen.append(of_phi(graph, phi, judges, rows, config))
+        seen.append(of_phi(graph, phi, rows, config))
     elif config.method.latent:
         seen.append(graph.input("factors", (*rows, config.factors[place])))
     seen += raw(graph, config, rows, place)
@@ -82,10 +80,10 @@ def reward(
     return graph
 
 
-def of_phi(graph: Graph, phi: LatentFunction, judges: Judges, rows: tuple[int, ...], config: TrainConfig) -> str:
+def of_phi(graph: Graph, phi: LatentFunction, rows: tuple[int, ...], config: TrainConfig) -> str:
     """The factors of steps by phi, for each agent by itself."""
     width, parts = action_width(config), []
-    for which in ("before", "after") if judges == "both" else (judges,):
+    for which in judged_states(config.judges, "before", "after"):
         shown = graph.input(which, (*rows, config.shown))
         action = graph.input("action", (*rows, width))
         if rows:
@@ -108,9 +106,8 @@ def raw(graph: Graph, config: TrainConfig, rows: tuple[int, ...], place: int) ->
     if encoder in (None, Encoder.LATENT):
         return []
     shown = (*rows, config.shown)
-    after = graph.input("after", shown) if encoder is not Encoder.STATE_ACTION else ""
     if encoder is Encoder.RAW and not config.raw_differences:
-        return [after]
+        return [graph.input("after", shown)]
     action = graph.input("action", (*rows, action_width(config)))
     if not env.discrete:
         bounds = (
@@ -122,12 +119,14 @@ def raw(graph: Graph, config: TrainConfig, rows: tuple[int, ...], place: int) ->
         action = graph.clip(graph.standardised(action, (low + high) / 2, (high - low) / 2), -1, 1)
     match encoder:
         case Encoder.RAW:
-            before = graph.input("before", shown)
+            before, after = (graph.input(name, shown) for name in ("before", "after"))
             return [before, action, graph.apply("Sub", before, after)]
         case Encoder.STATE_ACTION:
             return [graph.input("before", shown), action]
+        case Encoder.JUDGED | Encoder.LATENT_AND_JUDGED:
+            return [*(graph.input(name, shown) for name in judged_states(config.judges, "before", "after")), action]
         case _:
-            return [after, action]
+            return [graph.input("after", shown), action]
 
 
 def decoded(graph: Graph, x: str, credit: Decomposition, config: TrainConfig) -> str:

@@ -23,7 +23,8 @@ from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN, RETU
 from lare.experiments.statistics import mean_and_deviation, plus_minus
 from lare.experiments.verdict import Facts, last_known, median_of_known, verdict
 from lare.experiments.video import record_video
-from lare.run.directory import Run, open_run, read_config
+from lare.latent.saved import read_source
+from lare.run.directory import Run, function_file, open_run, read_config
 from lare.run.settings import Settings
 from lare.run.usual import resolve
 from lare.source import source
@@ -244,8 +245,9 @@ def details(name: str, run: Run) -> Iterable[str]:
     if module := unknown_module(run.config.task):
         yield note(
             f"Its environment is of the module {module}, which is not imported for a report. Set {TRUSTED}={module} to have it "
-            "imported: pictures of credit and factors then appear here."
+            "imported: random play, credit, factors and what the returns say of them then appear here."
         )
+        yield from unverified_functions(run)
     elif run.has_checkpoint():
         yield film_of(run)
         if said := explanation_of(run):
@@ -256,6 +258,15 @@ def details(name: str, run: Run) -> Iterable[str]:
         yield note("Its checkpoint is not there any more, so that credit and factors cannot be drawn.")
     yield "<h3>Settings</h3>"
     yield settings_table(run)
+
+
+def unverified_functions(run: Run) -> Iterable[str]:
+    """The sources of a run's latent functions as its files have them, which nothing has run or verified."""
+    config = run.config
+    for role in config.task.roles if config.function_sha256 else ():
+        saved = read_source(run.directory / function_file(config.task, role))
+        yield f"<h3>The latent function{f' of {escape(role.team)}' if role.team else ''}</h3>"
+        yield f"<pre>{escape(saved.source)}</pre>"
 
 
 def film_of(run: Run) -> str:

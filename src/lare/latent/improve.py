@@ -62,7 +62,7 @@ def improve(
     except (LareError, KeyboardInterrupt) as error:
         said(f"no reflection: {str(error) or 'stopped'}")
         return function
-    said(f"reflection: the factors of the first function predict unseen returns with R^2 = {known.r2:.3f}")
+    said(f"reflection: the factors of the first function predict unseen returns with R² = {known.r2:.3f}")
     for number in range(1, rounds + 1):
         try:
             request = prompts.reflect(task, said_of(best), known.text, function.kind)
@@ -76,7 +76,7 @@ def improve(
             said(f"reflection {number}: stopped")
             break
         better = found.r2 > known.r2
-        said(f"reflection {number}: R^2 = {found.r2:.3f}, {'kept' if better else 'not better'}")
+        said(f"reflection {number}: R² = {found.r2:.3f}, {'kept' if better else 'not better'}")
         if better:
             best, known = new, found
     return conversation.with_exchanges(best)

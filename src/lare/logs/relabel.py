@@ -82,7 +82,7 @@ def predicted(found: Relabelled) -> list[str]:
         return [
             f"The {of}, which nothing was fitted to, and their predictions have a correlation of {found.return_correlation:.2f}."
         ]
-    said = [f"The {of}, which nothing was fitted to, are predicted with an R^2 of {found.return_r2:.2f}."]
+    said = [f"The {of}, which nothing was fitted to, are predicted with an R² of {found.return_r2:.2f}."]
     if found.return_r2 < 0.1:
         said.append(
             "Warning: that is no better than their mean. These rewards say next to nothing: do not train on them."

@@ -15,7 +15,7 @@ from lare.credit.settings import CreditSettings
 from lare.errors import LareError, shortened
 from lare.latent.function import LatentFunction, check_task
 from lare.plugs.layout import Layout, layout_of
-from lare.tasks.spec import Judges, TaskSpec
+from lare.tasks.spec import Judges, TaskSpec, judged_states
 from lare.tasks.table import env_spec
 
 Space = gymnasium.Space | Layout | int
@@ -60,6 +60,8 @@ class CreditConfig:
                 return 0
             case Encoder.RAW:
                 return 2 * shown + action if self.agents == 1 else shown
+            case Encoder.JUDGED | Encoder.LATENT_AND_JUDGED:
+                return shown * len(judged_states(self.judges, 0, 1)) + action
             case _:
                 return shown + action
 
@@ -84,8 +86,10 @@ class CreditConfig:
                 parts += [before, action, before - after] if self.agents == 1 else [after]
             case Encoder.STATE_ACTION:
                 parts += [before, action]
-            case Encoder.NEXT | Encoder.LATENT_AND_NEXT:
+            case Encoder.NEXT:
                 parts += [after, action]
+            case Encoder.JUDGED | Encoder.LATENT_AND_JUDGED:
+                parts += [*judged_states(self.judges, before, after), action]
         return np.concatenate(parts, axis=-1) if parts else before[..., :0]
 
     def rows(self, before: Any, action: Any, after: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -227,11 +227,12 @@ class Learner:
         return words(found, returns.form_found(self.state), names, self.entry_names(len(found.left)))
 
     def entry_names(self, entries: int) -> list[str]:
-        """Names of the entries of [s', a]; empty if the decoder's input has other entries."""
-        if self.config.method.encoder not in (Encoder.NEXT, Encoder.LATENT_AND_NEXT):
+        """Names of the raw entries; empty if they are differences, or those of another method than those in closed form."""
+        encoder, both = self.config.method.encoder, self.config.judges == "both"
+        if encoder not in (Encoder.NEXT, Encoder.JUDGED, Encoder.LATENT_AND_JUDGED):
             return []
         texts = ("", "") if self.config.task is None else (self.config.task.observation, self.config.task.action)
-        return entry_names(*texts, entries, self.config.action.size)
+        return entry_names(*texts, entries, self.config.action.size, both and encoder is not Encoder.NEXT)
 
 
 def untrained(config: CreditConfig) -> Decomposition | None:

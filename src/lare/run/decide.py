@@ -71,7 +71,7 @@ def check_method(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> No
             "rollout_steps must be a multiple of it"
         )
     check_credit(resolved, method, task, env)
-    if resolved.reflect_every is not None and method.encoder is not Encoder.LATENT_AND_NEXT:
+    if resolved.reflect_every is not None and method.encoder is not Encoder.LATENT_AND_JUDGED:
         raise LareError(
             f"reflect_every is for lare-bayes, whose decoder is fitted at once when phi changes; the method is {method.name}"
         )

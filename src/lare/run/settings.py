@@ -53,7 +53,7 @@ class Settings(Checked):
     seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 0
     """The first seed; the others are the numbers after it."""
     judges: Judges | None = None
-    """Which observation of a step the factors judge: the one before it, the one after it, or both. By default, as the task says."""
+    """By which observation a step is judged: the one before it, the one after it, or both. By default, as the task says."""
     draw: Annotated[int, Field(ge=0)] = 0
     """Which recorded reply of the language model to take phi from (0 to 4); independent of the seed."""
     candidates: Count = CANDIDATES
@@ -197,7 +197,7 @@ class ResolvedSettings(Checked):
         return ALGORITHMS[self.algorithm].consumes is not Consumes.ROLLOUTS or find_method(self.method).fit is not None
 
     def judged_by(self, task: TaskSpec) -> Judges:
-        """Which observation of a step the factors judge."""
+        """By which observation a step is judged."""
         return self.judges or task.judges
 
     def rows(self, longest: int) -> int:
@@ -226,8 +226,10 @@ class ResolvedSettings(Checked):
             found += ["fit_every", "fit_updates"]
         if not (method.descends and consumes is Consumes.ROLLOUTS and ALGORITHMS[self.algorithm].many_agents):
             found.append("first_fit")
+        if not method.judges:
+            found.append("judges")
         if not method.latent:
-            found += ["judges", "draw", "candidates"]
+            found += ["draw", "candidates"]
         if self.reflect_every is None:
             found.append("reflect_every")
         if not self.rereads:

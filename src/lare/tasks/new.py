@@ -29,7 +29,9 @@ SENTENCE = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
 FIGURE = re.compile(r"^```\{.*?^```|<[^<>\n]+>", re.MULTILINE | re.DOTALL)
 NOISE = re.compile(r"^!\[|^:?-{3,}|^```|^\s*$")
-JUDGES = 'judges = "after" # phi sees the observation after the step; "before": the one in which the agent acts; "both"'
+JUDGES = (
+    'judges = "after" # a step is judged by the observation after it; "before": the one in which the agent acts; "both"'
+)
 SCORE = '# score = "average" # a mean over the steps, or a grade; "sum": a sum over the steps. If unset, training determines it'
 ELSEWHERE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.IGNORECASE)
 """References to figures, which are useless outside the original page."""
@@ -105,22 +107,26 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
     name = re.sub(r"[^\w.\-]+", "-", environment_id.rpartition(":")[2])
     limit = environment.spec.max_episode_steps if environment.spec else None
     lines = [
-        *warning(left_out),
+        *warning("the documentation of the environment", left_out),
         f'name = "{name}"',
         f'environment = "{full_id}"',
         f"observation_size = {observation_size}",
         f"action_size = {action_size}",
         JUDGES,
         SCORE,
-        *([] if limit else ["max_episode_steps = 1000 # the environment has no limit of its own"]),
+        *(
+            []
+            if limit
+            else ["max_episode_steps = 1000 # the environment has no limit of its own; this one cuts longer episodes"]
+        ),
         *bodies(texts, heads),
     ]
     return Draft(name, "\n".join(lines) + "\n", missing, left_out)
 
 
-def warning(left_out: int) -> list[str]:
+def warning(origin: str, left_out: int) -> list[str]:
     return [
-        "# A first draft, from the documentation of the environment. Read it before you use it: a language model will",
+        f"# A first draft, from {origin}. Read it before you use it: a language model will",
         "# know only these texts. Whatever mentions rewards was left out on purpose, so that the request does not reveal the",
         f"# reward ({left_out} sentences or rows). Describe the goal, not how it is rewarded.",
     ]

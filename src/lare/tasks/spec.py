@@ -5,7 +5,7 @@ import json
 import os.path
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
@@ -13,8 +13,16 @@ from lare.errors import Checked, LareError, did_you_mean, shortened
 from lare.foreign import LARGEST_SETTINGS, read_text, read_toml
 
 Judges = Literal["before", "after", "both"]
-"""The observation by which `phi` judges a step: the one before the action, the one after it, or both. For both, `phi` is
-called on each, and the factors are concatenated."""
+"""The observation by which a step is judged: the one before the action, the one after it, or both. For both, `phi` is called on
+each, and the factors are concatenated; so are the raw entries of closed-form decoders."""
+
+State = TypeVar("State")
+
+
+def judged_states(judges: Judges, before: State, after: State) -> list[State]:
+    """The states by which a step is judged, in the order in which they are concatenated."""
+    return {"before": [before], "after": [after], "both": [before, after]}[judges]
+
 
 JudgedFrom = Literal["observation", "state"]
 """The inputs by which a step is judged: each agent's own observation and action, or the global state and all actions, which

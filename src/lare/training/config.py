@@ -11,7 +11,7 @@ from lare.credit.decomposition import SUM, forms_of
 from lare.credit.methods import Decoder, Encoder, Method
 from lare.credit.settings import CreditSettings
 from lare.tasks.env import EnvSpec
-from lare.tasks.spec import JudgedFrom
+from lare.tasks.spec import JudgedFrom, Judges, judged_states
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,7 @@ class TrainConfig:
 
     env: EnvSpec
     judged_from: JudgedFrom
+    judges: Judges
     method: Method
     algorithm: Algorithm
     hyperparameters: AlgorithmSettings
@@ -92,6 +93,8 @@ class TrainConfig:
                 return 0
             case Encoder.RAW:
                 return 2 * self.shown + action if self.raw_differences else self.shown
+            case Encoder.JUDGED | Encoder.LATENT_AND_JUDGED:
+                return self.shown * len(judged_states(self.judges, 0, 1)) + action
             case _:
                 return self.shown + action
 

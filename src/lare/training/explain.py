@@ -74,7 +74,9 @@ def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
         form = returns.form_found(of_seed(learner.credit[place]))
         role = roles[place]
         entries = (
-            [] if config.of_state else entry_names(role.observation, role.action, len(found.left), role.action_size)
+            []
+            if config.of_state
+            else entry_names(role.observation, role.action, len(found.left), role.action_size, config.judges == "both")
         )
         team = f"{config.env.teams[place].name}: " if len(roles) > 1 else ""
         lines += [team + line for line in words(found, form, factors, entries)]

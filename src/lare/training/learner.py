@@ -24,6 +24,7 @@ from lare.data.sampling import CreditSample, sample_packed, sample_padded, sampl
 from lare.data.trajectory import Trajectory
 from lare.normalise import Scale, magnitude, new_scale, observe_scale, within_range
 from lare.tasks.env import alive_mean, team_mean
+from lare.tasks.spec import judged_states
 from lare.training.config import TrainConfig
 
 PART = 2400
@@ -111,6 +112,8 @@ def raw_features(steps: StoredSteps, config: TrainConfig, rows: slice) -> list[F
             return [shown, action, shown - led_to]
         case Encoder.STATE_ACTION:
             return [shown, action]
+        case Encoder.JUDGED | Encoder.LATENT_AND_JUDGED:
+            return [*judged_states(config.judges, shown, led_to), action]
         case _:
             return [led_to, action]
 

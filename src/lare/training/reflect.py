@@ -19,7 +19,7 @@ from lare.errors import LareError
 from lare.latent.function import LatentFunction
 from lare.latent.improve import Evidence, Model, improve
 from lare.tasks.play import Episode, Policy, episodes_of
-from lare.tasks.spec import TaskSpec, as_task, the_role
+from lare.tasks.spec import TaskSpec, as_task, judged_states, the_role
 
 EPISODES = 40
 """The number of episodes to play, if none are given."""
@@ -95,7 +95,7 @@ def told_by_returns(function: LatentFunction, role: TaskSpec, episodes: Sequence
         raise LareError(f"{len(episodes)} episodes say too little of a function: {FEWEST} are needed")
     factors = [factors_of(function, role, episode) for episode in episodes]
     rows = [
-        np.concatenate([z, episode.after, episode.action], axis=-1)
+        np.concatenate([z, *judged_states(role.judges, episode.before, episode.after), episode.action], axis=-1)
         for z, episode in zip(factors, episodes, strict=True)
     ]
     size = factors[0].shape[-1]
@@ -120,7 +120,10 @@ def said_of(found: Judgement, names: list[str], role: TaskSpec, basis: Basis) ->
     """The explanation in sentences, which the user reads, too."""
     form = None if found.average is None else FORMS[int(found.average)]
     return words(
-        found.explanation, form, names, entry_names(role.observation, role.action, basis.used_entries, role.action_size)
+        found.explanation,
+        form,
+        names,
+        entry_names(role.observation, role.action, basis.used_entries, role.action_size, role.judges == "both"),
     )
 
 

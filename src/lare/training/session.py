@@ -42,6 +42,7 @@ def config_for(run: Run) -> TrainConfig:
     return TrainConfig(
         env=env,
         judged_from=task.judged_from,
+        judges=run.judges,
         method=find_method(settings.method),
         algorithm=ALGORITHMS[settings.algorithm],
         hyperparameters=settings.hyperparameters,

@@ -110,7 +110,10 @@ WANTED = "factor {} must be an array of shape (batch_size, 1) = (256, 1), but is
         (lambda o, a: [a[:, 0]], WANTED.format(1, "an array of shape (256,) and type float32")),
         (lambda o, a: [a, o], WANTED.format(2, "an array of shape (256, 2) and type float32")),
         (lambda o, a: [a.T], WANTED.format(1, "an array of shape (1, 256) and type float32")),
-        (lambda o, a: [o[:, 7:8]], WANTED.format(1, "an array of shape (256, 0) and type float32")),
+        (
+            lambda o, a: [o[:, 7:8]],
+            WANTED.format(1, "an array of shape (256, 0) and type float32: a slice beyond the last column is empty"),
+        ),
         (
             lambda o, a: [a.astype(complex)],
             "factor 1 must hold real numbers, but is an array of shape (256, 1) and type complex128",
@@ -450,7 +453,7 @@ FIRST_MESSAGE = {
     "dtype_complex": (
         "E-FINITE line 3: factor 1 is nan for 256 of 256 recorded steps (invalid value encountered in sqrt)"
     ),
-    "slice_hallucinated_dim": f"E-FORM: {FORM} an array of shape (256, 0) and type float32",
+    "slice_hallucinated_dim": f"E-FORM: {FORM} an array of shape (256, 0) and type float32: a slice beyond the last column is empty",
     "row_loop_slow": "E-LOOP: it makes 65 turns for 64 rows and 1032 for 1031: no loop over the batch, use whole arrays",
     "mutate_alias": f"E-RUN line 3: ValueError: assignment destination {READ_ONLY}",
     "augassign_alias": f"E-RUN line 3: ValueError: output array {READ_ONLY}",

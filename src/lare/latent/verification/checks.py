@@ -120,7 +120,8 @@ def factors_of(returned: Returned, rows: int, kind: str) -> Float[np.ndarray, "r
     for number, value in enumerate(returned.values, start=1):
         if value[0] != "array" or value[1] != (rows, 1):
             wanted = f"an array of shape (batch_size, 1) = ({rows}, 1)"
-            raise failed("E-FORM", f"factor {number} must be {wanted}, but is {shown(value)}")
+            empty = ": a slice beyond the last column is empty" if value[1:2] == ((rows, 0),) else ""
+            raise failed("E-FORM", f"factor {number} must be {wanted}, but is {shown(value)}{empty}")
         if value[2] not in REAL:
             raise failed("E-FORM", f"factor {number} must hold real numbers, but is {shown(value)}")
     if returned.factors is None:
