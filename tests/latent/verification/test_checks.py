@@ -453,7 +453,9 @@ FIRST_MESSAGE = {
     "dtype_complex": (
         "E-FINITE line 3: factor 1 is nan for 256 of 256 recorded steps (invalid value encountered in sqrt)"
     ),
-    "slice_hallucinated_dim": f"E-FORM: {FORM} an array of shape (256, 0) and type float32: a slice beyond the last column is empty",
+    "slice_hallucinated_dim": (
+        f"E-FORM: {FORM} an array of shape (256, 0) and type float32: a slice beyond the last column is empty"
+    ),
     "row_loop_slow": "E-LOOP: it makes 65 turns for 64 rows and 1032 for 1031: no loop over the batch, use whole arrays",
     "mutate_alias": f"E-RUN line 3: ValueError: assignment destination {READ_ONLY}",
     "augassign_alias": f"E-RUN line 3: ValueError: output array {READ_ONLY}",
