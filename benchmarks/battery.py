@@ -4,6 +4,9 @@
 
 A battery buys and sells at a price that changes during the day: r = -price * power - 0.02 power^2. `bayes` is trained with pairs of
 raw entries and without them, beside true rewards and the return at the end of an episode. A battery that does nothing scores 0.
+Runs that OUT already holds are not trained again. "potential" is the regression of the last proxy rewards of `bayes` on the true
+rewards and on the differences, from step to step, of all squares and products of the state's entries: the weight of the true
+rewards and the correlation with the regression, for each seed.
 """
 
 import sys
@@ -14,10 +17,16 @@ import numpy as np
 from gymnasium.spaces import Box
 
 import lare
+from lare.algorithms.settings import SACSettings
 from lare.credit import basis
+from lare.data import replay
+from lare.training.learner import Paid, rewards
+from lare.training.seeds import of_seed
+from lare.training.session import load_learner
 from measure import write
 
 STEPS, WARMUP, SEEDS = 10_000, 2_000, 5
+RECENT = 2000
 HALF_HOURS = 96
 CAPACITY = 10.0
 ROWS = {
@@ -57,7 +66,7 @@ class Battery(gymnasium.Env):
         return self.observe(), reward, False, False, {}
 
 
-gymnasium.register("benchmarks/Battery-v0", entry_point=Battery, max_episode_steps=HALF_HOURS)
+gymnasium.register("benchmarks/Battery-v0", entry_point=lambda: Battery(), max_episode_steps=HALF_HOURS)
 
 
 def task() -> lare.TaskSpec:
@@ -73,19 +82,52 @@ def task() -> lare.TaskSpec:
     )
 
 
+def beside_a_potential(run: lare.Run) -> list[dict[str, float]]:
+    """How far the proxy rewards of each seed are the true rewards plus the difference of a quadratic function of the state."""
+    config, learner, _, _ = load_learner(run)
+    found = []
+    for place in range(len(run.seeds)):
+        one = of_seed(learner, place)
+        steps = replay.read(one.replay, replay.newest(one.replay, RECENT))
+        r_hat = np.asarray(rewards(steps, Paid(one.credit, one.scale), config))[0, :, 0]
+        before, after = (np.asarray(part["observation"])[0, :, 0] for part in (steps.before, steps.after))
+        true, inside = np.asarray(steps.before["reward"])[0, :, 0], ~np.asarray(steps.last)[0]
+        change = quadratic(after) - quadratic(before)
+        given = np.column_stack([true, change, np.ones(len(true))])[inside]
+        weight = np.linalg.lstsq(given, r_hat[inside], rcond=None)[0]
+        correlation = np.corrcoef(given @ weight, r_hat[inside])[0, 1]
+        found.append({"weight": round(float(weight[0]), 3), "correlation": round(float(correlation), 3)})
+    return found
+
+
+def quadratic(state: np.ndarray) -> np.ndarray:
+    """The entries of states, and all their squares and products."""
+    one, other = np.triu_indices(state.shape[1])
+    return np.column_stack([state, state[:, one] * state[:, other]])
+
+
 def main(out: str) -> None:
     table = {}
     for name, (method, most) in ROWS.items():
         basis.MOST_PAIRED = most
         settings = lare.Settings(
-            method=method, algorithm="sac", steps=STEPS, seeds=SEEDS, evaluate_every=STEPS // 10, sac={"warmup": WARMUP}
+            method=method,
+            algorithm="sac",
+            steps=STEPS,
+            seeds=SEEDS,
+            evaluate_every=STEPS // 10,
+            sac=SACSettings(warmup=WARMUP),
         )
-        run = lare.train(task(), settings, out=Path(out) / name.replace(" ", "-"), listeners=[])
+        place = Path(out) / name.replace(" ", "-")
+        run = lare.open_run(place) if place.exists() else lare.train(task(), settings, out=place, listeners=[])
         last = [line for line in run.metrics() if line["step"] == STEPS]
         table[name] = {key: [line[key] for line in last] for key in KEYS if key in last[0]}
         for key, each in table[name].items():
             print(f"{name:20s} {key:20s} {np.mean(each):8.3f} ± {np.std(each, ddof=1):.3f}", flush=True)
-    write("battery", {"steps": STEPS, "warmup": WARMUP, "algorithm": "sac", "rows": table})
+    basis.MOST_PAIRED = ROWS["bayes"][1]
+    potential = beside_a_potential(lare.open_run(Path(out) / "bayes"))
+    print(potential)
+    write("battery", {"steps": STEPS, "warmup": WARMUP, "algorithm": "sac", "rows": table, "potential": potential})
 
 
 if __name__ == "__main__":
