@@ -1,12 +1,12 @@
 """Which settings, method, algorithm and task go together."""
 
-from lare.algorithms.table import ALGORITHMS, Consumes
+from lare.algorithms.table import ALGORITHMS, Algorithm, Consumes
 from lare.credit.basis import MOST_ENTRIES
 from lare.credit.methods import Decoder, Encoder, Fit, Method, Reward, find_method
 from lare.data.replay import room
 from lare.errors import LareError
 from lare.run.settings import ResolvedSettings, Settings
-from lare.run.usual import resolve
+from lare.run.usual import resolve, usual_algorithm
 from lare.tasks.env import EnvSpec
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import env_spec
@@ -21,21 +21,20 @@ def decide(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     if task.team is not None:
         raise LareError(f"{task.name} is one team of {task.environment}: train the task that has both")
     env = env_spec(task)
+    check_algorithm(ALGORITHMS[settings.algorithm or usual_algorithm(env)], task, env)
     resolved = resolve(settings, env)
     if resolved.judges == task.judges:  # the task's own value makes no difference
         resolved = resolved.model_copy(update={"judges": None})
     if resolved.credit.score == "auto" and task.score is not None:
         credit = resolved.credit.model_copy(update={"score": task.score})
         resolved = resolved.model_copy(update={"credit": credit})
-    check_algorithm(resolved, task, env)
     check_method(resolved, task, env)
     check_room(resolved, task, env)
     return resolved
 
 
-def check_algorithm(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> None:
+def check_algorithm(row: Algorithm, task: TaskSpec, env: EnvSpec) -> None:
     """Raise `LareError` if an algorithm cannot train on a task."""
-    row = ALGORITHMS[resolved.algorithm]
     many = env.agents > 1
     if not (row.many_agents if many else row.one_agent):
         raise LareError(
