@@ -66,7 +66,11 @@ class Battery(gymnasium.Env):
         return self.observe(), reward, False, False, {}
 
 
-gymnasium.register("benchmarks/Battery-v0", entry_point=lambda: Battery(), max_episode_steps=HALF_HOURS)
+def make(**kwargs: object) -> gymnasium.Env:
+    return Battery(**kwargs)
+
+
+gymnasium.register("benchmarks/Battery-v0", entry_point=make, max_episode_steps=HALF_HOURS)
 
 
 def task() -> lare.TaskSpec:

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from lare.errors import LareError
-from lare.experiments.compare import find_runs
-from lare.experiments.scores import RETURN, by_label, grouped
+from lare.experiments.compare import find_all, find_runs
+from lare.experiments.scores import RETURN, by_label, differing, grouped
 from lare.run.directory import Run
 from toys import toy_spec
 
@@ -96,3 +96,29 @@ def test_what_the_task_says_anyway_makes_no_other_method(made):
     runs = [made("c", [1.0]), made("d", [2.0], judges="after", credit={"hidden": (8,)}, draw=3)]
     assert list(by_label(runs)) == ["dense"]
     assert list(by_label([made("e", [1.0], method="lare-rd", judges="after"), runs[0]])) == ["lare-rd", "dense"]
+
+
+def test_settings_in_which_runs_differ_are_named(made):
+    settings = [{"td3": {"warmup": 10}}, {"td3": {"warmup": 20}, "method": "rd"}, {"algorithm": "ddpg"}]
+    runs = [made(str(place), [1.0], **given) for place, given in enumerate(settings)]
+    assert differing(runs) == ["td3.warmup (10, 20)"]
+    remarks = find_all([run.directory for run in runs[:2]], RETURN)[1]
+    assert remarks == ["the runs also differ in td3.warmup (10, 20)"]
+    assert differing(runs[1:]) == []
+
+
+def test_another_metric(made):
+    run = made("a", [1.0, 3.0])
+    with pytest.raises(LareError) as error:
+        grouped(by_label([run]), "evaluation/returns")
+    assert str(error.value) == (
+        f"{run.directory} has no metric 'evaluation/returns' (did you mean 'evaluation/return'?); it has evaluation/return"
+    )
+    runs = [made("b", [1.0], "Walker2d-v4"), made("b", [1.0], "Reacher-v4")]
+    for lines in (one.directory / "metrics.jsonl" for one in runs):
+        lines.write_text(lines.read_text().replace("evaluation/return", "credit/error"))
+    with pytest.raises(LareError) as error:
+        grouped(by_label(runs), "credit/error")
+    assert str(error.value) == (
+        "only evaluation/return can be compared over several tasks: compare credit/error on each task by itself"
+    )

@@ -79,7 +79,7 @@ def test_draws_are_told_apart_from_seeds(made):
 
 def test_several_tasks_are_laid_between_fixed_ends(made, tmp_path):
     runs = [made("a", [-44.0, -2.7], "Reacher-v4"), made("b", [4600.0, 4600.0], "Walker2d-v4")]
-    found = write_comparison(runs, tmp_path / "page.html")
+    found = write_comparison(by_label(runs), tmp_path / "page.html")
     assert found.normalised
     assert found.rows[0].mean == pytest.approx(np.mean([0, 1, 1, 1]))
     page = (tmp_path / "page.html").read_text()
@@ -191,7 +191,7 @@ def test_a_table_is_not_a_run(tmp_path):
 def test_single_seeds_have_no_intervals(made):
     compared = statistics.compare(by_label([made("a", [-347.3176]), made("b", [2.0], method="rd")]))
     assert cells(compared) == [
-        ("dense", "1", "1", "-347.3", "-347.3", "-", "-", "-"),
+        ("dense (baseline)", "1", "1", "-347.3", "-347.3", "-", "-", "-"),
         ("rd", "1", "1", "2.000", "2.000", "-", "-", "-"),
     ]
     assert what_scores_are(compared).endswith(" at step 100, the last at which all runs were evaluated.")

@@ -21,7 +21,11 @@ def decided(settings, task):
     ("task", "settings", "message"),
     [
         ("CN-6", {"algorithm": "td3"}, "td3 is for a single agent, and CN-6 is a task of many"),
-        ("Reacher-v4", {"algorithm": "ippo", "steps": 1000}, "ippo is for many agents, and Reacher-v4 is a task of one"),
+        (
+            "Reacher-v4",
+            {"algorithm": "ippo", "steps": 1000},
+            "ippo is for many agents, and Reacher-v4 is a task of one",
+        ),
         (
             "CompetitivePP-6",
             {"algorithm": "qmix"},

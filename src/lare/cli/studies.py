@@ -56,21 +56,26 @@ def sweep(
         sys.exit(1)
 
 
-def compare(runs: RunDirectories, out: Path = Path("compare.html")) -> None:
+def compare(
+    runs: RunDirectories,
+    metric: Annotated[str, tyro.conf.arg(metavar="KEY")] = "evaluation/return",
+    out: Path = Path("compare.html"),
+) -> None:
     """Compare methods by their runs: interquartile means with bootstrap intervals, profiles, probability of improvement.
 
     Args:
-        runs: run directories, or directories that contain some, such as that of a sweep. The method of the first run is the one
-            that the others are compared with.
+        runs: run directories, directories that contain some, such as that of a sweep, or .csv files with results of other programs
+            (docs/sweeps.md). The first method is the baseline that the others are compared with.
+        metric: the key of metrics.jsonl to compare.
         out: the page to write.
     """
-    from lare.experiments.compare import HEAD, MEANINGS, cells, comparable, find_runs, what_scores_are, write_comparison
+    from lare.experiments.compare import HEAD, MEANINGS, cells, find_all, what_scores_are, write_comparison
     from lare.experiments.statistics import too_few
 
-    found, remarks = comparable(find_runs(runs))
+    found, remarks = find_all(runs, metric)
     for remark in remarks:
         progress(remark)
-    comparison = write_comparison(found, out)
+    comparison = write_comparison(found, out, metric)
     show(HEAD, cells(comparison))
     say(f"{what_scores_are(comparison)} {MEANINGS} {too_few(comparison)}".rstrip())
     say(f"wrote {out}")

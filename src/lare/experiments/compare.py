@@ -7,11 +7,35 @@ from pathlib import Path
 from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.html import note, table, write_page
-from lare.experiments.scores import REFERENCES, by_label
+from lare.experiments.own_results import read_results
+from lare.experiments.scores import REFERENCES, RETURN, SUMMED_RETURN, Measured, by_label, differing
 from lare.experiments.statistics import REPETITIONS, Band, Comparison, compare, plus_minus, too_few
 from lare.run.directory import CONFIG, Run, read_measured
 
-HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "better than first [95%]", "p")
+HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "better than baseline [95%]", "p")
+
+
+def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | Measured]], list[str]]:
+    """The runs and tables of results by label, in the order of the places, and remarks for the user.
+
+    Raises:
+        LareError: there is nothing to compare, or a table cannot be read.
+    """
+    tables = [place for place in places if place.suffix == ".csv"]
+    directories = [place for place in places if place not in tables]
+    runs, remarks = comparable(find_runs(directories)) if directories or not tables else ([], [])
+    found: dict[str, list[Run | Measured]] = {label: list(of_label) for label, of_label in by_label(runs).items()}
+    of_tables = [read_results(place, metric) for place in tables]
+    for label, of_label in (item for of_table in of_tables for item in of_table.items()):
+        found.setdefault(label, []).extend(of_label)
+    if places[:1] == tables[:1]:  # its first method is the baseline
+        first = next(iter(of_tables[0]))
+        found = {first: found.pop(first), **found}
+    if len(found) > 1 and (names := differing(runs)):
+        remarks.append(f"the runs also differ in {', '.join(names)}")
+    if metric == RETURN and any(SUMMED_RETURN in line for run in runs for line in run.metrics()):
+        remarks.append(f"returns are means over the agents; --metric {SUMMED_RETURN} compares their sums")
+    return found, remarks
 
 
 def find_runs(places: Sequence[Path]) -> list[Run]:
@@ -63,7 +87,7 @@ def cells(comparison: Comparison) -> list[tuple[str, ...]]:
     """The table, as text."""
     return [
         (
-            row.label,
+            row.label if place else f"{row.label} (baseline)",
             str(row.seeds),
             str(row.draws),
             str(row.iqm),
@@ -72,7 +96,7 @@ def cells(comparison: Comparison) -> list[tuple[str, ...]]:
             "-" if row.better is None else str(row.better),
             "-" if row.p is None else f"{row.p:.2g}",
         )
-        for row in comparison.rows
+        for place, row in enumerate(comparison.rows)
     ]
 
 
@@ -80,27 +104,28 @@ def what_scores_are(comparison: Comparison) -> str:
     """What the scores are, in a sentence or two."""
     step = int(comparison.curves[comparison.rows[0].label].x[-1])
     when = f"at step {step:,}, the last at which all runs were evaluated"
+    what = "true returns" if comparison.metric == RETURN else comparison.metric
     if not comparison.normalised:
-        return f"Scores are true returns on {comparison.tasks[0]} {when}."
+        return f"Scores are {what} on {comparison.tasks[0]} {when}."
     ends = (f"{task}: 0 is {REFERENCES[task][0]:g}, 1 is {REFERENCES[task][1]:g}" for task in comparison.tasks)
     return f"Scores are true returns {when}, scaled linearly between two fixed returns. {'; '.join(ends)}."
 
 
 MEANINGS = (
     "IQM: interquartile mean; of fewer than four seeds it is the mean. sd: standard deviation over the seeds (n - 1). Better than "
-    "first: the probability that a run scores more than a run of the first method; of a single seed it is not given, and a "
-    "probability of 0 or 1 has no interval. p: the probability of at least so many won (or lost) pairs of runs by chance (exact "
-    "Mann-Whitney test, one-sided: a two-sided p is twice as large)."
+    "baseline: the probability that a run scores more than one of the baseline, the first method; of a single seed it is not "
+    "given, and a probability of 0 or 1 has no interval. p: the probability of at least so many won pairs of runs by chance or, if "
+    "fewer than half were won, of so many lost ones (exact Mann-Whitney test, one-sided: a two-sided p is twice as large)."
 )
 
 
-def write_comparison(runs: Sequence[Run], out: Path) -> Comparison:
-    """Compare runs, and write the page.
+def write_comparison(runs: Mapping[str, Sequence[Run | Measured]], out: Path, metric: str = RETURN) -> Comparison:
+    """Compare runs by their labels, and write the page.
 
     Raises:
         LareError: the runs cannot be compared, or the file cannot be written.
     """
-    comparison = compare(by_label(runs))
+    comparison = compare(runs, metric)
     title = f"{', '.join(comparison.tasks)}: {len(comparison.rows)} contenders"
     write_page(out, title, "\n".join(body(title, comparison)))
     return comparison
@@ -114,7 +139,7 @@ def body(title: str, comparison: Comparison) -> Iterable[str]:
         + f" {MEANINGS} Intervals: stratified bootstrap over the seeds, {REPETITIONS} repetitions; in the column with draws, over "
         f"the draws of the language model. {too_few(comparison)}"
     )
-    score = "score" if comparison.normalised else "true return"
+    score = "score" if comparison.normalised else "true return" if comparison.metric == RETURN else comparison.metric
     yield from figure("Learning", comparison.curves, "environment steps", f"IQM of the {score}", steps=True)
     yield from figure("Performance profiles", comparison.profiles, f"x ({score})", "share of runs that score more")
 

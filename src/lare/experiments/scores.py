@@ -6,12 +6,13 @@ a fixed reference (`REFERENCES`).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from lare.errors import LareError
+from lare.errors import LareError, did_you_mean
 from lare.run.directory import Run
 
 REFERENCES = {
@@ -30,6 +31,32 @@ SUMMED_RETURN = "evaluation/summed_return"
 
 ERROR, CORRELATION, RETURN_R2 = "credit/error", "credit/correlation", "credit/return_r2"
 """How close the proxy rewards are to the true ones."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The values of a metric in one run, or in the rows of a table of results."""
+
+    source: Path
+    """The directory or the file."""
+    task: str
+    draw: int
+    curves: Mapping[int, Mapping[int, float]]
+    """By seed and step."""
+    digest: str | None = None
+    """The hash of the task's spec, if it is known."""
+
+
+def measured(run: Run, key: str) -> Measured:
+    """The values of a metric in a run. Raises `LareError` if there are none."""
+    lines = run.metrics()
+    if not lines:
+        raise LareError(f"{run.directory} has no evaluation yet: leave it out")
+    curves = {seed: curve(lines, seed, key) for seed in run.seeds}
+    if not any(curves.values()):
+        known = sorted({name for line in lines for name, value in line.items() if value is not None} - {"step", "seed"})
+        raise LareError(f"{run.directory} has no metric {key!r}{did_you_mean(key, known)}; it has {', '.join(known)}")
+    return Measured(run.directory, run.config.task.name, run.config.settings.draw, curves, run.config.task.digest)
 
 
 @dataclass(frozen=True)
@@ -73,39 +100,54 @@ IGNORED = {"seed", "seeds", "draw", "steps", "evaluate_every", "evaluation_episo
 """Settings that do not distinguish methods."""
 
 
-def grouped(runs: Mapping[str, Sequence[Run]], key: str) -> tuple[list[Group], tuple[str, ...]]:
+def differing(runs: Sequence[Run]) -> list[str]:
+    """The settings, beside the methods, in which runs of one algorithm differ, with their values."""
+    found: dict[str, list[str]] = {}
+    plans = [run.config.settings.in_force(run.config.task) for run in runs]
+    for plan in plans:
+        for other in plans:
+            if other["algorithm"] == plan["algorithm"]:
+                for name in plan.keys() & other.keys() - IGNORED - {"method"}:
+                    if plan[name] != other[name] and str(plan[name]) not in found.setdefault(name, []):
+                        found[name].append(str(plan[name]))
+    return [f"{name} ({', '.join(values)})" for name, values in sorted(found.items())]
+
+
+def grouped(runs: Mapping[str, Sequence[Run | Measured]], key: str) -> tuple[list[Group], tuple[str, ...]]:
     """The curves by label, and the tasks. Raises `LareError` if their table would be incomplete."""
-    tasks = tuple(sorted({run.config.task.name for of_label in runs.values() for run in of_label}))
+    found = {
+        label: [one if isinstance(one, Measured) else measured(one, key) for one in of_label]
+        for label, of_label in runs.items()
+    }
+    every = [(label, one) for label, of_label in found.items() for one in of_label]
+    tasks = tuple(sorted({one.task for _, one in every}))
+    if len(tasks) > 1 and key != RETURN:
+        raise LareError(f"only {RETURN} can be compared over several tasks: compare {key} on each task by itself")
     if len(tasks) > 1 and (unknown := [task for task in tasks if task not in REFERENCES]):
         raise LareError(
             f"there is no reference for {', '.join(unknown)}, so its returns cannot be compared with those of other tasks: "
             "compare the runs of each task by themselves"
         )
-    specs: dict[str, Run] = {}
-    for run in (run for of_label in runs.values() for run in of_label):
-        other = specs.setdefault(run.config.task.name, run)
-        if other.config.task.digest != run.config.task.digest:
+    specs: dict[str, Measured] = {}
+    for one in (one for _, one in every if one.digest is not None):
+        other = specs.setdefault(one.task, one)
+        if other.digest != one.digest:
             raise LareError(
-                f"{run.directory} and {other.directory} are runs of two tasks that are both called {run.config.task.name}: "
-                "compare them separately"
+                f"{one.source} and {other.source} are runs of two tasks that are both called {one.task}: compare them separately"
             )
-    curves: dict[tuple[str, str, int, int], tuple[Run, dict[int, float]]] = {}
-    for label, run in ((label, run) for label, of_label in runs.items() for run in of_label):
-        lines = run.metrics()
-        for seed in run.seeds:
-            place = (label, run.config.task.name, run.config.settings.draw, seed)
+    curves: dict[tuple[str, str, int, int], tuple[Path, Mapping[int, float]]] = {}
+    for label, one in every:
+        for seed, values in one.curves.items():
+            place = (label, one.task, one.draw, seed)
             if place in curves:
-                other = curves[place][0].directory
                 raise LareError(
-                    f"{run.directory} and {other} are both {label} on {place[1]} with seed {seed}: leave one out"
+                    f"{one.source} and {curves[place][0]} are both {label} on {one.task} with seed {seed}: leave one out"
                 )
-            curves[place] = run, curve(lines, seed, key)
-            if not lines:
-                raise LareError(f"{run.directory} has no evaluation yet: leave it out")
+            curves[place] = one.source, values
     steps = sorted(set.intersection(*(set(values) for _, values in curves.values())))
     if not steps:
         raise LareError("the runs have no step in common at which all of them were evaluated")
-    return [group_of(label, tasks, curves, steps) for label in runs], tasks
+    return [group_of(label, tasks, curves, steps) for label in found], tasks
 
 
 def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[int]) -> Group:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from scipy.stats import trim_mean
 
 from lare.errors import needs_extra
-from lare.experiments.scores import RETURN, Group, grouped
+from lare.experiments.scores import RETURN, Group, Measured, grouped
 from lare.run.directory import Run
 
 REPETITIONS = 2000
@@ -112,6 +112,8 @@ class Comparison:
     normalised: bool
     groups: Mapping[str, Group]
     """The scores themselves, by label."""
+    metric: str
+    """The key of the metric that is compared."""
 
 
 def too_few(comparison: Comparison) -> str:
@@ -127,11 +129,11 @@ def too_few(comparison: Comparison) -> str:
     )
 
 
-def compare(runs: Mapping[str, Sequence[Run]], key: str = RETURN) -> Comparison:
+def compare(runs: Mapping[str, Sequence[Run | Measured]], key: str = RETURN) -> Comparison:
     """Compare runs by their labels, on the tasks that all of them were trained on.
 
     Args:
-        runs: for each label, one run for each task, seed and draw; see `by_label`.
+        runs: for each label, one run for each task, seed and draw; see `by_label` and `read_results`.
         key: the metric to compare, a key of metrics.jsonl.
 
     Raises:
@@ -150,6 +152,7 @@ def compare(runs: Mapping[str, Sequence[Run]], key: str = RETURN) -> Comparison:
         {label: band(taus, scores, lambda scores: share_above(scores, taus)) for label, scores in last.items()},
         len(tasks) > 1,
         {group.label: group for group in groups},
+        key,
     )
 
 

@@ -1,0 +1,82 @@
+"""Results of other programs, in a comparison beside runs."""
+
+import pytest
+
+from lare.errors import LareError
+from lare.experiments.compare import find_all
+from lare.experiments.own_results import read_results
+from lare.experiments.scores import RETURN
+from lare.experiments.statistics import compare
+
+HEAD = "method,task,seed,step,evaluation/return,note\n"
+
+
+@pytest.fixture
+def table(tmp_path):
+    def write(text, head=HEAD):
+        path = tmp_path / "own.csv"
+        path.write_text(head + text)
+        return path
+
+    return write
+
+
+def of_methods(*methods):
+    """Two seeds at two steps each; each method scores one more than the one before."""
+    return "".join(
+        f"{method},Chase,{seed},{step},{place + seed / 4},x\n"
+        for place, method in enumerate(methods)
+        for seed in (0, 1)
+        for step in (50, 100)
+    )
+
+
+def test_methods_of_a_table_stand_beside_those_of_runs(table, made):
+    run, path = made("a", [0.5, 0.75], td3={"warmup": 10}), table(of_methods("mine", "other"))
+    found, remarks = find_all([run.directory, path], RETURN)
+    compared = compare(found)
+    assert ([row.label for row in compared.rows], remarks) == (["dense", "mine", "other"], [])
+    assert [row.mean for row in compared.rows] == [0.625, 0.125, 1.125]
+    assert list(find_all([path, run.directory], RETURN)[0]) == ["mine", "dense", "other"]
+    assert list(find_all([path], RETURN)[0]) == ["mine", "other"]
+
+
+def test_a_seed_that_is_in_both_is_refused(table, made):
+    run, path = made("a", [0.5]), table(of_methods("dense"))
+    with pytest.raises(LareError) as error:
+        compare(find_all([run.directory, path], RETURN)[0])
+    assert str(error.value) == f"{path} and {run.directory} are both dense on Chase with seed 0: leave one out"
+
+
+@pytest.mark.parametrize(
+    ("text", "head", "message"),
+    [
+        (
+            "",
+            "method,task,seed,steps,evaluation/return\n",
+            "{} has no column 'step' (did you mean 'steps'?): a table of results has the columns method, task, seed, step, "
+            "evaluation/return",
+        ),
+        (
+            "",
+            "",
+            "{} has no column 'method': a table of results has the columns method, task, seed, step, evaluation/return",
+        ),
+        ("", HEAD, "{} has no row with a value of evaluation/return"),
+        ("a,T,0,5,,x\n", HEAD, "{} has no row with a value of evaluation/return"),
+        ("a,T,0.5,5,1,x\n", HEAD, "{}, line 2: seed '0.5' is not a whole number"),
+        ("a,T,0,5,1,x\na,T,0,10,nan,x\n", HEAD, "{}, line 3: evaluation/return 'nan' is not a finite number"),
+        ("a,T,0,5\n", HEAD, "{} has no row with a value of evaluation/return"),
+        ("a,T,0,5,1,x\n" * 2, HEAD, "{}, line 3: there is a second row of a on T with seed 0 at step 5"),
+    ],
+)
+def test_what_is_no_table_of_results(text, head, message, table):
+    path = table(text, head)
+    with pytest.raises(LareError) as error:
+        read_results(path, RETURN)
+    assert str(error.value) == message.format(path)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(LareError, match=r"own\.csv"):
+        find_all([tmp_path / "own.csv"], RETURN)
