@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lare.credit import evidence
+from lare.credit.basis import Basis, expand
 
 GROUP = np.repeat([0, 1, 2], [3, 4, 5])
 
@@ -262,3 +263,23 @@ def test_an_irrelevant_phi_is_as_good_as_none(seed, count, noise, longest):
         of_phi, of_raw, of_both = compared(seed, count, noise, longest, "irrelevant")
     assert of_both <= of_raw + 0.1 + 2.0 / count
     assert of_both < of_phi
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.sampled_from([12, 25, 60]),
+    noise=st.sampled_from([0.0, 0.3]),
+    longest=st.sampled_from([5, 40]),
+)
+def test_pairs_cost_nothing_where_the_score_has_no_product(seed, count, noise, longest):
+    basis = Basis(0, 8, extended=True)
+    _, raw, *rest = synthetic(seed, count, noise, longest, "perfect")
+    deviation = np.concatenate(raw[:count]).std(axis=0)
+    features = [np.asarray(expand(basis, jnp.asarray(rows / deviation)), float) for rows in raw]
+    additive = basis.group < basis.group.max()
+    with jax.enable_x64(True):
+        without = error_of([rows[:, additive] for rows in features], basis.group[additive], *rest, count)
+        with_pairs = error_of(features, basis.group, *rest, count)
+    assert list(basis.sizes)[-1] == "pairs of entries"
+    assert with_pairs <= without + 0.1 + 2.0 / count
