@@ -21,6 +21,7 @@ from lare.experiments.sweep import read_sweep, run_sweep
 from lare.experiments.tables import rows_of, write_table
 from lare.run.directory import open_run
 from lare.training.train import Interrupted
+from tiers import long
 from toys import At
 
 FILE = """
@@ -177,7 +178,7 @@ def test_the_sweeps_of_the_benchmarks_can_be_trained(path):
 KILLED = FILE.replace('"dense", ', "").replace("[0, 3]", "[0]").replace("steps = 200", "steps = 100_000")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, long(signal.SIGKILL)])
 def test_a_sweep_that_is_stopped_or_killed_leaves_a_saved_run_and_nobody_behind(number, file, tmp_path):
     """Ctrl-C reaches the whole group of processes, as in a terminal; the others reach the sweep alone."""
     file.write_text(KILLED)

@@ -14,6 +14,7 @@ from lare.latent.verification.verify import Verdict
 from lare.llm.prompts import candidate, combine, correct
 from lare.llm.recording import read_recording
 from lare.tasks.spec import read_task, shipped_tasks
+from tiers import long
 from toys import PHI, Chase, phi, toy_spec
 
 
@@ -55,7 +56,13 @@ def trusting(monkeypatch):
     monkeypatch.setattr(module, "verify", lambda *_: Verdict((Check("gate", True, ""),), 2))
 
 
-@pytest.mark.parametrize("name", [name for name in shipped_tasks() if not name.startswith("SMAC-")])
+ONE_OF_A_KIND = ("CN-6", "CompetitivePP-6", "HalfCheetah-v4", "Reacher-v4", "SMAX-2s3z", "TriangleArea", "Walker2d-v4")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [name if name in ONE_OF_A_KIND else long(name) for name in shipped_tasks() if not name.startswith("SMAC-")],
+)
 def test_every_shipped_task_has_its_function(name):
     spec = read_task(name)
     if spec.teams:

@@ -56,7 +56,7 @@ CASES = [
     long("lare-linear", TWO),
     long("lare-signs", TWO),
     long("bayes", TWO),
-    ("rd-linear", ALONE),
+    long("rd-linear", ALONE),
     ("rd-linear", TOGETHER),
     long("lare-rd", TWO),
     long("rd", TOGETHER),

@@ -173,6 +173,7 @@ def test_remarks_outlive_a_page(made_up, tmp_path):
     assert reproduce("sparse", "smoke", Share(), tmp_path / "runs", tmp_path / "out").read_text() == remarked
 
 
+@pytest.mark.long
 def test_an_exhibit_that_is_trained(command, monkeypatch, tmp_path):
     """The whole way, from the command line; the runs in this process, whose compiler is told to hurry."""
     monkeypatch.setattr(processes, "in_a_process", lambda job, cores, running: train_one(as_json(job)))
