@@ -1,6 +1,8 @@
 """Results of other programs, in a comparison beside runs."""
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from lare.errors import LareError
 from lare.experiments.compare import find_all
@@ -15,7 +17,7 @@ HEAD = "method,task,seed,step,evaluation/return,note\n"
 def table(tmp_path):
     def write(text, head=HEAD):
         path = tmp_path / "own.csv"
-        path.write_text(head + text)
+        path.write_text(head + text, encoding="utf-8", newline="")
         return path
 
     return write
@@ -67,6 +69,8 @@ def test_a_seed_that_is_in_both_is_refused(table, made):
         ("a,T,0.5,5,1,x\n", HEAD, "{}, line 2: seed '0.5' is not a whole number"),
         ("a,T,0,5,1,x\na,T,0,10,nan,x\n", HEAD, "{}, line 3: evaluation/return 'nan' is not a finite number"),
         ("a,T,0,5\n", HEAD, "{} has no row with a value of evaluation/return"),
+        (",T,0,5,1,x\n", HEAD, "{}, line 2: there is no name of a method or task"),
+        ("a" * 200_000 + ",T,0,5,1,x\n", HEAD, "{} is no CSV table: field larger than field limit (131072)"),
         ("a,T,0,5,1,x\n" * 2, HEAD, "{}, line 3: there is a second row of a on T with seed 0 at step 5"),
     ],
 )
@@ -75,6 +79,27 @@ def test_what_is_no_table_of_results(text, head, message, table):
     with pytest.raises(LareError) as error:
         read_results(path, RETURN)
     assert str(error.value) == message.format(path)
+
+
+def refused(path):
+    """The message of an error, if there is one."""
+    try:
+        read_results(path, RETURN)
+    except LareError as error:
+        return str(error)
+    return None
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    text=st.text(st.characters(exclude_categories=["Cs"]))
+    | st.lists(st.lists(st.sampled_from(["", "a", "0", "5", "-1", "1e9", "nan", '"', ",", "\n"]))).map(
+        lambda lines: "\n".join(",".join(line) for line in lines)
+    ),
+    head=st.sampled_from(["", HEAD]),
+)
+def test_any_text_is_read_or_refused_in_one_line(text, head, table):
+    assert "\n" not in (refused(table(text, head)) or "")
 
 
 def test_a_file_that_is_not_there(tmp_path):

@@ -23,7 +23,15 @@ def read_results(path: Path, key: str) -> dict[str, list[Measured]]:
     Raises:
         LareError: the file cannot be read, a column is missing, or a line is not valid.
     """
-    rows = csv.DictReader(io.StringIO(read_text(path, LARGEST)))
+    text = read_text(path, LARGEST)
+    try:
+        return curves_of(csv.DictReader(io.StringIO(text, newline=""), restkey=""), path, key)
+    except csv.Error as error:
+        raise LareError(f"{path} is no CSV table: {error}") from error
+
+
+def curves_of(rows: csv.DictReader, path: Path, key: str) -> dict[str, list[Measured]]:
+    """The curves in the rows of a table. Raises `LareError`, and `csv.Error` if a row cannot be split."""
     known = rows.fieldnames or []
     for name in (*COLUMNS, key):
         if name not in known:
@@ -36,6 +44,8 @@ def read_results(path: Path, key: str) -> dict[str, list[Measured]]:
         where = f"{path}, line {rows.line_num}"
         if not row[key]:  # a row without this metric
             continue
+        if not (row["method"] and row["task"]):
+            raise LareError(f"{where}: there is no name of a method or task")
         seed, step = (whole(row[name], name, where) for name in ("seed", "step"))
         of_seed = curves.setdefault((row["method"], row["task"]), {}).setdefault(seed, {})
         if step in of_seed:
