@@ -35,18 +35,41 @@ def of_methods(*methods):
 
 def test_methods_of_a_table_stand_beside_those_of_runs(table, made):
     run, path = made("a", [0.5, 0.75], td3={"warmup": 10}), table(of_methods("mine", "other"))
-    found, remarks = find_all([run.directory, path], RETURN)
+    found, remarks = find_all((run.directory, path), RETURN)
     compared = compare(found)
     assert ([row.label for row in compared.rows], remarks) == (["dense", "mine", "other"], [])
     assert [row.mean for row in compared.rows] == [0.625, 0.125, 1.125]
-    assert list(find_all([path, run.directory], RETURN)[0]) == ["mine", "dense", "other"]
-    assert list(find_all([path], RETURN)[0]) == ["mine", "other"]
+    assert list(find_all((path, run.directory), RETURN)[0]) == ["mine", "dense", "other"]
+    assert list(find_all((path,), RETURN)[0]) == ["mine", "other"]
+
+
+def test_the_first_method_of_a_table_that_is_listed_first_is_the_baseline(table, made, command, tmp_path):
+    run, path = made("a", [0.5, 0.75], td3={"warmup": 10}), table(of_methods("mine"))
+    status, out, noted = command("compare", path, run.directory, "--out", tmp_path / "page.html")
+    assert (status, noted) == (0, "")
+    assert "mine (baseline)" in out
+    assert "dense (baseline)" not in out
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        (
+            of_methods("mine").replace(",100,", ",99,"),
+            "{} has no evaluation/return of mine at step 100 for every seed: no run is compared there",
+        ),
+        (of_methods("mine").replace("Chase", "Chasing"), "{} has the task Chasing; the runs have Chase"),
+    ],
+)
+def test_a_table_that_does_not_fit_the_runs_is_named(rows, said, table, made):
+    run, path = made("a", [0.5], td3={"warmup": 10}), table(rows)
+    assert find_all((run.directory, path), RETURN)[1] == [said.format(path)]
 
 
 def test_a_seed_that_is_in_both_is_refused(table, made):
     run, path = made("a", [0.5]), table(of_methods("dense"))
     with pytest.raises(LareError) as error:
-        compare(find_all([run.directory, path], RETURN)[0])
+        compare(find_all((run.directory, path), RETURN)[0])
     assert str(error.value) == f"{path} and {run.directory} are both dense on Chase with seed 0: leave one out"
 
 
@@ -104,4 +127,4 @@ def test_any_text_is_read_or_refused_in_one_line(text, head, table):
 
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(LareError, match=r"own\.csv"):
-        find_all([tmp_path / "own.csv"], RETURN)
+        find_all((tmp_path / "own.csv",), RETURN)

@@ -112,7 +112,8 @@ def test_another_metric(made):
     with pytest.raises(LareError) as error:
         grouped(by_label([run]), "evaluation/returns")
     assert str(error.value) == (
-        f"{run.directory} has no metric 'evaluation/returns' (did you mean 'evaluation/return'?); it has evaluation/return"
+        f"{run.directory} has no metric 'evaluation/returns' (did you mean 'evaluation/return'?); it has evaluation/return. "
+        "Leave it out, or compare another metric"
     )
     runs = [made("b", [1.0], "Walker2d-v4"), made("b", [1.0], "Reacher-v4")]
     for lines in (one.directory / "metrics.jsonl" for one in runs):

@@ -28,14 +28,33 @@ def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | 
     of_tables = [read_results(place, metric) for place in tables]
     for label, of_label in (item for of_table in of_tables for item in of_table.items()):
         found.setdefault(label, []).extend(of_label)
-    if places[:1] == tables[:1]:  # its first method is the baseline
+    if tables and places[0] == tables[0]:  # its first method is the baseline
         first = next(iter(of_tables[0]))
         found = {first: found.pop(first), **found}
+    remarks += other_ends(runs, of_tables, metric)
     if len(found) > 1 and (names := differing(runs)):
         remarks.append(f"the runs also differ in {', '.join(names)}")
     if metric == RETURN and any(SUMMED_RETURN in line for run in runs for line in run.metrics()):
         remarks.append(f"returns are means over the agents; --metric {SUMMED_RETURN} compares their sums")
     return found, remarks
+
+
+def other_ends(runs: Sequence[Run], tables: Sequence[Mapping[str, Sequence[Measured]]], metric: str) -> list[str]:
+    """Remarks on tables that lack the last step of the runs, or one of their tasks."""
+    last: dict[str, int] = {}  # of the shortest run of each task
+    for run in runs:
+        name, step = run.config.task.name, run.metrics()[-1]["step"]
+        last[name] = min(step, last.get(name, step))
+    said = []
+    of_methods = [item for of_table in tables for item in of_table.items()]
+    for method, one in ((method, one) for method, of_method in of_methods for one in of_method):
+        if one.task in last and any(last[one.task] not in values for values in one.curves.values()):
+            said.append(
+                f"{one.source} has no {metric} of {method} at step {last[one.task]:,} for every seed: no run is compared there"
+            )
+        elif last and one.task not in last:
+            said.append(f"{one.source} has the task {one.task}; the runs have {', '.join(sorted(last))}")
+    return said
 
 
 def find_runs(places: Sequence[Path]) -> list[Run]:

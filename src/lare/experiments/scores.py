@@ -55,7 +55,10 @@ def measured(run: Run, key: str) -> Measured:
     curves = {seed: curve(lines, seed, key) for seed in run.seeds}
     if not any(curves.values()):
         known = sorted({name for line in lines for name, value in line.items() if value is not None} - {"step", "seed"})
-        raise LareError(f"{run.directory} has no metric {key!r}{did_you_mean(key, known)}; it has {', '.join(known)}")
+        raise LareError(
+            f"{run.directory} has no metric {key!r}{did_you_mean(key, known)}; it has {', '.join(known)}. Leave it out, or compare "
+            "another metric"
+        )
     return Measured(run.directory, run.config.task.name, run.config.settings.draw, curves, run.config.task.digest)
 
 

@@ -91,7 +91,8 @@ class RecordedModel:
         raise LareError(
             f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}): only the shipped tasks have "
             "recorded replies, for their exact texts. Ask a model (lare design TASK --model NAME --out phi.py), train with a "
-            "function that you have (--function phi.py), or by a method that needs none (--method bayes)"
+            "function that you have (--function phi.py; in a sweep file, the table [functions]), or by a method that needs none "
+            "(--method bayes)"
         )
 
 
