@@ -104,6 +104,13 @@ def test_what_is_said(returns, facts, sentences):
     assert said(returns, **facts) == sentences
 
 
+def test_seeds_that_learned_are_counted_where_their_mean_says_too_little():
+    returns = np.vstack([FLAT, FLAT - 52, FLAT - 51])
+    found = "The return is 16.7 ± 29.7 after 8,000 steps (mean over 3 seeds); random actions get 0 ± 1"
+    assert said(returns)[0] == f"It learned with 1 of 3 seeds. {found}."
+    assert said(returns, before=51.0)[0] == f"It has not learned yet. {found}, the policy before training 51."
+
+
 def test_a_policy_that_was_never_updated_has_learned_nothing():
     assert said(RISING, untrained="all 8,000 steps are random") == [
         "Nothing was learned: all 8,000 steps are random.",

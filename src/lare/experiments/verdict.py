@@ -74,9 +74,17 @@ def learned(run: Facts) -> str:
         by_chance += f", the policy before training {shown(run.before)}"
     if better_than_chance(run) and (run.before is None or run.last > run.before + 2 * noise(run)):
         return f"It learned. {reached}; {by_chance}."
+    if seeds := successes(run):
+        return f"It learned with {seeds} of {len(run.returns)} seeds. {reached}; {by_chance}."
     if run.last < run.random.mean() - 2 * noise(run):
         return f"It got worse than random actions. {reached}; {by_chance}."
     return f"It has not learned yet. {reached}; {by_chance}."
+
+
+def successes(run: Facts) -> int:
+    """How many seeds end above the return before training, and above random actions by two standard deviations of their returns."""
+    bar = float(run.random.mean()) + 2 * max(deviation(run.random), 1e-9)
+    return int(np.sum(run.returns[:, -1] > max(bar, -np.inf if run.before is None else run.before)))
 
 
 def better_than_chance(run: Facts) -> bool:
