@@ -20,7 +20,8 @@ LONG = LENGTHS * 6
 
 def both(method, env, phi=None):
     """A learner of the trainer's and an assigner that have met the same steps, some at a time."""
-    config = config_of(method, "td3" if env.agents == 1 else "ippo", env, capacity=1000)
+    judges = "after" if phi is None else toy_spec().judges
+    config = config_of(method, "td3" if env.agents == 1 else "ippo", env, capacity=1000, judges=judges)
     many = {} if env.agents == 1 else {"agents": env.agents, "max_steps": env.max_steps}
     credit = CreditAssigner(
         method,
