@@ -104,7 +104,8 @@ def test_whole_numbers_are_choices_where_a_task_says_so():
     with pytest.raises(LareError) as error:
         form_of("a", values, {}, None)
     assert str(error.value) == (
-        "a: actions are whole numbers, choices maybe: say how many there are with a task (action_size)"
+        "a: actions are whole numbers, choices maybe: write a task file that says how many there are (action_size), as "
+        "docs/logs.md shows, and give it (--task FILE)"
     )
     with pytest.raises(LareError, match=r"\Aa: actions holds a choice that does not exist: array\(\[0, 3, 1\]\)\Z"):
         checked("a", values | {"actions": np.array([0, 3, 1])}, form, None)

@@ -220,7 +220,7 @@ def test_a_replay_that_grows_holds_what_it_held(method, small, phi, tmp_path):
     ("steps", "message"),
     [
         (48, r"^steps = 48: the run has 60 already, and this number can only be increased$"),
-        (70, r"^steps = 70 is not a multiple of rollout_steps = 12: take 72$"),
+        (62, r"^steps = 62 is not a multiple of rollout_steps = 12: take 72$"),
     ],
 )
 def test_steps_that_a_run_cannot_be_extended_to(steps, message, small, tmp_path):

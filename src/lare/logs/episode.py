@@ -190,7 +190,8 @@ def form_of(name: str, values: Mapping[str, Any], sizes: Mapping[str, int], limi
         chosen = array.dtype.kind in "iu" and array.ndim == 1
         if chosen and size is None:
             raise LareError(
-                f"{name}: {kind}s are whole numbers, choices maybe: say how many there are with a task ({kind}_size)"
+                f"{name}: {kind}s are whole numbers, choices maybe: write a task file that says how many there are ({kind}_size), "
+                "as docs/logs.md shows, and give it (--task FILE)"
             )
         if chosen and size != 1:
             found[kind] = Layout(kind="choices", choices=(int(size or 0),), first=(0,))

@@ -201,6 +201,9 @@ class Run:
             )
         if steps == config.settings.steps:
             return self
+        if beyond := steps % config.settings.iteration_steps:
+            more = steps - beyond + config.settings.iteration_steps
+            raise LareError(f"steps = {steps} is not a multiple of {config.settings.described_iteration}: take {more}")
         settings = ResolvedSettings(**{**dict(config.settings), "steps": steps})
         longer = config.model_copy(update={"settings": settings, "ended_at": (*config.ended_at, config.settings.steps)})
         text = longer.model_dump_json(indent=1) + "\n"

@@ -15,7 +15,7 @@ from lare.tasks.spec import FILL_IN, PETTINGZOO
 HEADING = re.compile(r"^[ \t]*#+\s*(.+?)\s*$", re.MULTILINE)
 
 LEAKS = re.compile(
-    r"reward|penal|\bcosts?\b|\bscor(e|es|ed|ing)\b"
+    r"reward|penal|\bcosts?\b|\bscor(e|es|ed|ing)\b|\b(a|the|final) (mark|grade) (is|of|from|for)\b|\bgraded\b"
     r"|(\d|\b(earn|gain|get|give|lose|receive|win|award)\w*)( \w+)? points?\b"
     r"|\b(average|cumulative|discounted|episodic?|expected|mean|the|total) returns?\b(?! to\b)",
     re.IGNORECASE,
