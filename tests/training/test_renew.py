@@ -35,8 +35,7 @@ def trained(settings, model, out, listeners=()):
     return lare.train(task, settings, function=verified(WRONG, task), model=model, out=out, listeners=listeners)
 
 
-def test_a_better_function_takes_its_place(settings, tmp_path, monkeypatch):
-    monkeypatch.setattr("lare.credit.basis.MOST_PAIRED", 0)  # with pairs, raw entries make up for the first function
+def test_a_better_function_takes_its_place(settings, tmp_path):
     ear, model = Ear(), Says(RIGHT, WRONG)
     run = trained(settings, model, tmp_path / "run", [ear])
     assert (run.function.source, run.since) == (RIGHT, 600)
@@ -46,7 +45,7 @@ def test_a_better_function_takes_its_place(settings, tmp_path, monkeypatch):
     before, after = (
         [line["credit/correlation"] for line in run.metrics() if line["step"] == step] for step in (600, 900)
     )
-    assert max(before) < 0.95
+    assert max(before) < 0.99  # raw entries and their pairs nearly make up for the first function
     assert min(after) > 0.999
     again = open_run(tmp_path / "run")
     assert (again.function.source, again.since) == (RIGHT, 600)

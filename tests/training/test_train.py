@@ -611,7 +611,7 @@ def test_a_run_whose_state_has_another_structure_names_the_version_that_trained_
     """A version with pairs of entries, after one without."""
     monkeypatch.setattr("lare.credit.basis.MOST_PAIRED", 0)
     monkeypatch.setattr("lare.run.directory.source", lambda: "0.1.0")
-    run = lare.train(toy_spec(), small(method="bayes"), out=tmp_path / "run", listeners=[])
+    run = lare.train(toy_spec(), small(method="bayes", steps=156), out=tmp_path / "run", listeners=[])
     monkeypatch.undo()
     jax.clear_caches()
     with pytest.raises(LareError) as error:
