@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lare.credit import evidence
+from lare.credit.basis import pairs
 from lare.run.directory import read_config
 from measure import write
 from stored import of_each_seed
@@ -84,11 +85,6 @@ SHAPES: dict[str, Shape] = {
     "6 bumps": partial(bumps, count=6),
     "6 hinges": partial(hinges, count=6),
 }
-
-
-def pairs(u: Array) -> Array:
-    one, other = np.triu_indices(u.shape[1], 1)
-    return jnp.clip(u, -4, 4)[:, one] * jnp.clip(u, -4, 4)[:, other]
 
 
 CHOSEN = SHAPES["Fourier series, 3 frequencies"]

@@ -18,7 +18,8 @@ import numpy as np
 from jax import Array
 
 import lare
-from basis import ASKED, CHOSEN, fitted, pairs, scores, standardised
+from basis import ASKED, CHOSEN, fitted, scores, standardised
+from lare.credit.basis import pairs
 from lare.run.directory import read_config
 from measure import write
 from missing_factors import FACTORS, source

@@ -19,7 +19,7 @@ from lare.experiments.jobs import Job, job_of
 from lare.experiments.scores import RETURN
 from lare.foreign import LARGEST_SETTINGS, read_text, read_toml
 from lare.run.settings import Settings
-from lare.run.usual import usual_algorithm
+from lare.run.usual import algorithm_of
 from lare.tasks.spec import load_task
 from lare.tasks.table import env_spec
 
@@ -182,7 +182,7 @@ def jobs_of_contender(one: Contender, budget: Budget, name: str, root: Path) -> 
     task = load_task(name)
     steps = budget.steps_of_many if env_spec(task).agents > 1 else budget.steps
     common = {"method": one.method, "algorithm": one.algorithm, "steps": steps, "seeds": budget.seeds}
-    common |= budget.algorithms.get(one.algorithm or usual_algorithm(env_spec(task)), {})
+    common |= budget.algorithms.get(algorithm_of(one.algorithm, env_spec(task)), {})
     latent = find_method(one.method).latent
     for draw in range(min(budget.draws, one.draws) if latent else 1):
         job = job_of(root, task, Settings(**{**one.settings, **budget.settings, **common, "draw": draw}))

@@ -237,27 +237,26 @@ def compared(seed, count, noise, longest, phi):
     )
 
 
+def over(counts, noises):
+    """Any seed, short episodes and long ones, with some numbers of episodes and sizes of the noise."""
+    drawn = given(
+        seed=st.integers(0, 10_000),
+        count=st.sampled_from(counts),
+        noise=st.sampled_from(noises),
+        longest=st.sampled_from([5, 40]),
+    )
+    return lambda test: settings(max_examples=12, deadline=None, derandomize=True)(drawn(test))
+
+
 @pytest.mark.parametrize("phi", ["perfect", "correlated", "duplicated", "constant"])
-@settings(max_examples=12, deadline=None, derandomize=True)
-@given(
-    seed=st.integers(0, 10_000),
-    count=st.sampled_from([12, 25, 60]),
-    noise=st.sampled_from([0.0, 0.3, 1.0]),
-    longest=st.sampled_from([5, 40]),
-)
+@over([12, 25, 60], [0.0, 0.3, 1.0])
 def test_beside_a_good_phi_raw_features_cost_nothing(phi, seed, count, noise, longest):
     with jax.enable_x64(True):
         of_phi, _, of_both = compared(seed, count, noise, longest, phi)
     assert of_both <= of_phi + 0.15 + 2.0 / count
 
 
-@settings(max_examples=12, deadline=None, derandomize=True)
-@given(
-    seed=st.integers(0, 10_000),
-    count=st.sampled_from([15, 30, 80]),
-    noise=st.sampled_from([0.0, 0.3]),
-    longest=st.sampled_from([5, 40]),
-)
+@over([15, 30, 80], [0.0, 0.3])
 def test_an_irrelevant_phi_is_as_good_as_none(seed, count, noise, longest):
     with jax.enable_x64(True):
         of_phi, of_raw, of_both = compared(seed, count, noise, longest, "irrelevant")
@@ -265,13 +264,7 @@ def test_an_irrelevant_phi_is_as_good_as_none(seed, count, noise, longest):
     assert of_both < of_phi
 
 
-@settings(max_examples=12, deadline=None, derandomize=True)
-@given(
-    seed=st.integers(0, 10_000),
-    count=st.sampled_from([12, 25, 60]),
-    noise=st.sampled_from([0.0, 0.3]),
-    longest=st.sampled_from([5, 40]),
-)
+@over([12, 25, 60], [0.0, 0.3])
 def test_pairs_cost_nothing_where_the_score_has_no_product(seed, count, noise, longest):
     basis = Basis(0, 8, extended=True)
     _, raw, *rest = synthetic(seed, count, noise, longest, "perfect")

@@ -14,13 +14,14 @@ import pytest
 from lare.errors import LareError
 from lare.experiments.report import write_report
 from lare.experiments.sweep import read_sweep
+from lare.latent.saved import read_source
 from lare.llm.model import recorded_model
 from lare.run import checkpoint, directory
 from lare.run.decide import decide
 from lare.run.directory import describe, open_run, read_config, read_metrics
 from lare.run.settings import Settings
 from lare.tasks.spec import read_task
-from toys import toy_spec
+from toys import PHI, toy_spec
 
 DEEP = "[" * 50_000
 TOO_DEEP = "it is nested more than 64 deep"
@@ -333,6 +334,18 @@ def test_a_report_imports_nothing_that_a_file_names(run, neighbour, environment)
     module = environment.removeprefix("pettingzoo/").partition(":")[0]
     assert f"Its environment is of the module {module}, which is not imported for a report." in page
     assert module not in {*sys.modules} - before
+
+
+def test_such_a_report_prints_the_latent_function_that_is_in_use(run, neighbour):
+    place = run({"environment": "a_neighbours_file:X-v0"})
+    function = place / "latent_function.py"
+    function.write_text(PHI)
+    run({"environment": "a_neighbours_file:X-v0"}, function_sha256=[read_source(function).digest])
+    assert "# 1. how near the action comes" in write_report([place]).read_text(encoding="utf-8")
+    function.write_text(PHI.replace("near", "far"))
+    assert said(lambda one: write_report([one]), place).endswith(
+        "latent_function.py is not the function that this run was trained with: its hash changed"
+    )
 
 
 def test_the_command_says_what_a_report_leaves_out(run, neighbour, command):

@@ -24,6 +24,12 @@ WRONG = "def evaluation_func(observation, action):\n    return [observation[:, 1
 RIGHT = "def evaluation_func(observation, action):\n    return [np.square(action - observation[:, 0:1]), action]"
 
 
+@pytest.fixture(autouse=True)
+def without_pairs(monkeypatch):
+    """With pairs of entries, raw features nearly make up for the first function."""
+    monkeypatch.setattr("lare.credit.basis.MOST_PAIRED", 0)
+
+
 @pytest.fixture
 def settings(small):
     changes = {"steps": 1800, "seeds": 2, "evaluate_every": 300, "reflect_every": 600}
@@ -45,7 +51,7 @@ def test_a_better_function_takes_its_place(settings, tmp_path):
     before, after = (
         [line["credit/correlation"] for line in run.metrics() if line["step"] == step] for step in (600, 900)
     )
-    assert max(before) < 0.99  # raw entries and their pairs nearly make up for the first function
+    assert max(before) < 0.95
     assert min(after) > 0.999
     again = open_run(tmp_path / "run")
     assert (again.function.source, again.since) == (RIGHT, 600)

@@ -118,7 +118,7 @@ class Method:
         return self.encoder in (Encoder.LATENT, Encoder.LATENT_AND_JUDGED)
 
     @property
-    def judges(self) -> bool:
+    def follows_judges(self) -> bool:
         """Whether it matters by which states the task judges a step."""
         return self.latent or self.encoder is Encoder.JUDGED
 

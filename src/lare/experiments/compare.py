@@ -23,7 +23,7 @@ def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | 
     """
     tables = [place for place in places if place.suffix == ".csv"]
     directories = [place for place in places if place not in tables]
-    runs, remarks = comparable(find_runs(directories)) if directories or not tables else ([], [])
+    runs, remarks = comparable(find_runs(directories), metric) if directories or not tables else ([], [])
     found: dict[str, list[Run | Measured]] = {label: list(of_label) for label, of_label in by_label(runs).items()}
     of_tables = [read_results(place, metric) for place in tables]
     for label, of_label in (item for of_table in of_tables for item in of_table.items()):
@@ -31,11 +31,10 @@ def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | 
     if tables and places[0] == tables[0]:  # its first method is the baseline
         first = next(iter(of_tables[0]))
         found = {first: found.pop(first), **found}
-    remarks += other_ends(runs, of_tables, metric)
+    if of_tables:
+        remarks += other_ends(runs, of_tables, metric)
     if len(found) > 1 and (names := differing(runs)):
         remarks.append(f"the runs also differ in {', '.join(names)}")
-    if metric == RETURN and any(SUMMED_RETURN in line for run in runs for line in run.metrics()):
-        remarks.append(f"returns are means over the agents; --metric {SUMMED_RETURN} compares their sums")
     return found, remarks
 
 
@@ -78,18 +77,19 @@ def find_runs(places: Sequence[Path]) -> list[Run]:
     return [read_measured(directory) for directory in directories.values()]
 
 
-def comparable(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """The runs that have an evaluation, and remarks on runs that were not trained to their end.
+def comparable(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], list[str]]:
+    """The runs that have an evaluation, and remarks on the metric and on runs that were not trained to their end.
 
     Raises:
         LareError: no run has an evaluation.
     """
-    found, remarks = [], []
+    found, remarks, summed = [], [], False
     for run in runs:
         if not (lines := run.metrics()):
             remarks.append(f"{run.directory} has no evaluation yet, and is left out")
             continue
         found.append(run)
+        summed = summed or any(SUMMED_RETURN in line for line in lines)
         if (reached := lines[-1]["step"]) < run.config.settings.steps:
             remarks.append(
                 f"{run.directory} has only reached step {reached:,} of {run.config.settings.steps:,}, so no run is compared at a "
@@ -99,6 +99,8 @@ def comparable(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
             remarks.append(f"{run.directory}: {warning}")
     if not found:
         raise LareError(f"{', '.join(str(run.directory) for run in runs)}: no run has an evaluation yet")
+    if summed and metric == RETURN:
+        remarks.append(f"returns are means over the agents; --metric {SUMMED_RETURN} compares their sums")
     return found, remarks
 
 

@@ -24,7 +24,7 @@ from lare.experiments.statistics import mean_and_deviation, plus_minus
 from lare.experiments.verdict import Facts, last_known, median_of_known, verdict
 from lare.experiments.video import record_video
 from lare.latent.saved import read_source
-from lare.run.directory import Run, function_file, open_run, read_config
+from lare.run.directory import Run, function_places, open_run, read_config
 from lare.run.settings import Settings
 from lare.run.usual import resolve
 from lare.source import source
@@ -262,11 +262,9 @@ def details(name: str, run: Run) -> Iterable[str]:
 
 def unverified_functions(run: Run) -> Iterable[str]:
     """The sources of a run's latent functions as its files have them, which nothing has run or verified."""
-    config = run.config
-    for role in config.task.roles if config.function_sha256 else ():
-        saved = read_source(run.directory / function_file(config.task, role))
+    for role, place in function_places(run.directory, run.config)[0]:
         yield f"<h3>The latent function{f' of {escape(role.team)}' if role.team else ''}</h3>"
-        yield f"<pre>{escape(saved.source)}</pre>"
+        yield f"<pre>{escape(read_source(place).source)}</pre>"
 
 
 def film_of(run: Run) -> str:

@@ -6,6 +6,7 @@ a fixed reference (`REFERENCES`).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -105,14 +106,14 @@ IGNORED = {"seed", "seeds", "draw", "steps", "evaluate_every", "evaluation_episo
 
 def differing(runs: Sequence[Run]) -> list[str]:
     """The settings, beside the methods, in which runs of one algorithm differ, with their values."""
-    found: dict[str, list[str]] = {}
+    found: dict[str, dict[str, None]] = {}  # the values of each setting, in order
     plans = [run.config.settings.in_force(run.config.task) for run in runs]
-    for plan in plans:
-        for other in plans:
-            if other["algorithm"] == plan["algorithm"]:
-                for name in plan.keys() & other.keys() - IGNORED - {"method"}:
-                    if plan[name] != other[name] and str(plan[name]) not in found.setdefault(name, []):
-                        found[name].append(str(plan[name]))
+    for plan, other in permutations(plans, 2):
+        if other["algorithm"] != plan["algorithm"]:
+            continue
+        for name in plan.keys() & other.keys() - IGNORED - {"method"}:
+            if plan[name] != other[name]:
+                found.setdefault(name, {})[str(plan[name])] = None
     return [f"{name} ({', '.join(values)})" for name, values in sorted(found.items())]
 
 

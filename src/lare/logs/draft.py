@@ -24,7 +24,7 @@ def draft_of_logs(source: Any) -> Draft:
     name = re.sub(r"[^\w.\-]+", "-", re.sub(r"\.parquet$", "", logs.name.rstrip("/")).rpartition("/")[2]) or "logs"
     limit = logs.form.limit
     lines = [
-        *warning("the log", left_out),
+        *warning(left_out, "the log"),
         f'name = "{name}"',
         f'environment = "{NO_ENVIRONMENT}" # there are logs only; to train, the id of the environment that they come from',
         f"observation_size = {layouts['observation'].size}",

@@ -6,7 +6,7 @@ from lare.credit.methods import Decoder, Encoder, Fit, Method, Reward, find_meth
 from lare.data.replay import room
 from lare.errors import LareError
 from lare.run.settings import ResolvedSettings, Settings
-from lare.run.usual import resolve, usual_algorithm
+from lare.run.usual import algorithm_of, resolve
 from lare.tasks.env import EnvSpec
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import env_spec
@@ -21,7 +21,7 @@ def decide(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     if task.team is not None:
         raise LareError(f"{task.name} is one team of {task.environment}: train the task that has both")
     env = env_spec(task)
-    check_algorithm(ALGORITHMS[settings.algorithm or usual_algorithm(env)], task, env)
+    check_algorithm(ALGORITHMS[algorithm_of(settings.algorithm, env)], task, env)
     resolved = resolve(settings, env)
     if resolved.judges == task.judges:  # the task's own value makes no difference
         resolved = resolved.model_copy(update={"judges": None})

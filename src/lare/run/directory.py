@@ -318,17 +318,29 @@ def open_run(directory: str | Path) -> Run:
     directory = Path(directory)
     config = read_config(directory)
     check_trusted(config.task, directory)
-    functions, since, digests = [], 0, config.function_sha256
+    places, since = function_places(directory, config)
+    functions = tuple(load(place, role) for role, place in places)
+    return Run(directory, config, functions, since)
+
+
+def function_places(directory: Path, config: Config) -> tuple[list[tuple[TaskSpec, Path]], int]:
+    """The file of the latent function of each role, and the step since which they have been in use. Nothing is executed.
+
+    Raises:
+        LareError: a file cannot be read, or was changed.
+    """
+    since, digests = 0, config.function_sha256
     if config.settings.reflect_every is not None and (host := saved_host(directory / CHECKPOINT)) is not None:
         since, digests = host.get("functions_since", 0), tuple(host.get("function_sha256", ()))
     if digests and len(digests) != len(config.task.roles):
         raise LareError(f"{directory}: there are {len(digests)} latent functions for {len(config.task.roles)} roles")
+    places = []
     for role, digest in zip(config.task.roles, digests, strict=True) if digests else ():
         place = directory / function_file(config.task, role, since)
         if read_source(place).digest != digest:
             raise LareError(f"{place} is not the function that this run was trained with: its hash changed")
-        functions.append(load(place, role))
-    return Run(directory, config, tuple(functions), since)
+        places.append((role, place))
+    return places, since
 
 
 def as_run(given: Run | str | Path) -> Run:

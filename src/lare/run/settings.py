@@ -226,7 +226,7 @@ class ResolvedSettings(Checked):
             found += ["fit_every", "fit_updates"]
         if not (method.descends and consumes is Consumes.ROLLOUTS and ALGORITHMS[self.algorithm].many_agents):
             found.append("first_fit")
-        if not method.judges:
+        if not method.follows_judges:
             found.append("judges")
         if not method.latent:
             found += ["draw", "candidates"]

@@ -85,8 +85,10 @@ USUAL: dict[Name, Usual] = {
 """The default settings of a run, by algorithm."""
 
 
-def usual_algorithm(env: EnvSpec) -> Name:
-    """The default algorithm for an environment."""
+def algorithm_of(asked: Name | None, env: EnvSpec) -> Name:
+    """The algorithm that is asked for; without one, the default for an environment."""
+    if asked is not None:
+        return asked
     if env.agents == 1:
         return "ppo" if env.discrete else "td3"
     return "qmix" if env.state_size and env.masks_actions and len(env.teams) == 1 else "ippo"
@@ -94,7 +96,7 @@ def usual_algorithm(env: EnvSpec) -> Name:
 
 def resolve(settings: Settings, env: EnvSpec) -> ResolvedSettings:
     """Fill in the settings that are None. Raises `LareError` if the steps are not a multiple of an iteration's."""
-    algorithm = settings.algorithm or usual_algorithm(env)
+    algorithm = algorithm_of(settings.algorithm, env)
     given = {name: value for name, value in settings if value is not None and name not in (*ALGORITHMS, "credit")}
     values = {
         "method": "lare-bayes",

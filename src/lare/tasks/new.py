@@ -107,7 +107,7 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
     name = re.sub(r"[^\w.\-]+", "-", environment_id.rpartition(":")[2])
     limit = environment.spec.max_episode_steps if environment.spec else None
     lines = [
-        *warning("the documentation of the environment", left_out),
+        *warning(left_out),
         f'name = "{name}"',
         f'environment = "{full_id}"',
         f"observation_size = {observation_size}",
@@ -124,7 +124,7 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
     return Draft(name, "\n".join(lines) + "\n", missing, left_out)
 
 
-def warning(origin: str, left_out: int) -> list[str]:
+def warning(left_out: int, origin: str = "the documentation of the environment") -> list[str]:
     return [
         f"# A first draft, from {origin}. Read it before you use it: a language model will",
         "# know only these texts. Whatever mentions rewards was left out on purpose, so that the request does not reveal the",

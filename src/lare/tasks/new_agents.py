@@ -68,7 +68,7 @@ def draft_of_agents(environment_id: str) -> Draft:
         own, heads, head = texts, heads_of(host, host.spec.teams[0]), []
     arguments = defaults(environment)
     lines = [
-        *warning("the documentation of the environment", left_out),
+        *warning(left_out),
         f'name = "{name}"',
         f'environment = "{environment_id}"',
         *head,
@@ -132,7 +132,7 @@ def write_team(
         own["description"] += f"\nYou judge each agent that is called {team.name}, from what it observes itself."
     members = [str(one.name) for one in host.agents[team.agents]]
     lines = [
-        *warning("the documentation of the environment", left_out),
+        *warning(left_out),
         f'name = "{team.name}"',
         f'team = "{team.name}"',
         f'environment = "{environment_id}"',
