@@ -166,8 +166,11 @@ def scored(learner_config, score, count=60, seed=0):
 def test_the_form_of_the_score_is_found_out(method, score):
     config = config_of(method, capacity=2000)
     steps, factors, _, _ = scored(config, score)
-    learner = list(in_pieces(config, steps, factors, 6))[-1]
-    assert bool(learner.credit[0].average) == (score == "average")
+    *_, last = in_pieces(config, steps, factors, 6)
+    assert bool(last.credit[0].average) == (score == "average")
+    assert returns.form_found(untrained(config).credit[0]) == "undecided"
+    assert returns.form_found(last.credit[0]) == score
+    assert returns.form_found(untrained(config_of(method, credit=CreditSettings(score=score))).credit[0]) is None
 
 
 @pytest.mark.parametrize("given", ["auto", "sum", "average"])

@@ -75,6 +75,17 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             ],
         ),
         (
+            found(by_factors=0.05, by_all=0.05, left=np.zeros(2)),
+            "undecided",
+            [],
+            [],
+            [
+                "The score is treated as a sum over the steps of an episode: so far, an average predicts returns about as well. "
+                'If you know which of them it is, write `score = "sum"` or `score = "average"` into the task file.',
+                "Raw features explain 5% of the variation of the returns of 40 episodes.",
+            ],
+        ),
+        (
             found(by_factors=0.99, by_all=0.99, weight=np.array([0.15, 0.02]), share=np.array([0.95, 0.04])),
             None,
             FACTORS,

@@ -91,14 +91,14 @@ def add_episodes(state: Decomposition, episodes: Episodes, new: Bool[Array, " ep
     return state._replace(closed=state.closed._replace(summed=closed_form.kept(sums)))
 
 
-def form_found(state: Decomposition) -> Literal["sum", "average"] | None:
-    """The form that has predicted returns clearly better; None if the form is given or makes no difference."""
+def form_found(state: Decomposition) -> Literal["sum", "average", "undecided"] | None:
+    """The form that has predicted returns clearly better, if there is one; None if the form is given or makes no difference."""
     if state.rivals is None:
         return None
     of_sum, of_average = np.asarray(errors_told_apart(state.rivals))
     if of_average < BETTER * of_sum:
         return "average"
-    return "sum" if of_sum < BETTER * of_average else None
+    return "sum" if of_sum < BETTER * of_average else "undecided"
 
 
 def errors_told_apart(rivals: Predictions) -> Float[Array, " forms"]:

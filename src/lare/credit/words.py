@@ -53,7 +53,8 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
 
     Args:
         found: the explanation of one team's score.
-        form: `sum` or `average`, if the returns have determined it; None if they have not.
+        form: `sum` or `average`, if the returns have determined it; `undecided` if they have not; None if it is given or makes no
+            difference.
         factors: names of the factors; empty for a method without factors.
         entries: names of the raw entries.
     """
@@ -61,7 +62,12 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
     if count < FEWEST or not np.isfinite(found.by_all):
         return []
     said = []
-    if form is not None:
+    if form == "undecided":
+        said.append(
+            "The score is treated as a sum over the steps of an episode: so far, an average predicts returns about as well. If you know "
+            'which of them it is, write `score = "sum"` or `score = "average"` into the task file.'
+        )
+    elif form is not None:
         other = FORMS[1 - FORMS.index(form)]
         said.append(
             f"The score is taken for {WITH_ARTICLE[form]} over the steps of an episode: so far, this predicts returns better than "
