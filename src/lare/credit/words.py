@@ -64,8 +64,8 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
     said = []
     if form == "undecided":
         said.append(
-            "The score is treated as a sum over the steps of an episode: so far, an average predicts returns about as well. If you know "
-            'which of them it is, write `score = "sum"` or `score = "average"` into the task file.'
+            "The score is treated as a sum over the steps of an episode: so far, an average predicts returns about as well. "
+            'If you know which of them it is, write `score = "sum"` or `score = "average"` into the task file.'
         )
     elif form is not None:
         other = FORMS[1 - FORMS.index(form)]
