@@ -8,10 +8,18 @@ import pytest
 import lare
 from lare.data import replay
 from lare.latent.function import verified
+from lare.run.decide import decide
+from lare.run.directory import create
 from lare.tasks.spec import read_task
 from lare.training import first_fit, session
 from lare.training.first_fit import PATIENCE, fit_until_it_stops_helping, held_out
+from lare.training.seeds import of_seed
 from toys import At, figures
+
+
+def every_step(buffer):
+    """All transitions of one seed's replay."""
+    return replay.read(buffer, replay.newest(buffer, int(buffer.transitions[0])))
 
 
 def buffer_of(*episodes):
@@ -43,9 +51,7 @@ def begun(small_many, tmp_path):
     task = read_task("CN-6")
     changes = {"environments": 12, "steps": 600, "evaluate_every": 300, "capacity": 2000, "first_fit": "held-out"}
     settings = small_many(method="lare-rd", **changes)
-    run = lare.run.directory.create(
-        tmp_path / "run", task, lare.run.decide.decide(settings, task), [verified(PHI, task)]
-    )
+    run = create(tmp_path / "run", task, decide(settings, task), [verified(PHI, task)])
     started = session.start(run)
     steps = started.collector.collect(started.actor, 0)
     started.learner = started.functions.store(started.learner, steps, session.annotate(run, started.config, steps))
@@ -57,6 +63,10 @@ def test_fits_see_no_held_out_episode_and_the_best_decoders_are_kept(begun, monk
     errors, seen = [[3.0, 3.0], [1.0, 4.0], [2.0, 2.0], [5.0, 5.0], [6.0, 6.0]], []
 
     def fit(learner, keys):
+        steps = every_step(of_seed(learner.replay))
+        # One episode in each of ten environments, as long as it is in the whole replay.
+        assert np.asarray(steps.finished).sum() == 10 * 25
+        assert set(np.asarray(steps.length[steps.finished]).tolist()) == {25}
         seen.append((np.asarray(learner.replay.episodes).sum(axis=1).tolist(), np.asarray(jax.random.key_data(keys))))
         number = len(seen)
         credit = jax.tree.map(lambda leaf: jnp.full_like(leaf, number), learner.credit)

@@ -53,7 +53,7 @@ def fit_until_it_stops_helping(
     best, least, waited = jax.tree.map(jnp.copy, learner.credit), np.full(len(episodes), np.inf), 0
     measured: dict[str, Float[Array, " seeds"]] = {}
     for number in range(MOST):
-        hidden = learner.replay._replace(episodes=episodes - held, running=jnp.ones_like(running))
+        hidden = learner.replay._replace(episodes=episodes - held, running=running | (held > 0))
         again = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
         learner, measured = fit(learner._replace(replay=hidden), again)
         whole = learner.replay._replace(episodes=jnp.copy(episodes), running=jnp.copy(running))
