@@ -2,6 +2,8 @@
 
 from typing import get_args
 
+import pytest
+
 from lare.algorithms.table import ALGORITHMS, TABLE, Name
 from lare.run.settings import Settings
 
@@ -9,6 +11,12 @@ from lare.run.settings import Settings
 def test_names_are_those_of_the_types():
     assert tuple(ALGORITHMS) == get_args(Name)
     assert len(ALGORITHMS) == len(TABLE)
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_choices_of_a_distribution_are_sampled(discrete):
+    sampled = {row.name for row in TABLE if not row.greedy(discrete)}
+    assert sampled == ({"ppo", "ippo"} if discrete else {"ippo"})
 
 
 def test_every_algorithm_has_settings_of_its_own_that_start_as_published():

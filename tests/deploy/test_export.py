@@ -12,6 +12,7 @@ import onnxruntime
 import pytest
 
 import lare
+from lare.algorithms import ppo
 from lare.credit import decomposition
 from lare.credit.methods import METHODS
 from lare.data import replay
@@ -21,6 +22,7 @@ from lare.latent.function import verified
 from lare.tasks.env import in_units
 from lare.tasks.spec import read_task
 from lare.training import learner as common
+from lare.training import on_policy
 from lare.training.compiled import compiled, new_memory
 from lare.training.learner import Paid
 from lare.training.seeds import of_seed
@@ -162,11 +164,15 @@ def check_policy(exported, config, actor):
     action, memory = compiled(config).act(actor, memory, observation[None], available[None], None, new)
     if memory:
         wanted["next_hidden"] = memory.hidden[0]
+    if env.discrete and not config.greedy:
+        shown = on_policy.policy_input(jnp.asarray(observation)[None], config)
+        logits = jax.vmap(lambda one, *given: one.policy.logits(ppo.shown(given[0], one.observations), given[1]))
+        wanted["logits"] = np.asarray(logits(actor, shown, available[None]))[0]
     action = np.asarray(action)[0]
     wanted["action"] = np.argmax(action, axis=-1) if env.discrete else in_units(action, env)
     if env.agents == 1:
         inputs = {name: rows[:, 0] for name, rows in inputs.items()}
-        wanted["action"] = wanted["action"][:, 0]
+        wanted = {name: rows[:, 0] for name, rows in wanted.items()}
     same(exported, "policy", inputs, wanted)
 
 

@@ -54,14 +54,20 @@ class Algorithm:
     """Whether it trains many agents."""
     many_teams: bool = False
     """Whether it trains several teams, each on its own rewards."""
-    greedy: bool = True
-    """Whether it is evaluated without noise."""
 
     def noise(self, discrete: bool) -> Noise:
         """The kind of exploration noise for continuous or discrete actions."""
         if self.consumes is Consumes.SEQUENCES:
             return Noise.UNIFORM
         return Noise.GUMBEL if discrete else Noise.NORMAL
+
+    def greedy(self, discrete: bool) -> bool:
+        """Whether a policy acts without noise outside training.
+
+        A policy over choices is trained as a distribution. Its most likely choice alone, always the same until the policy is
+        nearly deterministic, can earn far less than the distribution does.
+        """
+        return self.consumes is not Consumes.ROLLOUTS or not (discrete or self.many_agents)
 
 
 DDPG = TD3Settings(critics=1, policy_noise=0.0, policy_delay=1)
@@ -111,7 +117,6 @@ TABLE = (
         one_agent=False,
         many_agents=True,
         many_teams=True,
-        greedy=False,
     ),
     Algorithm(
         "qmix",

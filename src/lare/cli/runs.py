@@ -143,7 +143,7 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
 
     Args:
         run: a run directory.
-        episodes: number of episodes for each seed. A single agent acts without noise, many agents act as in training's evaluations.
+        episodes: number of episodes for each seed. Policies act as in training's evaluations.
         best: play the policy of each seed's best evaluation, instead of the last policy.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """

@@ -50,7 +50,8 @@ class Exported(NamedTuple):
 def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best: bool = False) -> Exported:
     """Write the policy and the proxy rewards of a seed to a directory that must not exist.
 
-    Policies are deterministic. Rewards are those of the last checkpoint's decoder, in the unit of the true rewards.
+    A policy returns its most likely action; if evaluations sample choices, it returns their logits too. Rewards are those
+    of the last checkpoint's decoder, in the unit of the true rewards.
 
     Args:
         run: the run, or its directory.

@@ -1,9 +1,10 @@
-"""The deterministic policy of a seed as a graph: from observations to actions in the environment's units.
+"""The policy of a seed as a graph, without noise: from observations to actions in the environment's units.
 
     observation [batch *agents observation]  ->  action [batch *agents action], or the number of a choice [batch *agents]
 
-Only tasks of many agents have the axis `*agents`. QMIX and VDN have a memory: they also take `hidden` (zeros at the first step,
-then the last `next_hidden`) and `last_action` (the number of choices at the first step, then the last `action`).
+PPO and IPPO also return the `logits` of choices, (batch, *agents, choices), from which choices can be sampled. Only tasks of many
+agents have the axis `*agents`. QMIX and VDN have a memory: they also take `hidden` (zeros at the first step, then the last
+`next_hidden`) and `last_action` (the number of choices at the first step, then the last `action`).
 """
 
 from typing import Any
@@ -48,6 +49,8 @@ def policy(actor: Any, config: TrainConfig, start: int) -> Graph:
         return graph
     if available is not None:
         values = graph.apply("Where", available, values, np.float32(UNAVAILABLE))
+    if not config.greedy:
+        graph.output("logits", values, (*agents, env.action_size))
     chosen = graph.apply("ArgMax", values, axis=-1)
     graph.output("action", graph.apply("Add", chosen, np.int64(start)) if start else chosen, agents, "int64")
     return graph

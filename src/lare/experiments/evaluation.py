@@ -34,8 +34,9 @@ def evaluate_run(
 ) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
     """True returns by team. If a task has a single team, its name is that of the task.
 
-    The episodes begin in initial states that no evaluation of the run has used. A single agent acts without noise, many agents
-    act as in training's evaluations. A team's return is the sum over the steps of the mean over its agents.
+    The episodes begin in initial states that no evaluation of the run has used. Policies act as in training's evaluations: the
+    choices of PPO and all actions of IPPO are sampled, other actions are deterministic. A team's return is the sum over the steps
+    of the mean over its agents.
 
     Args:
         run: the run, or its directory.

@@ -16,12 +16,14 @@ from lare.tasks.spaces import OneHot
 from lare.tasks.table import env_spec
 from lare.training.compiled import compiled, new_memory
 from lare.training.session import load_actor
+from lare.training.streams import Stream, generator, host_noise
 
 
 class Policy:
-    """A deterministic policy: from one observation to one action of the environment, or from a batch of them to a batch.
+    """A policy: from one observation to one action of the environment, or from a batch of them to a batch.
 
-    A policy with a memory (`qmix`, `vdn`) takes observations one at a time, in order, and `reset` begins a new episode.
+    It acts as in evaluations: PPO's choices are sampled, and all other actions are deterministic. A policy with a memory (`qmix`,
+    `vdn`) takes observations one at a time, in order, and `reset` begins a new episode.
     """
 
     def __init__(self, run: Run, place: int, best: bool):
@@ -30,7 +32,9 @@ class Policy:
             raise LareError(f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy")
         self.config, actors, _ = load_actor(run, best)
         self.actor = jax.tree.map(lambda leaf: leaf[place : place + 1], actors)
-        self.act = compiled(self.config).act
+        functions = compiled(self.config)
+        self.act = functions.act if self.config.greedy else functions.explore
+        self.random = generator(run.seeds[place], Stream.EVALUATION_NOISE, 0)
         self.choices = choices(run) if self.env.discrete else None
         self.reset()
 
@@ -64,7 +68,9 @@ class Policy:
             )
         memory = self.memory if remembers else new_memory(self.config, 1, count)
         available, new = np.ones((1, count, 1, self.env.action_size), bool), np.zeros((1, count), bool)
-        action, self.memory = self.act(self.actor, memory, rows[None, :, None], available, None, new)
+        shape = (1, count, 1, self.config.noise_size)
+        noise = None if self.config.greedy else host_noise(self.random, self.config.noise, shape)
+        action, self.memory = self.act(self.actor, memory, rows[None, :, None], available, noise, new)
         return in_units(np.asarray(action)[0, :, 0], self.env)
 
     def rows(self, given: Any) -> tuple[Float[np.ndarray, "batch observation"], bool]:
@@ -86,9 +92,10 @@ class Policy:
 
 
 def policy_of(run: Run | str | Path, seed: int | None = None, best: bool = False) -> Policy:
-    """The deterministic policy of a seed, from one observation to one action of the environment, or from a batch to a batch.
+    """The policy of a seed, from one observation to one action of the environment, or from a batch to a batch.
 
-    Observations that are not one row of numbers must be flattened first (`gymnasium.spaces.flatten`).
+    It acts as in evaluations: PPO's choices are sampled, and all other actions are deterministic. Observations that are not one row
+    of numbers must be flattened first (`gymnasium.spaces.flatten`).
 
     Args:
         run: the run, or its directory.

@@ -131,7 +131,7 @@ def play(
 
 def evaluate(env: JaxEnv, actor: Any, keys: Key[Array, " seeds"], count: int, config: TrainConfig) -> tuple[Any, ...]:
     """The results of whole episodes of the policy: the parts of an `Evaluation`."""
-    played = play(env, actor, keys, count, config, config.algorithm.greedy)
+    played = play(env, actor, keys, count, config, config.greedy)
     steps, mask = played.steps, played.mask
     reward = steps.after.reward * mask[..., None]
     returns = [team_mean(reward, steps.before.alive, team).sum(axis=0) for team in config.env.teams]

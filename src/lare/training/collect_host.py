@@ -230,7 +230,7 @@ def policy(functions: Compiled, config: TrainConfig, actor: Any, seeds: Sequence
 
     def act(shown: Timestep, new: np.ndarray) -> np.ndarray:
         given = (actor, memory[0], shown.observation, shown.available)
-        if config.algorithm.greedy:
+        if config.greedy:
             action, memory[0] = functions.act(*given, None, new)
         else:
             shape = (episodes, config.env.agents, config.noise_size)

@@ -46,6 +46,11 @@ class TrainConfig:
         return self.algorithm.noise(self.env.discrete)
 
     @property
+    def greedy(self) -> bool:
+        """Whether the policy acts without noise outside training."""
+        return self.algorithm.greedy(self.env.discrete)
+
+    @property
     def noise_size(self) -> int:
         """Numbers of noise for an agent's action."""
         return self.env.action_size + (self.noise is Noise.UNIFORM)
