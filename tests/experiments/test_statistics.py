@@ -92,6 +92,10 @@ def test_something_else_than_the_return_is_compared(made):
     lines = [line | {"credit/error": 2 * line["seed"]} for line in run.metrics()]
     (run.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert statistics.compare(by_label([run]), "credit/error").rows[0].mean == 1.0
+    without = made("b", [1.0, 3.0], method="rd")
+    found, remarks = comparable([run, without], "credit/error")
+    assert (found, remarks[-1]) == ([run], f"{without.directory} has no credit/error, and is left out")
+    assert comparable([without], "credit/error")[0] == [without]
 
 
 def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):

@@ -69,6 +69,15 @@ def said(returns, random=CHANCE, **facts):
             ],
         ),
         (
+            FELL - 200,
+            {},
+            [
+                "It got worse than random actions. The return is -169 after 8,000 steps; random actions get 0 ± 1.",
+                "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
+            ],
+        ),
+        (
             FLAT - 1000,
             {},
             [
@@ -135,3 +144,12 @@ def test_of_few_evaluations_no_direction_is_said():
 def test_the_last_value_that_is_known():
     assert last_known(np.array([[1.0, 2, np.nan], [1, 4, np.nan]])) == 3
     assert last_known(np.full((2, 3), np.nan)) is None
+
+
+def test_returns_that_never_differ_are_no_lack_of_steps():
+    assert said(np.zeros((2, 8)), np.zeros(10)) == [
+        "Nothing can be learned: all episodes, of the policy and of random actions, have the return 0.",
+        "Next: does the environment pay, and before its time limit (`max_episode_steps`)?",
+    ]
+    assert said(np.ones((2, 8)), np.zeros(10))[0].startswith("It learned. ")
+    assert "Nothing can be learned" not in said(np.zeros((2, 8)), np.zeros(0))[0]

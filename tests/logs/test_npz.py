@@ -1,5 +1,7 @@
 """Directories of .npz files."""
 
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -7,6 +9,7 @@ from hypothesis import strategies as st
 
 import lare
 from lare import LareError
+from lare.errors import pip_install
 from lare.logs.npz import NpzLogs, read
 from lare.logs.source import hints_of, open_logs
 from logged import logged
@@ -29,6 +32,20 @@ def test_nothing_is_unpickled(folder, tmp_path):
     np.savez(path / "0000.npz", allow_pickle=True, observations=np.array([{}], object))
     with pytest.raises(LareError, match=r"0000\.npz is no \.npz file, or a damaged one: .*allow_pickle=False"):
         open_logs(path)
+
+
+def test_a_path_that_is_no_log_is_named(tmp_path, monkeypatch):
+    (tmp_path / "log.csv").write_text("observation,action\n")
+    with pytest.raises(LareError, match=r"log.csv is text, which is not read: write the log as .npz or Parquet "):
+        open_logs(tmp_path / "log.csv")
+    monkeypatch.setitem(sys.modules, "minari", None)
+    monkeypatch.delitem(sys.modules, "lare.logs.minari", raising=False)
+    with pytest.raises(LareError) as refusal:
+        open_logs("nologs")
+    assert str(refusal.value) == (
+        "there is no file or directory nologs. If it is the id of a data set, a Minari data set needs an extra: "
+        + pip_install("minari")
+    )
 
 
 def test_an_empty_directory_is_no_log(tmp_path):

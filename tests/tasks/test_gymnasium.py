@@ -158,7 +158,7 @@ def test_measures_are_of_the_last_step():
 @pytest.mark.parametrize(
     ("info", "message"),
     [
-        ({}, "the task measures 'won', but the last step's info has only nothing"),
+        ({}, "the task measures 'won', but the last step's info is empty (was the episode cut at max_episode_steps?)"),
         ({"lost": 1, 3: 4}, "the task measures 'won', but the last step's info has only 3, lost"),
         ({"won": "yes"}, "the task measures 'won', and the last step's info has 'yes', which is no number"),
         ({"won": 10**400}, f"the task measures 'won', and the last step's info has 1{'0' * 99}..., which is no number"),

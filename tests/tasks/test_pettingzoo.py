@@ -524,7 +524,8 @@ def test_a_time_limit_is_needed():
     with pytest.raises(LareError) as error:
         host(Toy(cycles=None))
     assert str(error.value) == (
-        f"task 'toy': {TOY} has no time limit, so an episode may never pay; set max_episode_steps in the task file"
+        f"task 'toy': {TOY} has no time limit, so an episode may never pay; "
+        "set max_episode_steps in the task file, to the length of its longest episode or more"
     )
 
 

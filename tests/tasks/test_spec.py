@@ -121,7 +121,7 @@ def test_like_over_two_generations(spec_file, tmp_path):
         (
             {"environment": "misfits/Endless-v0"},
             "task 'Chase': misfits/Endless-v0 has no time limit, so an episode may never pay; "
-            "set max_episode_steps in the task file",
+            "set max_episode_steps in the task file, to the length of its longest episode or more",
         ),
         (
             {"teams": ["Reacher-v4"]},

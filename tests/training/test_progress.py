@@ -32,6 +32,10 @@ def measured(step, rate, **more):
             measured(10_000, 50.0, **{"critic/loss": 1.0}),
             "step 10000 of 20000: 50 steps/s, return 1.0, 4 min left",
         ),
+        (
+            measured(19_000, 50.0, **{"critic/loss": 1.0}),
+            "step 19000 of 20000: 50 steps/s, return 1.0, 20 s left",
+        ),
         (measured(20_000, 50.0, **{"critic/loss": 1.0}), "step 20000 of 20000: 50 steps/s, return 1.0"),
         (measured(10_000, 0.0, **{"critic/loss": 1.0}), "step 10000 of 20000: 0 steps/s, return 1.0"),
     ],

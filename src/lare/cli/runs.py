@@ -72,7 +72,7 @@ def train(
         spec = lare.load_task(task)
         resolved = decide(settings, spec)
         for in_vain in set_in_vain(settings, resolved, spec).values():
-            raise LareError(in_vain)
+            raise LareError(f"{in_vain}: leave the setting out")
         if function:
             check_given(resolved)
         functions = [load(file, role) for file, role in per_role(function, spec)] if function else None

@@ -12,7 +12,7 @@ from lare.experiments.scores import REFERENCES, RETURN, SUMMED_RETURN, Measured,
 from lare.experiments.statistics import REPETITIONS, Band, Comparison, compare, plus_minus, too_few
 from lare.run.directory import CONFIG, Run, read_measured
 
-HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "better than baseline [95%]", "p")
+HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "above baseline [95%]", "p")
 
 
 def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | Measured]], list[str]]:
@@ -78,7 +78,7 @@ def find_runs(places: Sequence[Path]) -> list[Run]:
 
 
 def comparable(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], list[str]]:
-    """The runs that have an evaluation, and remarks on the metric and on runs that were not trained to their end.
+    """The runs that have the metric, and remarks on the metric and on runs that were not trained to their end.
 
     Raises:
         LareError: no run has an evaluation.
@@ -99,6 +99,9 @@ def comparable(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], li
             remarks.append(f"{run.directory}: {warning}")
     if not found:
         raise LareError(f"{', '.join(str(run.directory) for run in runs)}: no run has an evaluation yet")
+    if with_metric := [run for run in found if any(line.get(metric) is not None for line in run.metrics())]:
+        remarks += [f"{run.directory} has no {metric}, and is left out" for run in found if run not in with_metric]
+        found = with_metric
     if summed and metric == RETURN:
         remarks.append(f"returns are means over the agents; --metric {SUMMED_RETURN} compares their sums")
     return found, remarks
@@ -133,10 +136,11 @@ def what_scores_are(comparison: Comparison) -> str:
 
 
 MEANINGS = (
-    "IQM: interquartile mean; of fewer than four seeds it is the mean. sd: standard deviation over the seeds (n - 1). Better than "
+    "IQM: interquartile mean; of fewer than four seeds it is the mean. sd: standard deviation over the seeds (n - 1). Above "
     "baseline: the probability that a run scores more than one of the baseline, the first method; of a single seed it is not "
-    "given, and a probability of 0 or 1 has no interval. p: the probability of at least so many won pairs of runs by chance or, if "
-    "fewer than half were won, of so many lost ones (exact Mann-Whitney test, one-sided: a two-sided p is twice as large)."
+    "given, and a probability of 0 or 1 has no interval. If the score is an error or a loss, a low probability is good. p: the "
+    "probability of at least so many won pairs of runs by chance or, if fewer than half were won, of so many lost ones (exact "
+    "Mann-Whitney test, one-sided: a two-sided p is twice as large)."
 )
 
 

@@ -59,7 +59,18 @@ def verdict(run: Facts) -> list[str]:
         return ["Nothing can be said: the last evaluation gave no return."]
     if run.untrained is not None:
         return [f"Nothing was learned: {run.untrained}."]
+    if all_alike(run):
+        return [
+            f"Nothing can be learned: all episodes, of the policy and of random actions, have the return {shown(run.last)}.",
+            "Next: does the environment pay, and before its time limit (`max_episode_steps`)?",
+        ]
     return [learned(run), *compared(run), *told(run), *todo(run)]
+
+
+def all_alike(run: Facts) -> bool:
+    """Whether all known returns are the same, those of several episodes of random actions among them."""
+    known = np.concatenate([run.returns[np.isfinite(run.returns)], run.random])
+    return bool(len(run.random) > 1 and np.ptp(known) == 0)
 
 
 def learned(run: Facts) -> str:
@@ -189,15 +200,21 @@ def is_rising(run: Facts) -> bool:
 
 
 def fell_from(run: Facts) -> tuple[int, float] | None:
-    """Step and value of the best evaluation, where the end is lower by more than evaluations vary."""
-    found = quarters(run)
-    if found is None:
+    """Step and value of the best evaluation, where the end is lower by more than evaluations vary.
+
+    None if the best evaluation is not better than random actions.
+    """
+    evaluations = quarters(run)
+    if evaluations is None:
         return None
+    _, end, variation = evaluations
     mean = np.nanmean(run.returns, axis=0)
     best = int(np.nanargmax(mean))
     start = float(run.random.mean()) if len(run.random) else float(mean[0])
     top = float(mean[best])
-    fell = top - found[1] > max(0.15 * abs(top - start), 2 * found[2])
+    if len(run.random) and top <= start + 2 * noise(run):
+        return None
+    fell = top - end > max(0.15 * abs(top - start), 2 * variation)
     return (int(run.steps[best]), top) if fell else None
 
 

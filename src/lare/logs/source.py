@@ -79,6 +79,8 @@ def open_logs(source: Any, task: TaskSpec | None = None) -> Source:
 def open_path(source: str | Path, hints: Hints) -> Source:
     """A log by its path, or a Minari id."""
     path = Path(source)
+    if path.is_file() and path.suffix.lower() in (".csv", ".tsv", ".txt", ".json", ".jsonl"):
+        raise LareError(f"{path} is text, which is not read: write the log as .npz or Parquet (docs/logs.md, Formats)")
     if path.is_file() or any(path.glob("*.parquet")):
         from lare.logs.parquet import PARQUET
         from lare.logs.tables import TableLogs
@@ -95,6 +97,10 @@ def open_path(source: str | Path, hints: Hints) -> Source:
         return NpzLogs(path, hints)
     if isinstance(source, Path) or source.endswith((".parquet", "/")):
         raise LareError(f"there is no {source}")
-    from lare.logs.minari import MinariLogs, load
-
+    try:
+        from lare.logs.minari import MinariLogs, load
+    except LareError as missing:
+        raise LareError(
+            f"there is no file or directory {source}. If it is the id of a data set, {missing}"
+        ) from missing
     return MinariLogs(load(source), hints)

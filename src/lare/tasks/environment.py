@@ -111,5 +111,6 @@ def measured(info: dict, name: str) -> float:
     """The value of a measure of the task in the last step's `info`. Raises `LareError` if it is missing."""
     if name not in info:
         keys = ", ".join(sorted(map(str, info)))
-        raise LareError(f"the task measures {name!r}, but the last step's info has only {keys or 'nothing'}")
+        only = f"has only {keys}" if keys else "is empty (was the episode cut at max_episode_steps?)"
+        raise LareError(f"the task measures {name!r}, but the last step's info {only}")
     return number(info[name], f"the task measures {name!r}, and the last step's info has")

@@ -77,7 +77,7 @@ def spec_of(task: TaskSpec, observations: Any, actions: Any) -> EnvSpec:
     if limit is None:
         raise LareError(
             f"task {task.name!r}: {task.environment} has no time limit, so an episode may never pay; "
-            "set max_episode_steps in the task file"
+            "set max_episode_steps in the task file, to the length of its longest episode or more"
         )
     precise = np.result_type(actions.dtype, np.float32)
     return EnvSpec(

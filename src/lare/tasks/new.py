@@ -117,7 +117,10 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
         *(
             []
             if limit
-            else ["max_episode_steps = 1000 # the environment has no limit of its own; this one cuts longer episodes"]
+            else [
+                "max_episode_steps = 1000 # the environment has no limit of its own, and longer episodes are cut: at least the "
+                "length of an episode that it ends by itself"
+            ]
         ),
         *bodies(texts, heads),
     ]

@@ -60,7 +60,7 @@ class ParallelHost:
         if self.max_steps is None:
             raise LareError(
                 f"task {task.name!r}: {self.name} has no time limit, so an episode may never pay; "
-                "set max_episode_steps in the task file"
+                "set max_episode_steps in the task file, to the length of its longest episode or more"
             )
         self.places = {one.name: place for place, one in enumerate(self.agents)}
         self.width, self.numbered = rows_of.width(self.agents), rows_of.unlike(self.agents)

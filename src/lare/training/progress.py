@@ -97,7 +97,8 @@ class Terminal:
         rate = mean(metrics, "time/steps_per_second")
         if not rate or mean(metrics, "critic/loss") is None or step >= self.steps:
             return ""
-        return f", {math.ceil((self.steps - step) / rate / 60)} min left"
+        seconds = (self.steps - step) / rate
+        return f", {seconds:.0f} s left" if seconds < 60 else f", {math.ceil(seconds / 60)} min left"
 
     def said(self, message: str) -> None:
         self.console.print(legible(message), highlight=False, markup=False, soft_wrap=True)
