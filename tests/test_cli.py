@@ -74,8 +74,14 @@ def test_an_unknown_choice_lists_those_there_are(command):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("CN-6 --method dense --credit.sum-form True", "credit.sum_form makes no difference to dense: leave the setting out"),
-        ("CN-6 --ppo.clip 0.1", "ppo.clip makes no difference to ippo on CN-6; it has ippo.clip: leave the setting out"),
+        (
+            "CN-6 --method dense --credit.sum-form True",
+            "credit.sum_form makes no difference to dense: leave the setting out",
+        ),
+        (
+            "CN-6 --ppo.clip 0.1",
+            "ppo.clip makes no difference to ippo on CN-6; it has ippo.clip: leave the setting out",
+        ),
         ("Reacher-v4 --method dense --judges both", "judges makes no difference to dense: leave the setting out"),
         ("CN-6 --scale-rewards", "scale_rewards makes no difference to ippo on CN-6: leave the setting out"),
         ("CN-6 --method dense --capacity 1000", "capacity makes no difference to dense: leave the setting out"),

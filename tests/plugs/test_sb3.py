@@ -216,6 +216,18 @@ def test_actions_are_in_the_units_of_the_environment():
     check_paid_in_units(model, credit)
 
 
+def test_episodes_of_a_log_come_first():
+    """The buffer pays its own steps, and the decoder knows the logged episodes."""
+    credit, random = assigner("rd-linear"), np.random.default_rng(0)
+    for _ in range(5):
+        before, after = random.uniform(-1, 1, (2, 10, 2))
+        credit.add_episode(before, random.uniform(-2, 2, (10, 1)), after, random.normal())
+    model = td3(toy(), credit)
+    model.learn(120)
+    assert credit.metrics()["credit/episodes"] == 5 + 120 // STEPS_OF_TOY
+    check_paid_in_units(model, credit)
+
+
 def weights(model):
     return {name: value.numpy().copy() for name, value in model.policy.state_dict().items()}
 

@@ -27,7 +27,10 @@ def found(**changes):
     return Explanation(**(values | changes))
 
 
-SHARES = "For each factor: its share of the variation, and by how much a step's reward rises with one standard deviation of it:"
+SHARES = (
+    "For each factor: its share of the variation (0%: it does not matter, or it hardly varied), and by how much a step's reward "
+    "rises with one standard deviation of it:"
+)
 FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
 
 

@@ -86,7 +86,8 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
         )
     else:
         said.append(
-            "For each factor: its share of the variation, and by how much a step's reward rises with one standard deviation of it:"
+            "For each factor: its share of the variation (0%: it does not matter, or it hardly varied), and by how much a step's "
+            "reward rises with one standard deviation of it:"
         )
         said += [
             f"- {factors[i]}: {found.share[i]:.0%}, {found.weight[i]:+.3g} ± {found.deviation[i]:.1g}"
