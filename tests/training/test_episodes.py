@@ -168,9 +168,25 @@ def test_the_form_of_the_score_is_found_out(method, score):
     steps, factors, _, _ = scored(config, score)
     *_, last = in_pieces(config, steps, factors, 6)
     assert bool(last.credit[0].average) == (score == "average")
-    assert returns.form_found(untrained(config).credit[0]) == "undecided"
+    assert returns.form_found(untrained(config).credit[0]) is None
     assert returns.form_found(last.credit[0]) == score
     assert returns.form_found(untrained(config_of(method, credit=CreditSettings(score=score))).credit[0]) is None
+
+
+@pytest.mark.parametrize(
+    ("errors", "form"),
+    [
+        ((1.0, 0.9), "average"),
+        ((0.9, 1.0), "sum"),
+        ((1.0, 0.97), "undecided"),
+        ((0.97, 1.0), "undecided"),
+        ((1.0, 1.0), None),
+    ],
+)
+def test_a_form_is_found_by_its_smaller_error(errors, form, monkeypatch):
+    """Equal errors: all episodes have one length, and the form makes no difference."""
+    monkeypatch.setattr(returns, "errors_told_apart", lambda _: np.array(errors))
+    assert returns.form_found(untrained(config_of("lare-linear")).credit[0]) == form
 
 
 @pytest.mark.parametrize("given", ["auto", "sum", "average"])

@@ -92,10 +92,15 @@ def add_episodes(state: Decomposition, episodes: Episodes, new: Bool[Array, " ep
 
 
 def form_found(state: Decomposition) -> Literal["sum", "average", "undecided"] | None:
-    """The form that has predicted returns clearly better, if there is one; None if the form is given or makes no difference."""
+    """The form that has predicted returns clearly better, if there is one; None if the form is given or makes no difference.
+
+    It makes none as long as all episodes have one length.
+    """
     if state.rivals is None:
         return None
     of_sum, of_average = np.asarray(errors_told_apart(state.rivals))
+    if np.isclose(of_sum, of_average, rtol=1e-3):
+        return None
     if of_average < BETTER * of_sum:
         return "average"
     return "sum" if of_sum < BETTER * of_average else "undecided"
