@@ -1,5 +1,6 @@
 """Fixtures for all tests."""
 
+import gc
 import json
 import os
 import sys
@@ -60,6 +61,13 @@ collect_ignore = [
 """No tests in there, and looking for doctests would import it, and register its environments, a second time."""
 
 __all__ = ["PHI", "Chase", "toy_spec"]
+
+
+def pytest_collection_finish():
+    """Tracing makes many objects. Python shall not look through all that is imported each time that there are 700 new ones."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 50, 100)
 
 
 @pytest.fixture(autouse=True, scope="module")

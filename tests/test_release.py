@@ -37,6 +37,7 @@ def built(tmp_path_factory):
     return {"wheel": wheel, "sdist": sdist}
 
 
+@pytest.mark.long
 def test_the_wheel_does_the_main_job_without_the_checkout(built, tmp_path):
     with zipfile.ZipFile(built["wheel"]) as archive:
         archive.extractall(tmp_path / "installed")

@@ -269,7 +269,8 @@ def test_pairs_cost_nothing_where_the_score_has_no_product(seed, count, noise, l
     basis = Basis(0, 8, extended=True)
     _, raw, *rest = synthetic(seed, count, noise, longest, "perfect")
     deviation = np.concatenate(raw[:count]).std(axis=0)
-    features = [np.asarray(expand(basis, jnp.asarray(rows / deviation)), float) for rows in raw]
+    together = np.asarray(expand(basis, jnp.asarray(np.concatenate(raw) / deviation)), float)
+    features = np.split(together, np.cumsum([len(rows) for rows in raw])[:-1])
     additive = basis.group < basis.group.max()
     with jax.enable_x64(True):
         without = error_of([rows[:, additive] for rows in features], basis.group[additive], *rest, count)

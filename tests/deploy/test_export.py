@@ -33,7 +33,7 @@ from toys import pick_spec, toy_spec
 CASES = [
     ("td3", "lare-bayes"),
     long("ddpg", "rrdu"),
-    ("sac", "vib-rrdu"),
+    long("sac", "vib-rrdu"),
     long("td3", "lare-signs"),
     long("td3", "diaster"),
     long("sac", "dense"),
@@ -43,7 +43,7 @@ CASES = [
     long("ppo", "rrdu-next"),
     long("ippo", "lare-bayes"),
     long("ippo", "lare-rd-shared"),
-    ("ippo-teams", "lare-rd"),
+    long("ippo-teams", "lare-rd"),
     long("ippo-state", "rrdu-next"),
     ("qmix", "lare-bayes"),
     long("vdn", "ircr"),

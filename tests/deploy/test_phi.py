@@ -10,6 +10,7 @@ from lare.deploy.exported import OPERATIONS
 from lare.deploy.graph import Graph
 from lare.deploy.phi import factors
 from lare.deploy.rows import Rows, Untranslatable
+from tiers import long
 
 ENTRIES, ACTIONS = 6, 2
 
@@ -81,7 +82,8 @@ def test_a_translation_computes_the_same(body):
 
 
 @pytest.mark.parametrize(
-    ("task", "draw"), [("HalfCheetah-v4", 1), ("HumanoidStandup-v4", 0), ("CN-6", 2), ("PP-6", 0), ("SMAX-2s3z", 0)]
+    ("task", "draw"),
+    [("HalfCheetah-v4", 1), long("HumanoidStandup-v4", 0), ("CN-6", 2), long("PP-6", 0), long("SMAX-2s3z", 0)],
 )
 def test_recorded_functions_have_a_translation(task, draw):
     """94 of 100 of them have (109 of 116)."""

@@ -157,6 +157,7 @@ def test_a_whole_sweep_from_the_command_line(command, file, tmp_path):
     ]
 
 
+@pytest.mark.long
 def test_on_a_local_ray(file, tmp_path):
     """In a process of its own: Ray forks, and this one has threads by now."""
     file.write_text(FILE.replace('"dense", ', "").replace("[0, 3]", "[0]"))

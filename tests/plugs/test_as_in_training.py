@@ -58,7 +58,7 @@ CASES = [
     long("lare-signs", TWO),
     long("bayes", TWO),
     long("rd-linear", ALONE),
-    ("rd-linear", TOGETHER),
+    long("rd-linear", TOGETHER),
     long("lare-rd", TWO),
     long("rd", TOGETHER),
     ("ircr", ALONE),

@@ -14,10 +14,13 @@ from lare.plugs import assigner as assigners
 from lare.plugs import learner, payment
 from lare.plugs.assigner import CreditAssigner
 from shown import SMALL, TASK, Shown, assigner, episode, episodes, show
+from tiers import long
 from toys import pick_spec
 
 ALONE = [name for name, row in METHODS.items() if row.has_proxy and not row.whole_episodes and not row.for_many_only]
 TOGETHER = [name for name, row in METHODS.items() if row.has_proxy and not row.whole_episodes and not row.for_one_only]
+ALL_KINDS = {"rd", "rrd", "bayes", "lare-rd", "lare-rd-shared", "lare-signs", "ircr", "llm-reward"}
+"""Methods of all kinds of features, fits and payments."""
 
 
 @pytest.fixture
@@ -492,7 +495,7 @@ def team(length, random, agents=3):
     return together, np.arange(agents) < np.maximum(1, agents - np.arange(length))[:, None]
 
 
-@pytest.mark.parametrize("method", TOGETHER)
+@pytest.mark.parametrize("method", [name if name in ALL_KINDS else long(name) for name in TOGETHER])
 def test_every_method_pays_every_agent(method, function):
     credit = assigner(method, function, agents=3, max_steps=6)
     random, numbers, means = np.random.default_rng(0), [], []

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from tiers import long
+
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {
     "cleanrl_td3.py": {"total_timesteps": 240, "learning_starts": 200, "batch_size": 16, "buffer_size": 1000},
@@ -45,7 +47,7 @@ def test_without_the_marked_lines_it_is_the_plain_algorithm(name, tmp_path):
     assert len(returns) > 5
 
 
-@pytest.mark.parametrize("method", ["bayes", "rrdu"])
+@pytest.mark.parametrize("method", ["bayes", long("rrdu")])
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_it_trains_on_what_the_assigner_says(name, method):
     """The environment is the same, and with other rewards other actions follow."""

@@ -22,6 +22,7 @@ from lare.credit.methods import METHODS
 from lare.credit.settings import CreditSettings
 from lare.errors import pip_install
 from lare.plugs.sb3 import CreditCallback, CreditDictReplayBuffer, CreditNStepReplayBuffer, CreditReplayBuffer
+from tiers import long
 from toys import Chase, Pick, toy_spec
 
 torch.set_num_threads(1)
@@ -499,9 +500,11 @@ def test_observations_may_be_stored_once():
 
 
 ONE_AGENT = [row for row in METHODS.values() if row.has_proxy and not row.for_many_only]
+ALL_KINDS = {"rrdu", "bayes", "lare-bayes", "lare-rd", "lare-signs", "ircr", "llm-reward"}
+"""Methods of all kinds of features, fits and payments."""
 
 
-@pytest.mark.parametrize("method", [row.name for row in ONE_AGENT])
+@pytest.mark.parametrize("method", [row.name if row.name in ALL_KINDS else long(row.name) for row in ONE_AGENT])
 def test_every_method_pays(method, phi, reward):
     row = METHODS[method]
     function = (reward if row.kind == "reward" else phi) if row.latent else None

@@ -253,7 +253,7 @@ def test_a_run_of_two_environments_a_seed_resumes_bit_for_bit(kind, algorithm, s
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
-@pytest.mark.parametrize("algorithm", ["qmix", long("ippo")])
+@pytest.mark.parametrize("algorithm", [long("qmix"), "ippo"])
 def test_many_agents_on_the_host_resume_bit_for_bit(algorithm, small_many, tmp_path, monkeypatch):
     """In the middle of episodes of which the agents remember something, and after somebody has left."""
 

@@ -73,7 +73,9 @@ def add_all(credit, buffer, config):
     return episodes.pieces(credit, buffer, jnp.zeros_like(buffer.oldest), returns.add_episodes, config)
 
 
-@pytest.mark.parametrize("env", [None, TOGETHER], ids=["one", "many"])
+@pytest.mark.parametrize(
+    "env", [pytest.param(None, marks=pytest.mark.long, id="one"), pytest.param(TOGETHER, id="many")]
+)
 @pytest.mark.parametrize("method", ["lare-bayes", long("rd-linear")])
 def test_sums_are_those_from_scratch_whatever_the_scales_have_been(method, env):
     """Observations grow a hundredfold while they come in."""

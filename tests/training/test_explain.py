@@ -142,6 +142,7 @@ def test_a_run_is_explained(method, small, tmp_path):
     assert "What the returns say" in lare.write_report([run.directory]).read_text()
 
 
+@pytest.mark.long
 def test_many_agents_are_explained_by_factors_alone(small_many, tmp_path):
     source = "def evaluation_func(o, a):\n    return [o[:, 0:1] * a[:, 0:1], o[:, 1:2]]\n"
     task = read_task("CN-6")

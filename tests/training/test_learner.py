@@ -85,8 +85,8 @@ def test_state_and_action_alone():
     assert want.shape[-1] == config.bases[0].inputs == 5
 
 
-@pytest.mark.parametrize("judges", ["before", "after", "both"])
-@pytest.mark.parametrize("method", ["rd-linear", "bayes", "lare-linear", "lare-bayes"])
+@pytest.mark.parametrize("judges", ["before", long("after"), "both"])
+@pytest.mark.parametrize("method", [long("rd-linear"), "bayes", long("lare-linear"), "lare-bayes"])
 def test_closed_forms_see_the_factors_and_the_states_that_the_task_judges(method, judges):
     config, steps = config_of(method, judges=judges), steps_of()
     drawn = every_step(stored(config))
@@ -241,7 +241,7 @@ def says_its_factor(learner, signs):
 # Several environments.
 
 
-@pytest.mark.parametrize("method", [long("rd"), "rrdu", "lare-linear", long("lare-rd"), "ircr"])
+@pytest.mark.parametrize("method", [*map(long, ("rd", "rrdu", "lare-rd")), "lare-linear", "ircr"])
 def test_two_environments_are_one_twice_as_long(method):
     """The same episodes, collected side by side or one after the other: the same statistics, the same rewards, the same fit."""
     wide, long = config_of(method, environments=2), config_of(method)
@@ -269,7 +269,7 @@ def test_two_environments_are_one_twice_as_long(method):
 # Many agents.
 
 
-@pytest.mark.parametrize("method", ["rd", "stas", "lare-rd"])
+@pytest.mark.parametrize("method", ["rd", long("stas"), "lare-rd"])
 def test_what_decoders_see_of_many(method):
     """RD and AREL what each agent met after the step, STAS what it met before it and did, LaRe the factors."""
     config = MANY(method)
@@ -380,7 +380,7 @@ def test_a_closed_form_takes_the_mean_over_steps_and_over_agents_who_are_there()
 
 
 @pytest.mark.parametrize("method", ["lare-rd", long("lare-rrdu")])
-@pytest.mark.parametrize("fixed_length", [False, True])
+@pytest.mark.parametrize("fixed_length", [False, long(True)])
 def test_must_learn_who_earned_what(method, fixed_length):
     """Of two factors one is the true reward of the agent; the decoder is told the mean over agents and steps."""
     env = EnvSpec((Team("all", 0, 3),), 3, 4, True, 12, agents_leave=not fixed_length, fixed_length=fixed_length)
@@ -435,7 +435,8 @@ def test_what_stands_where_an_agent_has_left_changes_nothing(method):
 
 
 @pytest.mark.parametrize(
-    "method", ["dense", "episodic", "ircr", "rd", "rrdu", "lare-rd", "lare-linear", "lare-rd-shared"]
+    "method",
+    ["dense", "ircr", long("rd"), "rrdu", "lare-rd", "lare-linear", *map(long, ("episodic", "lare-rd-shared"))],
 )
 def test_an_agent_that_was_never_there_is_as_none(method):
     """Three agents of whom one never acts, and the same two alone."""
@@ -479,7 +480,7 @@ def judged_by_state(method, **changes):
     return MANY(method, judged_from="state", **changes)
 
 
-@pytest.mark.parametrize("method", ["rd", "rrdu", "rd-linear", "lare-rd", "lare-linear", "llm-reward"])
+@pytest.mark.parametrize("method", [long("rd"), "rrdu", "rd-linear", long("lare-rd"), "lare-linear", "llm-reward"])
 def test_credit_of_the_state_is_one_row_a_step_and_pays_all_who_are_there_alike(method):
     config, steps = judged_by_state(method, factors=(2,) if method[0] == "l" else ()), steps_of(TOGETHER)
     learner = stored(config)

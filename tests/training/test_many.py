@@ -42,7 +42,7 @@ def test_decoders_are_fitted_before_the_first_update_and_then_every_so_often(sma
     assert (fits, done) == ([0, 100], [0, 50, 100, 150])
 
 
-@pytest.mark.parametrize("task", ["CN-15", "CompetitivePP-6", long("PP-30"), long("TriangleArea")])
+@pytest.mark.parametrize("task", [long("CN-15"), "CompetitivePP-6", long("PP-30"), long("TriangleArea")])
 def test_every_particle_task_trains_with_its_recorded_functions(task, small_many, tmp_path):
     run = lare.train(task, small_many(steps=100), out=tmp_path / "run", listeners=[])
     teams, lines = [team.name for team in TASKS[task].teams], run.metrics()
@@ -105,7 +105,7 @@ def test_what_dies_between_two_checkpoints_is_done_again(small_many, tmp_path):
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
-@pytest.mark.parametrize("judges", ["before", "both"])
+@pytest.mark.parametrize("judges", [long("before"), "both"])
 def test_judges(judges, small_many, tmp_path):
     run = lare.train(OF_CHOICE, small_many(judges=judges, steps=100), out=tmp_path / "run", listeners=[])
     config, learner, _, _ = sessions.load_learner(run)

@@ -83,6 +83,7 @@ def test_a_run_that_is_stopped_after_a_reflection_goes_on_bit_for_bit(settings, 
     assert figures(lare.resume(tmp_path / "run", model=Says(WRONG), listeners=[])) == figures(whole)
 
 
+@pytest.mark.long
 def test_what_was_recorded_answers_again(settings, tmp_path):
     """A recording of the exchanges of one run is the model of another, which is the same."""
     first = trained(settings, Says(RIGHT, WRONG), tmp_path / "first")

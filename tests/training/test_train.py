@@ -41,7 +41,7 @@ def needed(method, function):
     return function if METHODS[method].latent else None
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("number", [signal.SIGKILL, long(signal.SIGSTOP)])
 def test_a_worker_that_is_killed_or_starved_stops_the_run_and_harms_nothing(number, small, tmp_path, monkeypatch):
     monkeypatch.setattr("lare.latent.sandbox.jailed.TIME_LIMIT", 4.0)
     whole = lare.train(toy_spec(), small(), function=verified(PHI, toy_spec()), out=tmp_path / "whole", listeners=[])
@@ -550,7 +550,7 @@ def test_config_says_what_the_run_depends_on(small, phi, tmp_path):
     [
         ("td3", "lare-bayes"),
         *(long("td3", method) for method in ("dense", "lare-rrdu", "rd")),
-        ("td3", "bayes"),
+        long("td3", "bayes"),
         ("ddpg", "lare-linear"),
         ("sac", "dense"),
     ],
