@@ -75,7 +75,7 @@ def test_two_tasks_of_one_name_are_not_compared(made):
         ),
         (
             [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": (60, 70)})],
-            "the runs have no step in common at which all of them were evaluated",
+            "the runs have no step in common at which all of them have a value of evaluation/return",
         ),
         (
             [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": ()})],

@@ -92,6 +92,10 @@ def test_something_else_than_the_return_is_compared(made):
     lines = [line | {"credit/error": 2 * line["seed"]} for line in run.metrics()]
     (run.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert statistics.compare(by_label([run]), "credit/error").rows[0].mean == 1.0
+    lines = [line | ({"credit/error": None} if line["seed"] == 1 else {}) for line in lines]
+    (run.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(LareError, match=r"Chase/a has no credit/error of seed 1 at any step: leave it out$"):
+        statistics.compare(by_label([run]), "credit/error")
     without = made("b", [1.0, 3.0], method="rd")
     found, remarks = comparable([run, without], "credit/error")
     assert (found, remarks[-1]) == ([run], f"{without.directory} has no credit/error, and is left out")

@@ -28,8 +28,8 @@ def found(**changes):
 
 
 SHARES = (
-    "For each factor: its share of the variation (0%: it does not matter, or it hardly varied), and by how much a step's reward "
-    "rises with one standard deviation of it:"
+    "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes), and by "
+    "how much a step's reward rises with one standard deviation of it:"
 )
 FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
 
@@ -102,7 +102,16 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
         ),
         (found(), None, [], [], ["Raw features explain 97% of the variation of the returns of 40 episodes."]),
         (found(episodes=19), None, FACTORS, ENTRIES, []),
-        (found(by_all=np.nan), None, FACTORS, ENTRIES, []),
+        (
+            found(by_all=np.nan),
+            None,
+            FACTORS,
+            ENTRIES,
+            [
+                "There is nothing to explain: in all episodes the return is the same, or, if the score is a sum, the mean reward "
+                "of a step."
+            ],
+        ),
     ],
 )
 def test_sentences(given, form, factors, entries, said):

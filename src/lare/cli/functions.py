@@ -163,11 +163,12 @@ def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes:
     from lare.training.reflect import told_by_returns
 
     found = told_by_returns(function, role, episodes)
-    if not found.sentences:
+    if len({one.total for one in episodes}) == 1:
         say(f"All {len(episodes)} episodes have the same return, which says nothing about the factors.")
         if role.environment != "none":
             say("Does the environment pay, and before its time limit (max_episode_steps)?")
-    elif math.isfinite(found.r2):
+        return
+    if math.isfinite(found.r2):
         say(
             f"Returns of episodes not seen yet, predicted by the factors: R² = {found.r2:.2f} (1: exactly; 0: no better than their "
             "mean)."

@@ -59,8 +59,13 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
         entries: names of the raw entries.
     """
     count = int(found.episodes)
-    if count < FEWEST or not np.isfinite(found.by_all):
+    if count < FEWEST:
         return []
+    if not np.isfinite(found.by_all):
+        return [
+            "There is nothing to explain: in all episodes the return is the same, or, if the score is a sum, the mean reward of a "
+            "step."
+        ]
     said = []
     if form == "undecided":
         said.append(
@@ -86,8 +91,8 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
         )
     else:
         said.append(
-            "For each factor: its share of the variation (0%: it does not matter, or it hardly varied), and by how much a step's "
-            "reward rises with one standard deviation of it:"
+            "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes), "
+            "and by how much a step's reward rises with one standard deviation of it:"
         )
         said += [
             f"- {factors[i]}: {found.share[i]:.0%}, {found.weight[i]:+.3g} ± {found.deviation[i]:.1g}"
@@ -96,7 +101,8 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
         ]
         if any(name.endswith("(before)") for name in factors):
             said.append(
-                "A factor before a step and after it are nearly the same: only the sums of their shares and weights mean something."
+                "If a factor hardly changes in a step, look only at the sum of its shares, and of its weights, before and after "
+                "the step."
             )
     if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:
         place = int(np.argmax(np.abs(found.left)))

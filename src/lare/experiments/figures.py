@@ -170,7 +170,8 @@ def credit(
         axes.fill_between(x, *band, color=COLOURS[0], alpha=0.2, linewidth=0)
         # A wide band must not flatten the curves.
         low, high = (pick(np.append(reward[shown], proxy[shown])) for pick in (np.min, np.max))
-        axes.set_ylim(low - (high - low), high + (high - low))
+        if high > low:
+            axes.set_ylim(low - (high - low), high + (high - low))
     axes.plot(x, reward[shown], color="#777777", linewidth=1.8, label="true reward")
     axes.plot(x, proxy[shown], color=COLOURS[0], linewidth=1.2, label="proxy reward")
     axes.set(xlabel="step of the episode", ylabel="reward")

@@ -148,9 +148,10 @@ def curve(run: Run, key: str) -> figures.Curve | None:
 
 
 def at_the_end(run: Run, key: str) -> str:
-    """The last value: its mean over the seeds, and their standard deviation."""
+    """The last value: its mean over the seeds for which it is known, and their standard deviation."""
     found = curve(run, key)
-    return "-" if found is None else plus_minus(*mean_and_deviation(found[1][:, -1]))
+    known = np.zeros(0) if found is None else found[1][:, -1][np.isfinite(found[1][:, -1])]
+    return plus_minus(*mean_and_deviation(known)) if len(known) else "-"
 
 
 def summary(runs: Sequence[Run], names: Sequence[str]) -> str:

@@ -147,10 +147,12 @@ def grouped(runs: Mapping[str, Sequence[Run | Measured]], key: str) -> tuple[lis
                 raise LareError(
                     f"{one.source} and {curves[place][0]} are both {label} on {one.task} with seed {seed}: leave one out"
                 )
+            if not values:
+                raise LareError(f"{one.source} has no {key} of seed {seed} at any step: leave it out")
             curves[place] = one.source, values
     steps = sorted(set.intersection(*(set(values) for _, values in curves.values())))
     if not steps:
-        raise LareError("the runs have no step in common at which all of them were evaluated")
+        raise LareError(f"the runs have no step in common at which all of them have a value of {key}")
     return [group_of(label, tasks, curves, steps) for label in found], tasks
 
 

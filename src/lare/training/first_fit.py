@@ -24,7 +24,7 @@ from lare.training.learner import Learner
 FEWEST = 10
 """If a seed has fewer finished episodes, none are held out."""
 PATIENCE = 2
-"""Fitting stops after so many fits in a row without improvement."""
+"""The fitting of a seed stops after so many fits in a row without improvement."""
 MOST = 40
 """The most fits."""
 
@@ -50,7 +50,8 @@ def fit_until_it_stops_helping(
     episodes, running = jnp.copy(learner.replay.episodes), jnp.copy(learner.replay.running)
     held = jax.vmap(held_out)(learner.replay)
     assess = jax.jit(jax.vmap(partial(error_of, config=config)))
-    best, least, waited = jax.tree.map(jnp.copy, learner.credit), np.full(len(episodes), np.inf), 0
+    best, least = jax.tree.map(jnp.copy, learner.credit), np.full(len(episodes), np.inf)
+    waited = np.zeros(len(episodes), int)
     measured: dict[str, Float[Array, " seeds"]] = {}
     for number in range(MOST):
         hidden = learner.replay._replace(episodes=episodes - held, running=running | (held > 0))
@@ -59,10 +60,10 @@ def fit_until_it_stops_helping(
         whole = learner.replay._replace(episodes=jnp.copy(episodes), running=jnp.copy(running))
         learner = learner._replace(replay=whole)
         error = np.asarray(assess(learner.credit, whole, held))
-        better = error < least
+        better = (error < least) & (waited < PATIENCE)  # how long a seed is fitted does not depend on the others
         best = jax.tree.map(partial(of_those, jnp.asarray(better)), learner.credit, best)
-        least, waited = np.where(better, error, least), 0 if better.any() else waited + 1
-        if waited == PATIENCE:
+        least, waited = np.where(better, error, least), np.where(better, 0, waited + 1)
+        if (waited >= PATIENCE).all():
             break
     return learner._replace(credit=best), measured
 
