@@ -67,7 +67,7 @@ def pytest_collection_finish():
     """Tracing makes many objects. Python shall not look through all that is imported each time that there are 700 new ones."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(100_000, 50, 100)
+    gc.set_threshold(50_000, 20, 20)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -75,6 +75,7 @@ def forget_what_was_compiled():
     """What JAX keeps of every program would grow to gigabytes, and Python would look through it again and again."""
     yield
     jax.clear_caches()
+    gc.collect()
 
 
 @pytest.fixture(autouse=True, scope="module")
