@@ -80,11 +80,12 @@ def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
         )
         team = f"{config.env.teams[place].name}: " if len(roles) > 1 else ""
         lines += [team + line for line in words(found, form, factors, entries)]
-    if lines and (config.method.descends or len(run.seeds) > 1):
-        of_seed_alone = f"Of seed {run.seeds[0]} alone" if len(run.seeds) > 1 else ""
-        other = f"by a closed-form fit to the stored returns, which is not the decoder of {config.method.name}"
-        said = ", ".join(part for part in (of_seed_alone, other if config.method.descends else "") if part)
-        lines.insert(0, f"{said[0].upper()}{said[1:]}:")
+    about = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
+    if config.method.descends:
+        about.append(f"by a closed-form fit to the stored returns, which is not the decoder of {config.method.name}")
+    if lines and about:
+        head = ", ".join(about)
+        lines.insert(0, f"{head[0].upper()}{head[1:]}:")
     return lines
 
 
