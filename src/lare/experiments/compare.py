@@ -80,15 +80,17 @@ def find_runs(places: Sequence[Path]) -> list[Run]:
 def comparable(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], list[str]]:
     """The runs that have the metric, and remarks on the metric and on runs that were not trained to their end.
 
+    If no run has the metric, all runs that have an evaluation are returned.
+
     Raises:
         LareError: no run has an evaluation.
     """
-    found, remarks, summed = [], [], False
+    found, without, remarks, summed = [], [], [], False
     for run in runs:
         if not (lines := run.metrics()):
             remarks.append(f"{run.directory} has no evaluation yet, and is left out")
             continue
-        found.append(run)
+        (found if any(line.get(metric) is not None for line in lines) else without).append(run)
         summed = summed or any(SUMMED_RETURN in line for line in lines)
         if (reached := lines[-1]["step"]) < run.config.settings.steps:
             remarks.append(
@@ -97,14 +99,13 @@ def comparable(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], li
             )
         if warning := run.config.settings.untrained:
             remarks.append(f"{run.directory}: {warning}")
-    if not found:
+    if not found + without:
         raise LareError(f"{', '.join(str(run.directory) for run in runs)}: no run has an evaluation yet")
-    if with_metric := [run for run in found if any(line.get(metric) is not None for line in run.metrics())]:
-        remarks += [f"{run.directory} has no {metric}, and is left out" for run in found if run not in with_metric]
-        found = with_metric
+    if found:
+        remarks += [f"{run.directory} has no {metric}, and is left out" for run in without]
     if summed and metric == RETURN:
         remarks.append(f"returns are means over the agents; --metric {SUMMED_RETURN} compares their sums")
-    return found, remarks
+    return found or without, remarks
 
 
 def cells(comparison: Comparison) -> list[tuple[str, ...]]:
