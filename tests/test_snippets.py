@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shlex
+import sys
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -309,6 +310,7 @@ def miniature(monkeypatch):
 @pytest.mark.filterwarnings("ignore:.*v4 is out of date", "ignore::UserWarning:minari")
 @pytest.mark.parametrize("name", [name for name in WITH_BLOCKS if name not in EXCERPTS])
 def test_a_page_runs(name, command, monkeypatch, tmp_path):
+    monkeypatch.delitem(sys.modules, "exported", raising=False)  # that of another page
     page = Page(command, monkeypatch, tmp_path)
     BEFORE.get(name, lambda page: None)(page)
     for language, text in blocks(ROOT / name):

@@ -1,5 +1,9 @@
 """The first fit of many agents' decoders: what is held out is not fitted to, and the best decoder of each seed is kept."""
 
+import os
+import signal
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +16,8 @@ from lare.run.decide import decide
 from lare.run.directory import create
 from lare.tasks.spec import read_task
 from lare.training import first_fit, session
-from lare.training.first_fit import PATIENCE, fit_until_it_stops_helping, held_out
+from lare.training.compiled import compiled
+from lare.training.first_fit import PATIENCE, fit_until_it_stops_helping, held_out, with_smaller_updates
 from lare.training.seeds import of_seed
 from toys import At, figures
 
@@ -76,7 +81,7 @@ def test_fits_see_no_held_out_episode_and_the_best_decoders_are_kept(begun, monk
     monkeypatch.setattr(first_fit.jax, "jit", lambda _: lambda *_: errors[len(seen) - 1])
     keys = jax.random.split(jax.random.key(0), 2)
     before = np.asarray(begun.learner.replay.episodes)
-    learner, measured = fit_until_it_stops_helping(begun.learner, fit, keys, begun.config)
+    learner, measured = fit_until_it_stops_helping(begun.learner, fit, keys, begun.config, lambda: False)
     assert len(seen) == 3 + PATIENCE
     assert all(episodes == [10, 10] for episodes, _ in seen)
     assert len({key.tobytes() for _, key in seen}) == len(seen)
@@ -90,20 +95,32 @@ def test_fits_see_no_held_out_episode_and_the_best_decoders_are_kept(begun, monk
 
 def test_the_first_fit_goes_on_longer_and_only_the_first(begun, monkeypatch):
     fits = []
-    fit = begun.functions.fit
 
-    def counted(learner, keys):
-        fits.append(begun.step)
-        return fit(learner, keys)
+    def counted(config):
+        functions = compiled(config)
 
-    begun.functions = begun.functions._replace(fit=counted)
+        def fit(learner, keys):
+            fits.append(config.credit.steps)
+            return functions.fit(learner, keys)
+
+        return functions._replace(fit=fit)
+
+    monkeypatch.setattr(session, "compiled", counted)
+    begun.functions = counted(begun.config)
     keys = jax.random.split(jax.random.key(0), 2)
-    begun.fit(keys)
+    begun.fit(keys, lambda: False)
     first = len(fits)
     assert first >= 1 + PATIENCE
+    assert set(fits) == {with_smaller_updates(begun.config).credit.steps}
     assert begun.fitted
-    begun.fit(keys)
-    assert len(fits) == first + 1
+    begun.fit(keys, lambda: False)
+    assert fits[first:] == [begun.config.credit.steps]
+
+
+@pytest.mark.parametrize(("steps", "first"), [(6400, 800), (400, 50), (150, 25), (20, 20)])
+def test_updates_of_the_first_fit_draw_an_eighth_of_the_steps_and_at_least_an_episode(begun, steps, first):
+    config = replace(begun.config, credit=begun.config.credit.model_copy(update={"steps": steps}))
+    assert with_smaller_updates(config).credit.steps == first
 
 
 def test_a_run_that_is_resumed_after_its_first_fit_makes_no_other(small_many, tmp_path):
@@ -119,4 +136,25 @@ def test_a_run_that_is_resumed_after_its_first_fit_makes_no_other(small_many, tm
 
     with pytest.raises(KeyboardInterrupt):
         lare.train(task, settings, out=tmp_path / "run", listeners=[At(600, stop)], **given)
+    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+
+
+def test_a_run_that_is_stopped_during_its_first_fit_begins_again(small_many, tmp_path, monkeypatch):
+    task = read_task("CN-6")
+    settings = small_many(
+        method="lare-rd", seeds=1, environments=12, steps=600, evaluate_every=300, capacity=2000, first_fit="held-out"
+    )
+    given = {"function": verified(PHI, task)}
+    whole = lare.train(task, settings, out=tmp_path / "whole", listeners=[], **given)
+
+    def ask_to_stop(learner):
+        os.kill(os.getpid(), signal.SIGINT)
+        return True
+
+    with monkeypatch.context() as patch:
+        patch.setattr(first_fit, "has_enough", ask_to_stop)
+        with pytest.raises(lare.LareError) as stopped:
+            lare.train(task, settings, out=tmp_path / "run", listeners=[], **given)
+    said = f"stopped during the decoder's first fit; to continue: lare train --resume {tmp_path / 'run'}"
+    assert str(stopped.value) == said
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)

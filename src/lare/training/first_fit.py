@@ -5,6 +5,7 @@ that is too few: the policy has settled before the decoder is accurate (docs/res
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -27,6 +28,14 @@ PATIENCE = 2
 """The fitting of a seed stops after so many fits in a row without improvement."""
 MOST = 40
 """The most fits."""
+SMALLER = 8
+"""An update draws one in so many of the steps of a later update. There are few episodes yet, and large updates would see each of
+them several times. The decoder becomes as accurate in an eighth of the time (benchmarks/first_fit.py)."""
+
+
+class Stopped(Exception):
+    """The user asked the run to stop during the first fit. Nothing of this iteration is kept."""
+
 
 Fit = Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, dict[str, Float[Array, " seeds"]]]]
 
@@ -36,8 +45,14 @@ def has_enough(learner: Learner) -> bool:
     return int(jnp.min(jnp.sum(jax.vmap(finished)(learner.replay), axis=1))) >= FEWEST
 
 
+def with_smaller_updates(config: TrainConfig) -> TrainConfig:
+    """The configuration of the first fit: updates draw fewer episodes, and at least one."""
+    steps = max(config.credit.steps // SMALLER, config.env.max_steps)
+    return replace(config, credit=config.credit.model_copy(update={"steps": min(steps, config.credit.steps)}))
+
+
 def fit_until_it_stops_helping(
-    learner: Learner, fit: Fit, keys: Key[Array, " seeds"], config: TrainConfig
+    learner: Learner, fit: Fit, keys: Key[Array, " seeds"], config: TrainConfig, stopped: Callable[[], bool]
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
     """Fit repeatedly; for each seed, the decoders with the least error on held-out episodes are kept.
 
@@ -46,6 +61,10 @@ def fit_until_it_stops_helping(
         fit: one fit, which consumes the learner that it is given.
         keys: the random keys of the first fit; those of the others are derived from them.
         config: the configuration of the run.
+        stopped: whether the user has asked the run to stop.
+
+    Raises:
+        Stopped: the user has asked the run to stop.
     """
     episodes, running = jnp.copy(learner.replay.episodes), jnp.copy(learner.replay.running)
     held = jax.vmap(held_out)(learner.replay)
@@ -54,6 +73,8 @@ def fit_until_it_stops_helping(
     waited = np.zeros(len(episodes), int)
     measured: dict[str, Float[Array, " seeds"]] = {}
     for number in range(MOST):
+        if stopped():
+            raise Stopped
         hidden = learner.replay._replace(episodes=episodes - held, running=running | (held > 0))
         again = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
         learner, measured = fit(learner._replace(replay=hidden), again)

@@ -86,32 +86,39 @@ class Session:
         """The parts of the learner that are needed to act now."""
         return self.functions.actor(self.learner, self.step)
 
-    def advance(self) -> None:
-        """One iteration: collect steps, compute factors, store them, sometimes fit the decoder, update the algorithm."""
+    def advance(self, stopped: Callable[[], bool] = lambda: False) -> None:
+        """One iteration: collect steps, compute factors, store them, sometimes fit the decoder, update the algorithm.
+
+        Args:
+            stopped: whether the user has asked the run to stop.
+
+        Raises:
+            Stopped: the user has asked the run to stop, during the decoder's first fit. The session cannot go on.
+        """
         steps = self.collector.collect(self.actor, self.step)
         self.learner = self.functions.store(self.learner, steps, annotate(self.run, self.config, steps))
         if self.learner.credit and np.any(steps.ended):
             self.learner = self.functions.learn_returns(self.learner)
         if self.step >= self.config.warmup:
-            self.update(steps)
+            self.update(steps, stopped)
         self.step += self.settings.iteration_steps
 
-    def update(self, steps: Trajectory) -> None:
+    def update(self, steps: Trajectory, stopped: Callable[[], bool]) -> None:
         """Make the decoder's own updates, if it has any and they are due, and those of the algorithm."""
         number = self.step // self.settings.iteration_steps
         fits = self.config.method.descends and not self.config.interleaved
         if fits and number % self.settings.fit_every == 0:
-            self.fit(stream_keys(self.run.seeds, Stream.FIT, self.step))
+            self.fit(stream_keys(self.run.seeds, Stream.FIT, self.step), stopped)
         keys = seed_keys(jnp.asarray(self.run.seeds), self.step + 1)
         self.learner, learned = self.functions.improve(self.learner, steps, keys, self.step)
         if np.any(np.asarray(learned.get("algorithm/updates", 1)) > 0):
             self.latest |= learned
 
-    def fit(self, keys: Key[Array, " seeds"]) -> None:
+    def fit(self, keys: Key[Array, " seeds"], stopped: Callable[[], bool]) -> None:
         """Make the decoder's own updates; the first time, until they bring no improvement."""
         if self.settings.first_fit == "held-out" and not self.fitted and first_fit.has_enough(self.learner):
             self.learner, measured = first_fit.fit_until_it_stops_helping(
-                self.learner, self.functions.fit, keys, self.config
+                self.learner, compiled(first_fit.with_smaller_updates(self.config)).fit, keys, self.config, stopped
             )
             self.fitted = True
         else:

@@ -19,6 +19,7 @@ from lare.run.decide import decide
 from lare.run.directory import Run, as_run, create, default_directory, isolation, locked
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain
 from lare.tasks.spec import TaskSpec, as_task
+from lare.training import first_fit
 from lare.training import session as sessions
 from lare.training.collect_host import Diverged
 from lare.training.explain import described
@@ -234,7 +235,12 @@ def finish(
             introduce(session, listener, messages)
         with stop_requests() as stop:
             while session.step < settings.steps:
-                session.advance()
+                try:
+                    session.advance(stop.is_set)
+                except first_fit.Stopped:
+                    raise Interrupted(
+                        f"stopped during the decoder's first fit; to continue: lare train --resume {run.directory}"
+                    ) from None
                 for listener in told:
                     listener.stepped(session.step)
                 if session.step % settings.evaluate_every == 0 or session.step == settings.steps:

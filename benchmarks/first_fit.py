@@ -1,0 +1,58 @@
+"""How long the first fit of many agents' decoders takes, and how accurate the decoders are after it.
+
+    python benchmarks/first_fit.py
+
+Each way of fitting starts from the same steps of an untrained policy: the first iteration of IPPO with `lare-rd`, seeds 0 to 2. The
+decoders are compared with the true rewards of these steps. Times are processor time for all three seeds, compiling included.
+"""
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import jax
+import numpy as np
+
+import lare
+from lare.run.decide import decide
+from lare.run.directory import create
+from lare.training import first_fit, session
+from lare.training.streams import Stream, stream_keys
+from measure import write
+
+TASKS = ("CN-6", "PP-15", "CN-30")
+WAYS = {"published": "published", "held-out": "held-out", "held-out, updates as large as later ones": "held-out"}
+
+
+def main() -> None:
+    found = {task: {way: measured(task, way) for way in WAYS} for task in TASKS}
+    write("first_fit", {"seeds": [0, 1, 2], "of each task": found})
+
+
+def measured(name: str, way: str) -> dict[str, Any]:
+    task = lare.load_task(name)
+    settings = lare.Settings(method="lare-rd", seeds=3, first_fit=WAYS[way])  # pyright: ignore[reportArgumentType]
+    with tempfile.TemporaryDirectory() as there:
+        run = create(Path(there) / "run", task, decide(settings, task), [lare.design(task)])
+        begun = session.start(run)
+        try:
+            steps = begun.collector.collect(begun.actor, 0)
+            begun.learner = begun.functions.store(begun.learner, steps, session.annotate(run, begun.config, steps))
+            jax.block_until_ready(begun.learner)
+            start = time.process_time()
+            with mock.patch.object(first_fit, "SMALLER", 1 if "large" in way else first_fit.SMALLER):
+                begun.fit(stream_keys(run.seeds, Stream.FIT, 0), lambda: False)
+                jax.block_until_ready(begun.learner)
+            seconds = time.process_time() - start
+            accuracy = begun.functions.assess(begun.learner)
+        finally:
+            begun.close()
+    digits = {key: np.round(np.asarray(accuracy[f"credit/{key}"]), 4).tolist() for key in ("correlation", "error")}
+    print(name, way, f"{seconds:.0f} s", digits, flush=True)
+    return {"processor seconds": round(seconds, 1), **digits}
+
+
+if __name__ == "__main__":
+    main()
