@@ -439,8 +439,8 @@ def test_training_that_diverges_says_so(small, tmp_path):
 def test_what_has_diverged_is_not_saved_when_it_is_stopped(small, tmp_path, monkeypatch):
     advance = sessions.Session.advance
 
-    def spoilt(session):
-        advance(session)
+    def spoilt(session, stopped):
+        advance(session, stopped)
         if session.step == 84:
             session.latest["critic/loss"] = np.array([1.0, np.nan])
 
