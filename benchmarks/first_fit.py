@@ -1,4 +1,4 @@
-"""How long the first fit of many agents' decoders takes, and how accurate the decoders are after it.
+"""The time of the decoder's first fit for many agents, and the decoder's accuracy after it.
 
     python benchmarks/first_fit.py
 

@@ -139,7 +139,7 @@ def model_of(model: str | None, base_url: str | None, task: str) -> "Model | Non
 def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: Path | None = None) -> None:
     """Evaluate the policy of a run by its true return, from initial states that no evaluation of the run has used.
 
-    Prints mean and standard deviation over the episodes, of the policy; and of random actions, over at most ten episodes.
+    Prints the mean return of the policy with its standard deviation, and the same of at most ten episodes of random actions.
 
     Args:
         run: a run directory.
