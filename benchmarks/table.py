@@ -22,6 +22,11 @@ def cell(values: list[float]) -> str:
     return f"{mean:.4g} ± {spread:.2g}" if len(values) > 1 else f"{mean:.4g}"
 
 
+def usual_names(method: str, algorithm: str) -> tuple[str, ...]:
+    """The names that a sweep gives to a run of draw 0; another name says what is different in the run."""
+    return f"{method}-{algorithm}", f"{method}-{algorithm}-draw0"
+
+
 def row(directory: Path, at: int | None) -> str:
     config, lines = read(directory)
     key = "evaluation/summed_return" if "evaluation/summed_return" in lines[-1] else "evaluation/return"
@@ -34,8 +39,9 @@ def row(directory: Path, at: int | None) -> str:
     quarter = [sum(values) / len(values) for values in late.values()]
     cells = [cell([line[key] for line in end]), cell(quarter)]
     cells += [cell([line[name] for line in end if line.get(name) is not None]) for name in COLUMNS]
-    method, name = config["settings"]["method"], directory.name
-    label = f"`{method}`" if name.startswith(method) else f"`{method}`, {name}"
+    method, algorithm = config["settings"]["method"], config["settings"]["algorithm"]
+    apart = "" if directory.name in usual_names(method, algorithm) else f", {directory.name}"
+    label = f"`{method}`, {algorithm}{apart}"
     return f"| {config['task']['name']} | {label} | {last:,} | {' | '.join(cells)} |"
 
 

@@ -361,7 +361,28 @@ def test_help_breaks_no_line_where_the_source_does(command):
     assert "--algorithm" in out
     lines = [line.strip(" |│") for line in out.splitlines()]
     assert "one --function for each, in the order of the task. (repeatable)" not in lines
-    assert "qmix if there are a global state and action masks, else ippo. (default: None)" not in lines
+    assert "qmix if there are a global state and action masks, else ippo." not in lines
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_help_says_in_words_what_happens_without_an_option(name, command):
+    status, out, _ = command(name, "--help")
+    assert status == 0
+    assert "None" not in out
+    assert "(default: )" not in out
+
+
+def test_help_names_the_type_of_an_option_that_may_be_left_out(command):
+    _, out, _ = command("train", "--help")
+    for option in (
+        "--steps INT",
+        "--model STR",
+        "--out DIR",
+        "--judges {before,after,both}",
+        "--credit.hidden [INT [INT ...]]",
+        "--td3.gamma FLOAT",
+    ):
+        assert f" {option} " in out
 
 
 def test_from_training_to_report(command, spec_file, phi):

@@ -183,6 +183,9 @@ def test_parts_of_an_observation_stand_behind_each_other():
             "The goal is to run forward as fast as possible.",
         ),
         ("Be quick, since a penalty is due.", ""),
+        ("A mark 0..100 at the end.", ""),
+        ("The final grade (0 to 10) depends on the level.", ""),
+        ("Stop at the mark on the floor.", "Stop at the mark on the floor."),
     ],
 )
 def test_what_speaks_of_rewards_and_what_does_not(said, kept):

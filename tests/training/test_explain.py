@@ -58,7 +58,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             ENTRIES,
             [
                 "The score is taken for an average over the steps of an episode: so far, this predicts returns better than a sum. "
-                'If you know that it is a sum, write `score = "sum"` into the task file.',
+                'To keep this form, write `score = "average"` into the task file.',
                 "The factors explain 5% of the variation of the returns of 40 episodes.",
                 "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of.",
             ],
@@ -70,7 +70,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             [],
             [
                 "The score is taken for a sum over the steps of an episode: so far, this predicts returns better than an average. "
-                'If you know that it is an average, write `score = "average"` into the task file.',
+                'To keep this form, write `score = "sum"` into the task file.',
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
                 SHARES,
                 "- speed: 99%, +1 ± 0.1",

@@ -6,8 +6,12 @@ import inspect
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
+from pydantic import BaseModel
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 from lare.errors import LareError, did_you_mean
 
@@ -29,7 +33,7 @@ def parse(
         LareError: the arguments cannot be read.
     """
     asked = {name: deferred(command) for name, command in commands.items()}
-    with contextlib.redirect_stderr(io.StringIO()) as box:
+    with RULES, contextlib.redirect_stderr(io.StringIO()) as box:
         try:
             return tyro.extras.subcommand_cli_from_dict(asked, prog="lare", description=description, args=arguments)
         except SystemExit as stopped:
@@ -49,10 +53,49 @@ def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     def keep(*values: object, **named: object) -> Callable[[], None]:
         return functools.partial(command, *values, **named)
 
+    signature = inspect.signature(command)
     keep.__doc__ = CONTINUED.sub(" ", inspect.cleandoc(command.__doc__ or ""))
-    keep.__dict__["__signature__"] = inspect.signature(command)
+    keep.__dict__["__signature__"] = signature
+    keep.__annotations__ = {name: shown_as(one.annotation, one.default) for name, one in signature.parameters.items()}
     del keep.__wrapped__  # tyro would read the docstring there
     return keep
+
+
+RULES = ConstructorRegistry()
+
+
+@RULES.struct_rule
+def options_of(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """The options of a Pydantic model, as tyro makes them, but for `shown_as`."""
+    if not (isinstance(info.type, type) and issubclass(info.type, BaseModel)):
+        return None
+    options = []
+    for name, field in info.type.model_fields.items():
+        kind: Any = Annotated[(field.annotation, *field.metadata)] if field.metadata else field.annotation
+        default = getattr(info.default, name, field.get_default(call_default_factory=True))
+        options.append(StructFieldSpec(name, shown_as(kind, default), default, helptext=field.description))
+    return StructConstructorSpec(instantiate=info.type, fields=tuple(options))
+
+
+def shown_as(kind: Any, default: object) -> Any:
+    """The type of an option. If it may be left out, the help says in words what happens then; "None" would say something else."""
+    if default is not None:
+        return kind
+    taken = [one for one in get_args(kind) if one is not NoneType]
+    name = metavar(taken[0]) if len(taken) == 1 else None
+    return Annotated[kind, tyro.conf.arg(help_behavior_hint="", metavar=name)]
+
+
+def metavar(kind: Any) -> str | None:
+    """The name of a type in the help."""
+    origin, inside = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return metavar(inside[0])
+    if origin is Literal:
+        return "{" + ",".join(inside) + "}"
+    if origin is tuple:
+        return f"[{metavar(inside[0])} [{metavar(inside[0])} ...]]"
+    return kind.__name__.upper() if isinstance(kind, type) else None
 
 
 def in_one_line(box: str, commands: Mapping[str, object]) -> str:

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 Task = Annotated[Positional[str], tyro.conf.arg(metavar="TASK")]
 RunDirectory = Annotated[Positional[Path], tyro.conf.arg(metavar="RUN")]
-RunDirectories = Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN")]
+RunDirectories = Annotated[
+    Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN", help_behavior_hint="(one or more)")
+]
 Kind = Literal["factors", "reward"]
 Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET")]
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     CreditOptions = CreditSettings
 else:
     CreditOptions = create_model("CreditOptions", __base__=Checked, __module__=__name__, **OPTIONS)
-    CreditOptions.__doc__ = "How the decoder is fitted. If a setting is None, the algorithm decides it."
+    CreditOptions.__doc__ = "How the decoder is fitted. The algorithm decides each setting that is not given."
 
 Count = Annotated[int, Field(ge=1)]
 

@@ -15,7 +15,8 @@ from lare.tasks.spec import FILL_IN, PETTINGZOO
 HEADING = re.compile(r"^[ \t]*#+\s*(.+?)\s*$", re.MULTILINE)
 
 LEAKS = re.compile(
-    r"reward|penal|\bcosts?\b|\bscor(e|es|ed|ing)\b|\b(a|the|final) (mark|grade) (is|of|from|for)\b|\bgraded\b"
+    r"reward|penal|\bcosts?\b|\bscor(e|es|ed|ing)\b|\bgraded\b"
+    r"|\b(a|the|final) (mark|grade) (is|of|from|for|between|at the end|out of|\(?-?\d)"
     r"|(\d|\b(earn|gain|get|give|lose|receive|win|award)\w*)( \w+)? points?\b"
     r"|\b(average|cumulative|discounted|episodic?|expected|mean|the|total) returns?\b(?! to\b)",
     re.IGNORECASE,
@@ -130,8 +131,8 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
 def warning(left_out: int, origin: str = "the documentation of the environment") -> list[str]:
     return [
         f"# A first draft, from {origin}. Read it before you use it: a language model will",
-        "# know only these texts. Whatever mentions rewards was left out on purpose, so that the request does not reveal the",
-        f"# reward ({left_out} sentences or rows). Describe the goal, not how it is rewarded.",
+        f"# know only these texts. Left out on purpose: {left_out} sentences or rows with words such as reward, cost or score.",
+        "# Take out anything else that reveals the reward. Describe the goal, not how it is rewarded.",
     ]
 
 
