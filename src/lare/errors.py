@@ -2,7 +2,9 @@
 
 import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from inspect import cleandoc
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
@@ -47,6 +49,10 @@ class Checked(BaseModel):
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
         for field in cls.model_fields.values():  # docstrings, without line breaks, which `--help` sets itself
             field.description = " ".join((field.description or "").split()) or None
+        told = [f"{name}: {field.description}" for name, field in cls.model_fields.items() if field.description]
+        if cls.__doc__ and told:  # for help(), which knows no docstrings of fields
+            lines = [fill(line, 120, initial_indent=" " * 4, subsequent_indent=" " * 8) for line in told]
+            cls.__doc__ = "\n".join([cleandoc(cls.__doc__), "", "Attributes:", *lines])
 
     @model_validator(mode="before")
     @classmethod

@@ -55,8 +55,11 @@ class TaskSpec(Checked):
     """A Gymnasium id (`module:id` first imports the module that registers it), or the name of another family's environment, such as
     `particles/CN-6`, or `none` if there are only logs: functions are then designed and logs relabelled, but nothing is trained."""
     observation_size: Annotated[int, Field(ge=1)]
+    """The number of entries of an observation."""
     action_size: Annotated[int, Field(ge=1)]
+    """The number of entries of an action; if the action is a choice, the number of choices."""
     judges: Judges = "after"
+    """By which observation a step is judged: the one before it, the one after it, or both."""
     description: Annotated[str, Field(min_length=1)]
     """The task and its goal, without a word about the reward."""
     observation: Annotated[str, Field(min_length=1)]
