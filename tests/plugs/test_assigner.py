@@ -100,6 +100,17 @@ def test_a_step_is_the_same_step_however_it_is_shown(method, function):
     np.testing.assert_allclose(scored.rewards_at(every), single.rewards_at(every), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("asked", ["after each episode", "at the end"])
+def test_returns_are_predicted_by_fits_to_those_before_whenever_it_is_asked(asked, phi):
+    credit = assigner("lare-linear", phi)
+    for one in episodes([10] * 40):
+        credit.add_episode(*one)
+        if asked == "after each episode":
+            credit.metrics()
+    assert 0.9 < credit.metrics()["credit/return_r2"] <= 1
+    assert float(credit.learner.state.closed.fitted) > 38
+
+
 def test_lanes_come_in_between_each_other():
     credit, shown = assigner(), episodes([4, 2, 3, 5])
     left = {lane: list(zip(*one, strict=True)) for lane, one in zip("abcd", shown, strict=True)}

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from math import ceil
 
 import jax
 import numpy as np
@@ -87,6 +88,13 @@ class Learner:
         """Whether enough new episodes have ended to learn from them."""
         return len(self.pending) >= max(returns.GROWTH * self.told, 1)
 
+    @property
+    def until_the_next_fit(self) -> int | None:
+        """After how many new episodes a closed form is fitted again; None for other decoders."""
+        if self.state is None or self.state.closed is None:
+            return None
+        return max(ceil((closed_form.GROWTH_OF_FIT - 1) * self.told), 1)
+
     def owe(self, steps: int) -> None:
         """Add the gradient updates that are due for new steps."""
         self.owed = min(self.owed + self.config.fits_per_step * steps, MOST_OWED)
@@ -135,26 +143,38 @@ class Learner:
             self.scale = compiled.observe_mean_rewards(self.scale, mean, there)
 
     def learn(self) -> None:
-        """Let the decoder learn from the episodes that have ended. All steps must have their features."""
+        """Let the decoder learn from the episodes that have ended. All steps must have their features.
+
+        However many have ended since the last call, a decoder in closed form is fitted as often as if each had been learned from
+        when it ended: a return is predicted by a decoder that was fitted to those before it.
+        """
         self.observe()
         new = [episode for episode in self.pending if episode.steps[0] >= self.store.steps - self.store.capacity]
         self.pending.clear()
         self.untold = 0
-        self.told += len(new)
-        if self.state is None or not new:
-            return
         with on_host(), jax.enable_x64(True):
-            for piece in self.pieces(new):
-                self.state = compiled.tell(self.state, piece, self.config.settings)
-            if self.state.closed is None:
-                return
-            whole = self.config.forget or self.store.steps <= self.store.capacity
-            if self.config.method.fit is not Fit.SIGNS and whole and compiled.is_stale(self.state):
-                self.state = compiled.begin_again(self.state)
-                for piece in self.pieces(list(self.store.episodes.values())):
-                    self.state = compiled.add(self.state, piece)
-            if compiled.is_due(self.state):
-                self.state = compiled.fit_in_closed_form(self.state, self.config.method.name, self.config.forms)
+            while new:
+                count = self.until_the_next_fit or len(new)
+                now, new = new[:count], new[count:]
+                self.told += len(now)
+                if self.state is not None:
+                    self.state = self.told_of(self.state, now, later=new)
+
+    def told_of(self, state: Decomposition, now: Sequence[Episode], later: Sequence[Episode]) -> Decomposition:
+        """The state after some new episodes, while others still wait."""
+        for piece in self.pieces(now):
+            state = compiled.tell(state, piece, self.config.settings)
+        if state.closed is None:
+            return state
+        whole = self.config.forget or self.store.steps <= self.store.capacity
+        if self.config.method.fit is not Fit.SIGNS and whole and compiled.is_stale(state):
+            waiting = set(map(id, later))
+            state = compiled.begin_again(state)
+            for piece in self.pieces([one for one in self.store.episodes.values() if id(one) not in waiting]):
+                state = compiled.add(state, piece)
+        if compiled.is_due(state):
+            state = compiled.fit_in_closed_form(state, self.config.method.name, self.config.forms)
+        return state
 
     def pieces(self, episodes: Sequence[Episode]) -> Iterator[Episodes]:
         """Whole episodes, some at a time, in arrays of one of two shapes: for a single episode, or for many."""
