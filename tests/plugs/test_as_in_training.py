@@ -19,10 +19,7 @@ LONG = LENGTHS * 6
 
 
 def both(method, env, phi=None):
-    """A learner of the trainer's and an assigner that have met the same steps, so few at a time that no two episodes end at once.
-
-    The trainer learns at once from episodes that end in one iteration. The assigner learns from one after the other.
-    """
+    """A learner of the trainer's and an assigner that have met the same steps, some at a time."""
     judges = "after" if phi is None else toy_spec().judges
     config = config_of(method, "td3" if env.agents == 1 else "ippo", env, capacity=1000, judges=judges)
     many = {} if env.agents == 1 else {"agents": env.agents, "max_steps": env.max_steps}
@@ -36,7 +33,7 @@ def both(method, env, phi=None):
         **many,
     )
     learner, steps = untrained(config), steps_of(env, lengths=LONG)
-    for rows in np.array_split(np.arange(len(steps.ended)), len(steps.ended) // min(LENGTHS)):
+    for rows in np.array_split(np.arange(len(steps.ended)), 12):
         some = jax.tree.map(lambda leaf, rows=rows: leaf[rows], steps)
         parts = [
             part[:, 0] for part in (some.before.observation, some.taken, some.after.observation, some.after.reward)

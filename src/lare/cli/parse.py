@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 from lare.errors import LareError, did_you_mean
+from lare.run.settings import kind_of
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 NUMBERS = {"INT": "not a whole number, such as 10000", "FLOAT": "not a number, such as 0.5"}
@@ -71,9 +72,8 @@ def options_of(info: StructTypeInfo) -> StructConstructorSpec | None:
         return None
     options = []
     for name, field in info.type.model_fields.items():
-        kind: Any = Annotated[(field.annotation, *field.metadata)] if field.metadata else field.annotation
         default = getattr(info.default, name, field.get_default(call_default_factory=True))
-        options.append(StructFieldSpec(name, shown_as(kind, default), default, helptext=field.description))
+        options.append(StructFieldSpec(name, shown_as(kind_of(field), default), default, helptext=field.description))
     return StructConstructorSpec(instantiate=info.type, fields=tuple(options))
 
 

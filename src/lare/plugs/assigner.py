@@ -167,13 +167,15 @@ class CreditAssigner:
             if not len(rows):
                 return found
             found[rows] = numbers = self.keep(before, action, after, None if there is None else there[rows])
+            over = False
             for place, (number, row) in enumerate(zip(numbers.tolist(), rows.tolist(), strict=True)):
                 run = self.store.running_of(lanes[row], before[place])
                 run.steps.append(number)
                 run.paid += float(paid[place])
                 run.last = after[place]
                 if ended[place]:
-                    self.learner.ended(self.store.end(lanes[row], run.paid))
+                    self.learner.ended(self.store.end(lanes[row], run.paid), beside=over)
+                    over = True
             if self.unseen >= WAITING:
                 self.look()
             if self.learner.untold >= PIECE:

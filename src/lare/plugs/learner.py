@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from math import ceil
+from itertools import chain
+from math import inf
 
 import jax
 import numpy as np
@@ -39,8 +40,8 @@ class Learner:
         """The scale of R/T."""
         self.unobserved: list[tuple[np.ndarray, np.ndarray]] = []
         """Features of steps that are not in the running statistics yet, and which agents acted."""
-        self.pending: list[Episode] = []
-        """Episodes that the decoder has not learned from yet."""
+        self.pending: list[list[Episode]] = []
+        """Episodes that the decoder has not learned from yet. Those that ended in one call are together."""
         self.returned: list[tuple[float, int]] = []
         """R/T and T of episodes that are not in the scales yet."""
         self.untold = 0
@@ -86,22 +87,24 @@ class Learner:
     @property
     def is_due(self) -> bool:
         """Whether enough new episodes have ended to learn from them."""
-        return len(self.pending) >= max(returns.GROWTH * self.told, 1)
+        return sum(map(len, self.pending)) >= max(returns.GROWTH * self.told, 1)
 
     @property
-    def until_the_next_fit(self) -> int | None:
-        """After how many new episodes a closed form is fitted again; None for other decoders."""
+    def until_the_next_fit(self) -> float:
+        """After how many new episodes a closed form is fitted again; other decoders are not fitted when they learn returns."""
         if self.state is None or self.state.closed is None:
-            return None
-        return max(ceil((closed_form.GROWTH_OF_FIT - 1) * self.told), 1)
+            return inf
+        return (closed_form.GROWTH_OF_FIT - 1) * self.told
 
     def owe(self, steps: int) -> None:
         """Add the gradient updates that are due for new steps."""
         self.owed = min(self.owed + self.config.fits_per_step * steps, MOST_OWED)
 
-    def ended(self, episode: Episode) -> None:
-        """Add an episode that has ended."""
-        self.pending.append(episode)
+    def ended(self, episode: Episode, beside: bool = False) -> None:
+        """Add an episode that has ended; `beside` the one before, if both ended in one call."""
+        if not beside:
+            self.pending.append([])
+        self.pending[-1].append(episode)
         self.untold += len(episode.steps)
         self.returned.append((episode.score / len(episode.steps), len(episode.steps)))
 
@@ -145,23 +148,25 @@ class Learner:
     def learn(self) -> None:
         """Let the decoder learn from the episodes that have ended. All steps must have their features.
 
-        However many have ended since the last call, a decoder in closed form is fitted as often as if each had been learned from
-        when it ended: a return is predicted by a decoder that was fitted to those before it.
+        However late this is called, a decoder in closed form is fitted as often as if it had been called whenever episodes ended: a
+        return is predicted by a decoder that was fitted to those before it.
         """
         self.observe()
-        new = [episode for episode in self.pending if episode.steps[0] >= self.store.steps - self.store.capacity]
+        oldest = self.store.steps - self.store.capacity
+        new = [kept for group in self.pending if (kept := [one for one in group if one.steps[0] >= oldest])]
         self.pending.clear()
         self.untold = 0
         with on_host(), jax.enable_x64(True):
             while new:
-                count = self.until_the_next_fit or len(new)
-                now, new = new[:count], new[count:]
+                now = new.pop(0)
+                while new and len(now) < self.until_the_next_fit:
+                    now += new.pop(0)
                 self.told += len(now)
                 if self.state is not None:
-                    self.state = self.told_of(self.state, now, later=new)
+                    self.state = self.after(self.state, now, list(chain.from_iterable(new)))
 
-    def told_of(self, state: Decomposition, now: Sequence[Episode], later: Sequence[Episode]) -> Decomposition:
-        """The state after some new episodes, while others still wait."""
+    def after(self, state: Decomposition, now: Sequence[Episode], later: Sequence[Episode]) -> Decomposition:
+        """The state of a decoder that has learned from some new episodes, while others still wait."""
         for piece in self.pieces(now):
             state = compiled.tell(state, piece, self.config.settings)
         if state.closed is None:

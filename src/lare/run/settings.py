@@ -20,10 +20,14 @@ MOST_SEEDS = 1000
 """The most seeds in one process."""
 
 
+def kind_of(field: FieldInfo) -> Any:
+    """The type of a field, with its bounds."""
+    return Annotated[(field.annotation, *field.metadata)] if field.metadata else field.annotation
+
+
 def optional(field: FieldInfo) -> tuple[Any, Any]:
     """A field that may also be None, which is its default."""
-    kind: Any = Annotated[(field.annotation, *field.metadata)] if field.metadata else field.annotation
-    return kind | None, Field(None, description=field.description)
+    return kind_of(field) | None, Field(None, description=field.description)
 
 
 OPTIONS: dict[str, Any] = {name: optional(field) for name, field in CreditSettings.model_fields.items()}
