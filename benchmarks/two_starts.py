@@ -35,7 +35,7 @@ def continued(sums: Sums, basis: Basis, start: Posterior) -> Posterior:
     known = start.beta > 0
     alpha = jnp.where(known, start.alpha, given.equal)
     found = evidence.fixed_point(given, alpha, jnp.where(known, start.beta, 2 * given.free / given.q), ROUNDS)
-    return evidence.in_units(sums, 0, given, found, otherwise=start)
+    return evidence.in_return_units(sums, 0, given, found, otherwise=start)
 
 
 def from_both(sums: Sums, basis: Basis, start: Posterior) -> Posterior:

@@ -12,7 +12,7 @@ from lare.credit.methods import METHODS
 from lare.credit.settings import CreditSettings
 from lare.data import replay
 from lare.data.trajectory import Trajectory
-from lare.tasks.env import EnvSpec, Team, Timestep, in_units
+from lare.tasks.env import EnvSpec, Team, Timestep, env_action
 from lare.training import learner as common
 from lare.training.compiled import module_of
 from lare.training.config import TrainConfig
@@ -89,7 +89,7 @@ def steps_of(env=ALONE, envs=1, seed=0, lengths=LENGTHS):
         available[..., 0] |= ~available.any(axis=-1)
     action = 2 * normal(agents, env.action_size)  # some of them beyond the bounds
     if env.discrete:
-        action = in_units(np.where(available, action, -np.inf), env)
+        action = env_action(np.where(available, action, -np.inf), env)
     nothing, never = np.zeros((*lead, agents), np.float32), np.zeros(lead, bool)
     before = Timestep(observation, state, available, alive, nothing, never, never, {})
     after = Timestep(
@@ -101,7 +101,7 @@ def steps_of(env=ALONE, envs=1, seed=0, lengths=LENGTHS):
         ended,
         {},
     )
-    return Trajectory(before, action, in_units(action, env), after)
+    return Trajectory(before, action, env_action(action, env), after)
 
 
 def factors_for(config, steps, seed=1):

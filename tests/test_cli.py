@@ -239,7 +239,13 @@ def test_a_new_task_of_two_teams_is_three_files(command, tmp_path):
     status, out, err = command("new-task", "pettingzoo/mpe2.simple_adversary_v3:parallel_env")
     assert (status, err) == (0, "")
     files = [f"simple_adversary_v3{team}.toml" for team in ("", "-adversary", "-agent")]
-    assert out.splitlines()[0].startswith(f"wrote {', '.join(files)}; ")
+    first, heading, sentence, *_ = out.splitlines()
+    assert (first, heading) == (
+        f"wrote {', '.join(files)}",
+        "  left out, because it seems to speak of rewards:",
+    )
+    assert sentence.startswith("    ")
+    assert "reward" in sentence
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(files)
 
 

@@ -19,7 +19,7 @@ from lare.data import replay
 from lare.deploy import onnx
 from lare.errors import pip_install
 from lare.latent.function import verified
-from lare.tasks.env import in_units
+from lare.tasks.env import env_action
 from lare.tasks.spec import read_task
 from lare.training import learner as common
 from lare.training import on_policy
@@ -169,7 +169,7 @@ def check_policy(exported, config, actor):
         logits = jax.vmap(lambda one, *given: one.policy.logits(ppo.shown(given[0], one.observations), given[1]))
         wanted["logits"] = np.asarray(logits(actor, shown, available[None]))[0]
     action = np.asarray(action)[0]
-    wanted["action"] = np.argmax(action, axis=-1) if env.discrete else in_units(action, env)
+    wanted["action"] = np.argmax(action, axis=-1) if env.discrete else env_action(action, env)
     if env.agents == 1:
         inputs = {name: rows[:, 0] for name, rows in inputs.items()}
         wanted = {name: rows[:, 0] for name, rows in wanted.items()}
@@ -181,7 +181,7 @@ def check_reward(exported, name, config, steps, wanted, place):
     action = np.asarray(steps.before["action"]) if "action" in steps.before else None
     inputs = {"length": np.asarray(steps.length, np.float32), "alive": np.asarray(common.alive(steps, config))}
     if action is not None:
-        inputs["action"] = action if env.discrete else in_units(np.clip(action, -1, 1), env)
+        inputs["action"] = action if env.discrete else env_action(np.clip(action, -1, 1), env)
     for side, columns in (("before", steps.before), ("after", steps.after)):
         shown = columns.get("state" if config.of_state else "observation")
         inputs |= {} if shown is None else {side: np.asarray(shown)}

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 
 from hosts import Host
 from jax_toys import Echo
-from lare.tasks.env import EnvSpec, HostEnv, JaxEnv, Team, in_units, team_mean
+from lare.tasks.env import EnvSpec, HostEnv, JaxEnv, Team, env_action, team_mean
 from lare.tasks.gymnasium import GymnasiumEnv
 from lare.tasks.on_host import OnHost
 from lare.tasks.particles.env import ParticleJaxEnv
@@ -66,8 +66,8 @@ def test_the_mean_and_the_units_are_the_same_when_compiled():
     values, alive, team = np.array([[1, 0, 8]], np.float32), np.array([[True, False, True]]), Team("all", 0, 3)
     assert jax.jit(lambda values, alive: team_mean(values, alive, team))(values, alive).tolist() == [4.5]
     action = np.array([[0.1, 0.3, 0.2], [0.5, -1, 0]], np.float32)
-    rows = jax.jit(lambda action: in_units(action, CHOICES))(action)
-    np.testing.assert_array_equal(rows, in_units(action, CHOICES))
+    rows = jax.jit(lambda action: env_action(action, CHOICES))(action)
+    np.testing.assert_array_equal(rows, env_action(action, CHOICES))
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_the_mean_and_the_units_are_the_same_when_compiled():
     ],
 )
 def test_a_choice_is_the_largest_number_and_the_first_of_equals(action, row):
-    taken = in_units(np.array([action, [0, 0, 1]], np.float32), CHOICES)
+    taken = env_action(np.array([action, [0, 0, 1]], np.float32), CHOICES)
     np.testing.assert_array_equal(taken, [row, [0, 0, 1]])
     assert taken.dtype == np.float32
 
@@ -91,8 +91,8 @@ def test_every_agent_has_bounds_of_its_own():
     spec = EnvSpec((Team("agent", 0, 2),), 1, 2, discrete=False, max_steps=1, low=low, high=high)
     action = np.array([[[-1, -1], [1, 1]], [[0, 0.5], [-0.5, 0]], [[-9, 9], [9, -9]]], np.float32)
     taken = [[[-1, 0], [20, 10]], [[0, 3], [12.5, 10]], [[-1, 4], [20, 10]]]
-    np.testing.assert_array_equal(in_units(action, spec), taken)
-    np.testing.assert_allclose(in_units(jnp.array(action), spec), taken, rtol=1e-6)
+    np.testing.assert_array_equal(env_action(action, spec), taken)
+    np.testing.assert_allclose(env_action(jnp.array(action), spec), taken, rtol=1e-6)
 
 
 def test_agents_are_counted_over_all_teams():

@@ -100,7 +100,11 @@ def test_whatever_speaks_of_rewards_is_left_out(tmp_path):
     )
     assert task.observation == "2 entries.\nA target.\nIt returns nothing."
     assert task.action == "1 entry, between -2 and 2.\n1: The second row; -"
-    assert drafted.left_out == 3
+    assert drafted.left_out == (
+        "You get a reward of 1 for each catch.",
+        "Num: Action; Reward",
+        '0: guess a \\o/ """; no cost',
+    )
     assert "3 sentences or rows" in drafted.toml
 
 
@@ -223,7 +227,12 @@ def test_agents_of_one_kind(tmp_path):
     assert task.description.endswith("agents must learn to cover all the landmarks while avoiding collisions.")
     assert task.observation.startswith("18 entries.\nAgent observations: [self_vel, self_pos")
     assert task.action.startswith("5 entries, all 0 but one: the action that is taken.\nAgent action space: [no_action")
-    assert drafted.left_out == 3
+    first, *_, last = drafted.left_out
+    assert first.startswith("More specifically, all agents are globally rewarded based on how far")
+    assert (last, len(drafted.left_out)) == (
+        "The relative weights of these rewards can be controlled with the local_ratio parameter.",
+        3,
+    )
     assert "\n# arguments = { N = 3, local_ratio = 0.5, max_cycles = 25, " in drafted.toml
 
 

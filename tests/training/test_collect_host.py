@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import lare
 from jax_toys import Echo, echo_spec
-from lare.tasks.env import EnvSpec, Team, in_units
+from lare.tasks.env import EnvSpec, Team, env_action
 from lare.tasks.environment import EnvironmentFault
 from lare.tasks.gymnasium import GymnasiumEnv
 from lare.tasks.on_host import OnHost
@@ -74,7 +74,7 @@ def spec_with(low, high):
 def test_actions_are_rescaled():
     spec = spec_with(np.float32([-0.4, 0]), np.float32([0.4, 10]))
     for action, want in (([-1, 1], [-0.4, 10]), ([0, 0], [0, 5]), ([-3, 1.5], [-0.4, 10])):
-        np.testing.assert_allclose(in_units(np.float32([action]), spec), [want])
+        np.testing.assert_allclose(env_action(np.float32([action]), spec), [want])
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -84,7 +84,7 @@ def test_actions_are_within_their_space_to_the_last_digit(dtype, low, width):
     bounds = np.array(low, dtype) / dtype(3), np.array(low, dtype) / dtype(3) + dtype(width)
     space = gymnasium.spaces.Box(*bounds, dtype=dtype)
     for action in (-1, -0.3, 0.99999994, 1):
-        taken = in_units(np.full((1, len(low)), action, np.float32), spec_with(space.low, space.high))[0]
+        taken = env_action(np.full((1, len(low)), action, np.float32), spec_with(space.low, space.high))[0]
         assert space.contains(taken)
 
 

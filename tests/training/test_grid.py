@@ -74,7 +74,7 @@ def test_every_method_trains_and_reports_or_is_refused(method, kind, small, smal
     learner = sessions.load_learner(run)[1]
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((learner.algorithm, learner.credit)))
     assert ("credit/correlation" in lines[-1]) == row.has_proxy
-    assert ("credit/error" in lines[-1]) == row.in_units
+    assert ("credit/error" in lines[-1]) == row.in_reward_units
     assert ("credit/loss" in lines[-1]) == row.descends
     assert "critic/loss" in lines[-1]
     assert (run.directory / "latent_function.py").exists() == row.latent
@@ -110,4 +110,4 @@ def test_methods_where_agents_leave(judged_from, method, small_many, echo, tmp_p
         return
     line = train().metrics()[-1]
     assert np.isfinite(line["critic/loss"])
-    assert ("credit/error" in line) == row.in_units
+    assert ("credit/error" in line) == row.in_reward_units

@@ -55,8 +55,11 @@ def new_task(
     write_new(path, drafted.toml, "--out")
     for name, text in drafted.teams.items():
         write_new(path.parent / name, text, "folder for --out")
-    left_out = f"; {drafted.left_out} sentences or rows that spoke of rewards were left out" if drafted.left_out else ""
-    say(f"wrote {', '.join(map(str, (path, *(path.parent / name for name in drafted.teams))))}{left_out}")
+    say(f"wrote {', '.join(map(str, (path, *(path.parent / name for name in drafted.teams))))}")
+    if drafted.left_out:
+        say("  left out, because it seems to speak of rewards:")
+    for said in drafted.left_out:
+        say(f"    {said}")
     for key in drafted.missing:
         say(f"  fill in: {key} ({'the log' if drafted.of_logs else 'the environment'} does not document it)")
     data = f" --data {environment}" if drafted.of_logs else ""

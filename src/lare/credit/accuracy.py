@@ -9,16 +9,16 @@ def metrics(
     reward: Float[Array, " steps"],
     last: Bool[Array, " steps"],
     mask: Bool[Array, " steps"],
-    in_units: bool,
+    in_reward_units: bool,
 ) -> dict[str, Float[Array, ""]]:
     """The accuracy, under the keys of metrics.jsonl.
 
-    The error is included only if proxy rewards are in the unit of the true rewards (`in_units`). All values are NaN if only
+    The error is included only if proxy rewards are in the unit of the true rewards (`in_reward_units`). All values are NaN if only
     the last steps of episodes have paid a reward: the true rewards of single steps are then unknown.
     """
     known = jnp.any((reward != 0) & mask & ~last)
     found = {"credit/correlation": correlation(r_hat, reward, mask)}
-    found |= {"credit/error": mean_error(r_hat, reward, mask)} if in_units else {}
+    found |= {"credit/error": mean_error(r_hat, reward, mask)} if in_reward_units else {}
     return {name: jnp.where(known, value, jnp.nan) for name, value in found.items()}
 
 

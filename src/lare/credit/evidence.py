@@ -165,10 +165,10 @@ def fit(
     most = jnp.stack([jnp.array(rounds), jnp.where(known & (given.free < ENOUGH * len(group)), rounds, 1)])
     of_each = jax.lax.map(lambda one: fixed_point(given, *one), (*starts, most))
     found = jax.tree.map(lambda leaf: leaf[jnp.argmax(jnp.nan_to_num(of_each.log_evidence, nan=-jnp.inf))], of_each)
-    return in_units(sums, form, given, found, otherwise=start)
+    return in_return_units(sums, form, given, found, otherwise=start)
 
 
-def in_units(
+def in_return_units(
     sums: Sums, form: Int[Array, ""] | int, given: Problem, found: Posterior, otherwise: Posterior
 ) -> Posterior:
     """A fixed point with weights in the unit of y, and b = y' - mu . m'. With fewer than two episodes, or if all returns are

@@ -108,7 +108,7 @@ class Method:
         return self.reward not in (Reward.TRUE, Reward.EPISODIC)
 
     @property
-    def in_units(self) -> bool:
+    def in_reward_units(self) -> bool:
         """Whether its rewards are in the unit of the true ones: they are fitted to add up to returns."""
         return self.reward is Reward.PROXY
 

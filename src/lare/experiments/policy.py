@@ -10,13 +10,14 @@ from jaxtyping import Float
 
 from lare.errors import LareError
 from lare.run.directory import Run, as_run
-from lare.tasks.env import in_units
+from lare.tasks.env import env_action
 from lare.tasks.gymnasium import GymnasiumEnv
 from lare.tasks.spaces import OneHot
 from lare.tasks.table import env_spec
+from lare.training.collect_host import evaluation_action
 from lare.training.compiled import compiled, new_memory
 from lare.training.session import load_actor
-from lare.training.streams import Stream, generator, host_noise
+from lare.training.streams import Stream, generator
 
 
 class Policy:
@@ -32,8 +33,7 @@ class Policy:
             raise LareError(f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy")
         self.config, actors, _ = load_actor(run, best)
         self.actor = jax.tree.map(lambda leaf: leaf[place : place + 1], actors)
-        functions = compiled(self.config)
-        self.act = functions.act if self.config.greedy else functions.explore
+        self.functions = compiled(self.config)
         self.random = generator(run.seeds[place], Stream.EVALUATION_NOISE, 0)
         self.choices = choices(run) if self.env.discrete else None
         self.reset()
@@ -49,7 +49,7 @@ class Policy:
             LareError: observations are of another size, or a policy that remembers its episode is given a batch.
         """
         rows, single = self.rows(observation)
-        found = self.in_units(rows)
+        found = self.actions(rows)
         if self.choices is not None:
             numbers = [self.choices.number(row) for row in found]
             return numbers[0] if single else np.array(numbers)
@@ -57,9 +57,9 @@ class Policy:
 
     def row(self, observation: Any) -> Float[np.ndarray, " action"]:
         """The action for one observation in the environment's units; for a choice, a one-hot row."""
-        return self.in_units(self.rows(observation)[0])[0]
+        return self.actions(self.rows(observation)[0])[0]
 
-    def in_units(self, rows: Float[np.ndarray, "batch observation"]) -> Float[np.ndarray, "batch action"]:
+    def actions(self, rows: Float[np.ndarray, "batch observation"]) -> Float[np.ndarray, "batch action"]:
         """The actions in the environment's units; for a choice, a one-hot row."""
         count, remembers = len(rows), bool(jax.tree.leaves(self.memory))
         if remembers and count > 1:
@@ -68,10 +68,9 @@ class Policy:
             )
         memory = self.memory if remembers else new_memory(self.config, 1, count)
         available, new = np.ones((1, count, 1, self.env.action_size), bool), np.zeros((1, count), bool)
-        shape = (1, count, 1, self.config.noise_size)
-        noise = None if self.config.greedy else host_noise(self.random, self.config.noise, shape)
-        action, self.memory = self.act(self.actor, memory, rows[None, :, None], available, noise, new)
-        return in_units(np.asarray(action)[0, :, 0], self.env)
+        given = memory, rows[None, :, None], available, new
+        action, self.memory = evaluation_action(self.functions, self.config, self.actor, *given, [self.random])
+        return env_action(action[0, :, 0], self.env)
 
     def rows(self, given: Any) -> tuple[Float[np.ndarray, "batch observation"], bool]:
         """Observations as rows, and whether a single one was given."""

@@ -172,7 +172,7 @@ def relabel(
         written = logs.write(out, pay(credit, logs, hold_out, seed, tally, seen, told), overwrite, about)
     finally:
         credit.close()
-    r2 = tally.r2() if credit.config.method.in_units else math.nan
+    r2 = tally.r2() if credit.config.method.in_reward_units else math.nan
     counted = tally.episodes, tally.steps, tally.cut, len(tally.returns)
     return Relabelled(written, name, *counted, r2, tally.correlation(), explanation)
 

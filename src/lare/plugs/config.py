@@ -175,7 +175,7 @@ def check(config: CreditConfig) -> None:
         raise LareError(f"{name} assigns credit among agents, and agents = 1")
     if config.agents > 1 and config.max_steps is None:
         raise LareError("many agents need max_steps, the steps of the longest episode")
-    if config.scale_rewards and not method.in_units:
+    if config.scale_rewards and not method.in_reward_units:
         raise LareError(f"scale_rewards divides by the size of returns, and rewards of {name} are not in their unit")
     if method.fit is Fit.EVIDENCE and not method.latent and config.entries > MOST_ENTRIES:
         raise LareError(

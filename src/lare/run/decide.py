@@ -54,7 +54,7 @@ def check_method(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> No
     method, many = find_method(resolved.method), env.agents > 1
     if method.reward is Reward.DESIGNED and resolved.judged_by(task) == "both":
         raise LareError(f"{method.name} is one reward a step: it judges the observation before or after, not both")
-    if resolved.scale_rewards and method.has_proxy and not method.in_units:
+    if resolved.scale_rewards and method.has_proxy and not method.in_reward_units:
         raise LareError(
             f"scale_rewards divides by the size of returns, and the rewards of {method.name} are not in their unit"
         )

@@ -104,7 +104,7 @@ def alive_mean(
     return (values * alive).sum(axis=-1) / array_module(values).maximum(alive.sum(axis=-1), 1)
 
 
-def in_units(action: Float[Numbers, "*batch agents action"], spec: EnvSpec) -> Float[Numbers, "*batch agents action"]:
+def env_action(action: Float[Numbers, "*batch agents action"], spec: EnvSpec) -> Float[Numbers, "*batch agents action"]:
     """Scale a continuous action from [-1, 1], after clipping, to the environment's units. Encode a discrete one by its argmax."""
     numpy = array_module(action)
     if spec.discrete:

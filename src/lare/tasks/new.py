@@ -2,7 +2,7 @@
 
 import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import gymnasium
@@ -54,8 +54,8 @@ class Draft:
     toml: str
     missing: tuple[str, ...]
     """The keys that must be filled in."""
-    left_out: int
-    """The number of sentences and table rows that were left out because they mention rewards."""
+    left_out: tuple[str, ...]
+    """The sentences and table rows that were left out, or cut short, because they mention rewards."""
     teams: dict[str, str] = field(default_factory=dict)
     """The specs of the teams, by the file names that the spec refers to."""
     of_logs: bool = False
@@ -86,7 +86,8 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
     sections = documented(environment.unwrapped)
     raw = environment.unwrapped
     observation_size, action_size = environment.observation_space.shape[0], environment.action_space.shape[0]  # type: ignore[index]
-    texts, left_out = {}, 0
+    texts: dict[str, str] = {}
+    left_out: tuple[str, ...] = ()
     for key, names in (
         ("description", ("description", "")),
         ("observation", ("observation space", "observation")),
@@ -128,10 +129,11 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
     return Draft(name, "\n".join(lines) + "\n", missing, left_out)
 
 
-def warning(left_out: int, origin: str = "the documentation of the environment") -> list[str]:
+def warning(left_out: Sequence[str], origin: str = "the documentation of the environment") -> list[str]:
     return [
         f"# A first draft, from {origin}. Read it before you use it: a language model will",
-        f"# know only these texts. Left out on purpose: {left_out} sentences or rows with words such as reward, cost or score.",
+        "# know only these texts. Left out on purpose: "
+        f"{len(left_out)} sentences or rows with words such as reward, cost or score.",
         "# Take out anything else that reveals the reward. Describe the goal, not how it is rewarded.",
     ]
 
@@ -146,7 +148,7 @@ def bodies(texts: Mapping[str, str], heads: Mapping[str, str]) -> list[str]:
 
 
 def documented(environment: gymnasium.Env) -> dict[str, str]:
-    """The sections of an environment's documentation."""
+    """The sections of an environment's documentation, which is the docstring of its class."""
     # Not inspect.getdoc: it would return the docstring of a base class, which does not describe this environment.
     return sections_of(type(environment).__doc__ or "")
 
@@ -194,10 +196,11 @@ def row(line: str) -> str:
     return f"{cells[0]}: {'; '.join(cells[1:])}" if len(cells) > 1 else cells[0]
 
 
-def without_rewards(lines: list[str]) -> tuple[str, int]:
-    """The lines without everything that mentions rewards, and the number of lines that did."""
+def without_rewards(lines: list[str]) -> tuple[str, tuple[str, ...]]:
+    """The lines without everything that mentions rewards, and the lines that did."""
     kept = [without_clause(line) for line in lines]
-    return "\n".join(line for line in kept if line), sum(line != was for line, was in zip(kept, lines, strict=True))
+    said = tuple(line for line, rest in zip(lines, kept, strict=True) if line != rest)
+    return "\n".join(line for line in kept if line), said
 
 
 def without_clause(line: str) -> str:

@@ -94,8 +94,8 @@ def patterns(name: str) -> tuple[str, ...]:
     return (name, f"{name}_[0-9]*", f"{name}[0-9]*")
 
 
-def documented(environment: Any) -> tuple[dict[str, str], int]:
-    """Texts by their keys, and how many lines were left out. The documentation is that of the class or of its module."""
+def documented(environment: Any) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Texts by their keys, and the lines that were left out. The documentation is that of the class or of its module."""
     own = type(environment)
     module = sys.modules.get(own.__module__)
     sections = sections_of(max(vars(own).get("__doc__") or "", getattr(module, "__doc__", None) or "", key=len))
@@ -106,7 +106,8 @@ def documented(environment: Any) -> tuple[dict[str, str], int]:
         names = (f"{key} space", key, f"{key}s")
         section = next((sections[name] for name in names if sections.get(name, "").strip()), "")
         found[key] = plain(section) or [line for line in about if re.search(rf"\b{key}s?( space)?: ", line)]
-    texts, left_out = {}, 0
+    texts: dict[str, str] = {}
+    left_out: tuple[str, ...] = ()
     for key, lines in found.items():
         texts[key], dropped = without_rewards(lines)
         left_out += dropped
@@ -121,7 +122,12 @@ def rows_out(text: str) -> str:
 
 
 def write_team(
-    environment_id: str, host: ParallelHost, team: Team, texts: dict[str, str], left_out: int, sizes: Sequence[str]
+    environment_id: str,
+    host: ParallelHost,
+    team: Team,
+    texts: dict[str, str],
+    left_out: Sequence[str],
+    sizes: Sequence[str],
 ) -> str:
     own = dict(texts)
     others = {other.name for other in host.spec.teams} - {team.name}

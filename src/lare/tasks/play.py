@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lare.tasks.env import EnvSpec, HostEnv, Team, Timestep, in_units, team_mean
+from lare.tasks.env import EnvSpec, HostEnv, Team, Timestep, env_action, team_mean
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import make_host_env
 
@@ -86,4 +86,4 @@ def steps_of(
 def random_action(spec: EnvSpec, shown: Timestep, random: np.random.Generator) -> Float[np.ndarray, "agents action"]:
     """A random action: uniform within the bounds, or over the available choices of each agent."""
     drawn = random.uniform(-1, 1, (spec.agents, spec.action_size)).astype(np.float32)
-    return in_units(np.where(shown.available, drawn, -np.inf) if spec.discrete else drawn, spec)
+    return env_action(np.where(shown.available, drawn, -np.inf) if spec.discrete else drawn, spec)

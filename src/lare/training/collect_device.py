@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Key
 
 from lare.data.trajectory import Trajectory
-from lare.tasks.env import JaxEnv, Timestep, in_units, team_mean
+from lare.tasks.env import JaxEnv, Timestep, env_action, team_mean
 from lare.training.compiled import acting, new_memory
 from lare.training.config import TrainConfig
 from lare.training.evaluation import Evaluation
@@ -73,7 +73,7 @@ def step(
         noise = jax.vmap(lambda key: device_noise(key, config.noise, shape))(noise_keys)
     before = worlds.shown
     action, memory = act(actor, worlds.memory, before.observation, before.available, noise, worlds.new)
-    taken = action if config.env.discrete else in_units(action, config.env)
+    taken = action if config.env.discrete else env_action(action, config.env)
     state, after = on_all(env.step)(worlds.state, taken, spread(keys, count))
     return Worlds(state, after, memory, jnp.zeros_like(worlds.new)), Trajectory(before, action, taken, after)
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from lare.data.trajectory import Trajectory
 from lare.errors import LareError
-from lare.tasks.env import EnvSpec, Timestep, in_units, team_mean
+from lare.tasks.env import EnvSpec, Timestep, env_action, team_mean
 from lare.tasks.environment import EnvironmentFault
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import make_host_env
@@ -96,7 +96,7 @@ class HostEpisodes:
         for time, disturbance in enumerate(noise):
             action = act(self.shown, disturbance, self.new)
             check_finite(action, self.seeds)
-            taken = in_units(action, self.spec)
+            taken = env_action(action, self.spec)
             write(steps.before, self.shown, time)
             steps.action[:, time], steps.taken[:, time] = action, taken
             self.step(taken)
@@ -229,16 +229,32 @@ def policy(functions: Compiled, config: TrainConfig, actor: Any, seeds: Sequence
     random = [generator(seed, Stream.EVALUATION_NOISE, 0) for seed in seeds]
 
     def act(shown: Timestep, new: np.ndarray) -> np.ndarray:
-        given = (actor, memory[0], shown.observation, shown.available)
-        if config.greedy:
-            action, memory[0] = functions.act(*given, None, new)
-        else:
-            shape = (episodes, config.env.agents, config.noise_size)
-            noise = np.stack([host_noise(one, config.noise, shape) for one in random])
-            action, memory[0] = functions.explore(*given, noise, new)
-        return np.asarray(action)
+        given = memory[0], shown.observation, shown.available, new
+        action, memory[0] = evaluation_action(functions, config, actor, *given, random)
+        return action
 
     return act
+
+
+def evaluation_action(
+    functions: Compiled,
+    config: TrainConfig,
+    actor: Any,
+    memory: Any,
+    observation: Float[np.ndarray, "seeds envs agents observation"],
+    available: Bool[np.ndarray, "seeds envs agents action"],
+    new: Bool[np.ndarray, "seeds envs"],
+    random: Sequence[np.random.Generator],
+) -> tuple[Float[np.ndarray, "seeds envs agents action"], Any]:
+    """The actions of a policy as in evaluations, where only PPO's are random; and the policy's new memory."""
+    given = actor, memory, observation, available
+    if config.greedy:
+        action, memory = functions.act(*given, None, new)
+    else:
+        shape = (*observation.shape[1:3], config.noise_size)
+        noise = np.stack([host_noise(one, config.noise, shape) for one in random])
+        action, memory = functions.explore(*given, noise, new)
+    return np.asarray(action), memory
 
 
 def shaped(rows: Timestep, shape: tuple[int, ...]) -> Timestep:
@@ -309,7 +325,7 @@ def evaluate(envs: Envs, act: Acting, seeds: Sequence[int], episodes: int, first
             actions = act(shown, new)
             alive = shown.alive.copy()
             check_finite(actions, seeds)
-            rows = in_units(actions, spec)
+            rows = env_action(actions, spec)
             envs.step(rows.reshape(-1, *rows.shape[2:]), running)
             now = running.reshape(shape)
             earned = shown.reward.astype(np.float64) * now[..., None]

@@ -332,7 +332,7 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
             for values in (proxy_rewards(recent, paid, config, place), recent.last[..., None])
         )
         compared = (values.ravel() for values in (r_hat, true, last, mask))
-        found.append(accuracy.metrics(*compared, in_units=config.method.in_units))
+        found.append(accuracy.metrics(*compared, in_reward_units=config.method.in_reward_units))
         if learner.credit:
             found[-1]["credit/return_r2"] = prediction.r2(learner.credit[place].predictions)[0]
     return by_team(found, config)

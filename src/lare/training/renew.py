@@ -18,7 +18,7 @@ from lare.data.sampling import episodes_since, in_order
 from lare.latent.function import LatentFunction
 from lare.latent.improve import Model, improve
 from lare.run.directory import Run
-from lare.tasks.env import Team, Timestep, in_units, team_mean
+from lare.tasks.env import Team, Timestep, env_action, team_mean
 from lare.tasks.play import Episode, rows_of
 from lare.tasks.spec import TaskSpec
 from lare.training.config import TrainConfig
@@ -85,7 +85,7 @@ def as_judged(steps: StoredSteps, length: int, config: TrainConfig, role: TaskSp
         {name: np.asarray(part)[:length] for name, part in one.items()} for one in (steps.before, steps.after)
     )
     shown, led_to = timestep(before), timestep(after)
-    taken = in_units(before["action"], env)
+    taken = env_action(before["action"], env)
     alive = before.get("alive", np.ones((length, env.agents), bool))
     paid = np.asarray(team_mean(before["reward"], alive, team))
     rows, action = rows_of(role, team, shown, taken)
@@ -141,7 +141,7 @@ def factors_again(run: Run, config: TrainConfig, buffer: Replay) -> Float[Array,
                 timestep({name: column[env, at] for name, column in columns.items()})
                 for at in (some, (some + 1) % capacity)
             )
-            taken = in_units(columns["action"][env, some], config.env)
+            taken = env_action(columns["action"][env, some], config.env)
             for place, (function, team) in enumerate(zip(run.functions, config.env.teams, strict=True)):
                 before, action = rows_of(run.config.task, team, shown, taken)
                 after, _ = rows_of(run.config.task, team, led_to, taken)
