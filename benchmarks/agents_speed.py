@@ -51,7 +51,7 @@ def drawn(by_task: Mapping[str, Mapping[str, Any]]) -> str:
     for task, x, y in zip(by_task, agents, median, strict=True):
         axes.annotate(task, (x, y), (6, -12), textcoords="offset points")
     axes.set(xlabel="agents", ylabel="minutes for 2.05 million steps", xlim=(0, 33), ylim=(0, None))
-    return figures.svg(figure)
+    return figures.on_white(figures.svg(figure))
 
 
 def main(rounds: int = 3) -> None:

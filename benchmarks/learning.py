@@ -135,7 +135,7 @@ def table() -> None:
         if curves:
             picture = Path(__file__).parents[1] / "docs" / "pictures" / f"{task}.svg"
             picture.parent.mkdir(exist_ok=True)
-            picture.write_text(figures.curves(curves, "true return") + "\n")
+            picture.write_text(figures.on_white(figures.curves(curves, "true return")) + "\n")
     for name, of_run in found.items():
         parts = [
             f"{key.split('/')[-1]} {value[0]:.3g} ± {value[1]:.2g}"

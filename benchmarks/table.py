@@ -24,7 +24,7 @@ def cell(values: list[float]) -> str:
 
 def usual_names(method: str, algorithm: str) -> tuple[str, ...]:
     """The names that a sweep gives to a run of draw 0; another name says what is different in the run."""
-    return f"{method}-{algorithm}", f"{method}-{algorithm}-draw0"
+    return method, f"{method}-{algorithm}", f"{method}-{algorithm}-draw0"
 
 
 def row(directory: Path, at: int | None) -> str:
@@ -39,10 +39,17 @@ def row(directory: Path, at: int | None) -> str:
     quarter = [sum(values) / len(values) for values in late.values()]
     cells = [cell([line[key] for line in end]), cell(quarter)]
     cells += [cell([line[name] for line in end if line.get(name) is not None]) for name in COLUMNS]
+    task, label = described(directory, config)
+    return f"| {task} | {label} | {last:,} | {' | '.join(cells)} |"
+
+
+def described(directory: Path, config: dict[str, Any]) -> tuple[str, str]:
+    """The task and the label of a run, which may be one of another library (`sbx_learning.py`)."""
+    if "method" not in config["settings"]:
+        return config["task"], f"{config['algorithm']}, true rewards"
     method, algorithm = config["settings"]["method"], config["settings"]["algorithm"]
     apart = "" if directory.name in usual_names(method, algorithm) else f", {directory.name}"
-    label = f"`{method}`, {algorithm}{apart}"
-    return f"| {config['task']['name']} | {label} | {last:,} | {' | '.join(cells)} |"
+    return config["task"]["name"], f"`{method}`, {algorithm}{apart}"
 
 
 def main() -> None:

@@ -1,6 +1,7 @@
 """What pictures show of long episodes."""
 
 import re
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -29,6 +30,18 @@ def test_a_long_legend_makes_the_picture_higher_not_its_curves_smaller():
     )
     assert long[0] == pytest.approx(short[0], rel=0.05)
     assert long[1] > short[1] + 100
+
+
+def test_a_picture_of_a_page_has_a_background():
+    """Readers of a dark page see it too. The rest of the drawing stays the same."""
+    drawn = figures.curves({"a": (np.arange(3.0), np.zeros((1, 3)))}, "return")
+    white = figures.on_white(drawn)
+    root, background, *others = ElementTree.fromstring(white).iter()
+    assert (background.tag.rpartition("}")[2], background.attrib["fill"]) == ("rect", "#ffffff")
+    parts = [root, *others]
+    assert [(part.tag, part.attrib) for part in parts] == [
+        (part.tag, part.attrib) for part in ElementTree.fromstring(drawn).iter()
+    ]
 
 
 def test_panels_share_their_names_and_have_their_titles():

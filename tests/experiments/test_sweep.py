@@ -140,7 +140,11 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(file, monkeypatch):
 
 
 def test_a_whole_sweep_from_the_command_line(command, file, tmp_path):
-    """Processes of their own, a log for each, a table, and a page of statistics."""
+    """Processes of their own, a log for each, a table, and a page of statistics.
+
+    A file in the user's folder does not replace a module of Python's that a process imports.
+    """
+    (tmp_path / "json.py").write_text("raise SystemExit('not this one')")
     file.write_text(FILE.replace("draws = [0, 3]", ""))
     status, out, err = command("sweep", file)
     assert status == 0, err
@@ -256,11 +260,15 @@ def test_how_a_process_ended(file, monkeypatch):
         (("tasks", "task"), "there is no key 'task' (did you mean 'tasks'?); the key 'tasks' is missing"),
         (('"dense"', '"dence"'), "no method 'dence' (did you mean 'dense'?); the methods are "),
         (("tasks = ", "seeds = 3\ntasks = "), "seeds is a setting: put it into the table [settings]"),
+        (
+            ("seeds = 2", "seeds = 2\nprocesses = 2"),
+            "processes is not one of the settings: write it above the table [settings]",
+        ),
         (('["Reacher-v4"]', "[]"), "tasks = []: tuple should have at least 1 item after validation, not 0"),
         (("seeds = 2", "seed = -1"), "seed = -1: input should be greater than or equal to 0"),
         (("steps = 200", "steps = 201"), "steps = 201 is not a multiple of rollout_steps = 50: take 200"),
         (('["Reacher-v4"]', '["Reacher-v5"]'), "no task 'Reacher-v5'"),
-        (("rollout_steps = 50", 'method = "rd"'), "settings = {'steps': 200, "),
+        (("rollout_steps = 50", 'method = "rd"'), "method is not one of the settings: list methods above them"),
         (
             ("[settings]", '[functions]\nReacher = ["phi.py"]\n[settings]'),
             "functions of Reacher, which is none of the tasks Reacher-v4",

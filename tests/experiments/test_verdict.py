@@ -87,6 +87,18 @@ def said(returns, random=CHANCE, **facts):
             ],
         ),
         (
+            FLAT / 100 - 52,
+            {"return_r2": 0.99, "latent": True},
+            [
+                "It got worse than random actions. The return is -51.5 after 8,000 steps; random actions get 0 ± 1.",
+                "Its proxy rewards, from factors and raw features, explain nearly all of the score: R² of the last returns, before "
+                "they were learned from, is 0.99.",
+                "Next: it repeats one behaviour: the last 5 returns of a seed hardly differ, and those of random actions do. More "
+                "`--steps` alone will not change that: another `--algorithm` (`lare algorithms`), or more random steps at first.",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
+            ],
+        ),
+        (
             np.vstack([FLAT - 50, FLAT - 50]),
             {"return_r2": -0.93, "usual_r2": 0.98, "latent": True},
             [

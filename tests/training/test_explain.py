@@ -58,7 +58,8 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             ENTRIES,
             [
                 "The score is taken for an average over the steps of an episode: so far, this predicts returns better than a sum. "
-                'To keep this form, write `score = "average"` into the task file.',
+                'This may change. If you know which of them it is, write `score = "sum"` or `score = "average"` into the task '
+                "file.",
                 "The factors explain 5% of the variation of the returns of 40 episodes.",
                 "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of.",
             ],
@@ -70,7 +71,8 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             [],
             [
                 "The score is taken for a sum over the steps of an episode: so far, this predicts returns better than an average. "
-                'To keep this form, write `score = "sum"` into the task file.',
+                'This may change. If you know which of them it is, write `score = "sum"` or `score = "average"` into the task '
+                "file.",
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
                 SHARES,
                 "- speed: 99%, +1 ± 0.1",

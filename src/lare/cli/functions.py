@@ -172,9 +172,9 @@ def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes:
             say("Does the environment pay, and before its time limit (max_episode_steps)?")
         return
     if math.isfinite(found.r2):
+        shown = f"{found.r2:.3f}" if found.r2 > 0.99 else f"{found.r2:.2f}"
         say(
-            f"Returns of episodes not seen yet, predicted by the factors: R² = {found.r2:.2f} (1: exactly; 0: no better than their "
-            "mean)."
+            f"Returns of episodes not seen yet, predicted by the factors: R² = {shown} (1: exactly; 0: no better than their mean)."
         )
         say(f"Fitted to all {len(episodes)} episodes:")
     for line in found.sentences:

@@ -76,7 +76,8 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
         other = FORMS[1 - FORMS.index(form)]
         said.append(
             f"The score is taken for {WITH_ARTICLE[form]} over the steps of an episode: so far, this predicts returns better than "
-            f'{WITH_ARTICLE[other]}. To keep this form, write `score = "{form}"` into the task file.'
+            f'{WITH_ARTICLE[other]}. This may change. If you know which of them it is, write `score = "sum"` or '
+            '`score = "average"` into the task file.'
         )
     if not factors:
         return [*said, f"Raw features explain {found.by_all:.0%} of the variation of the returns of {count} episodes."]

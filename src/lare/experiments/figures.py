@@ -47,6 +47,12 @@ def svg(figure: Figure) -> str:
     return drawn[drawn.index("<svg") :]
 
 
+def on_white(drawn: str) -> str:
+    """The same drawing on white, for a page that may be dark. (A report draws on its own background.)"""
+    tag, end, rest = drawn.partition(">")
+    return f'{tag}{end}<rect width="100%" height="100%" fill="#ffffff"/>{rest}'
+
+
 def new_figure(rows: int = 1, height: float = 3.4, columns: int = 1) -> tuple[Figure, np.ndarray]:
     """A figure and its axes, row by row. All share x; axes side by side also share y."""
     with matplotlib.rc_context(STYLE):

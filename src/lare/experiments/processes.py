@@ -108,7 +108,7 @@ def in_a_process(job: Job, cores: list[int], running: Running) -> str | None:
     order = json.dumps({"job": as_json(job), "cores": cores})
     with log.open("a", encoding="utf-8") as file:
         said_before = file.tell()
-        command = [sys.executable, "-m", "lare.experiments.processes"]
+        command = [sys.executable, "-P", "-m", "lare.experiments.processes"]
         # In its own session, so that Ctrl-C reaches it only once, through this process.
         process = running.start(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file, text=True, start_new_session=True

@@ -6,7 +6,7 @@ a fixed reference (`REFERENCES`).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import combinations, permutations
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,10 @@ class Group:
 
 
 def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """The runs by label: the method, the algorithm if there are several, and the settings in which runs of a method differ."""
+    """The runs by label: the method, the algorithm if there are several, and the settings in which runs of a method differ.
+
+    Runs with equal labels are told apart by their functions and, if a seed is in two of them, by their directories.
+    """
     plans = [run.config.settings.in_force(run.config.task) for run in runs]
     several = len({plan["algorithm"] for plan in plans}) > 1
     found: dict[str, list[Run]] = {}
@@ -84,7 +87,8 @@ def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
         told = (name for name in plan if name not in IGNORED and any(other[name] != plan[name] for other in alike))
         parts = [plan["method"], *([plan["algorithm"]] if several else []), *(f"{name} {plan[name]}" for name in told)]
         found.setdefault(", ".join(parts), []).append(run)
-    return {name: some for label, of_label in found.items() for name, some in by_function(label, of_label).items()}
+    functions = {name: some for label, of_label in found.items() for name, some in by_function(label, of_label).items()}
+    return {name: some for label, of_label in functions.items() for name, some in by_directory(label, of_label).items()}
 
 
 def by_function(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
@@ -97,6 +101,30 @@ def by_function(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
     for run in runs:
         name = " ".join(digest[:8] for digest in run.config.function_sha256)
         found.setdefault(f"{label}, phi {name}", []).append(run)
+    return found
+
+
+def by_directory(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Runs with the same settings and functions, split if two of them have the same task, draw and seed: two trainings of a method.
+
+    Each part is named after the part of its path in which these two differ.
+    """
+    paths = [run.directory.resolve().parts for run in runs]
+    places = [
+        {(run.config.task.name, run.config.settings.draw, seed) for seed in run.config.settings.all_seeds}
+        for run in runs
+    ]
+    depths = [
+        next((depth for depth, (one, other) in enumerate(zip(*pair, strict=False)) if one != other), None)
+        for pair, (mine, theirs) in zip(combinations(paths, 2), combinations(places, 2), strict=True)
+        if mine & theirs
+    ]
+    if not depths or None in depths:
+        return {label: list(runs)}
+    depth = min(depth for depth in depths if depth is not None)
+    found: dict[str, list[Run]] = {}
+    for run, path in zip(runs, paths, strict=True):
+        found.setdefault(f"{label}, {path[depth]}", []).append(run)
     return found
 
 

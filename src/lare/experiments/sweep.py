@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from lare.algorithms.table import Name
 from lare.credit.methods import find_method
@@ -56,18 +56,18 @@ class Sweep(Share):
     @model_validator(mode="before")
     @classmethod
     def settings_in_their_table(cls, values: Any) -> Any:
-        for name in values.keys() - cls.model_fields.keys() if isinstance(values, Mapping) else ():
+        if not isinstance(values, Mapping):
+            return values
+        for name in values.keys() - cls.model_fields.keys():
             if name in Settings.model_fields:
                 raise ValueError(f"{name} is a setting: put it into the table [settings]")
-        return values
-
-    @field_validator("settings")
-    @classmethod
-    def nothing_twice(cls, settings: dict[str, Any]) -> dict[str, Any]:
-        for name in ("method", "algorithm", "draw"):
-            if name in settings:
+        settings = values.get("settings")
+        for name in settings if isinstance(settings, Mapping) else ():
+            if name in ("method", "algorithm", "draw"):
                 raise ValueError(f"{name} is not one of the settings: list {name}s above them")
-        return settings
+            if name in cls.model_fields:
+                raise ValueError(f"{name} is not one of the settings: write it above the table [settings]")
+        return values
 
 
 def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:

@@ -15,6 +15,10 @@ FEW = 5
 """With fewer evaluations, the verdict says nothing about a trend."""
 
 
+STUCK = 0.05
+"""The returns of a policy that repeats one behaviour differ by less than this part of the deviation of random actions' returns."""
+
+
 @dataclass(frozen=True)
 class Facts:
     """The facts that a verdict is based on."""
@@ -169,6 +173,11 @@ def todo(run: Facts) -> list[str]:
             f"Next: it was better before, {shown(value)} at step {step:,}. `lare evaluate {run.directory} --best` plays the best "
             "policy of each seed."
         )
+    elif is_stuck(run):
+        found.append(
+            f"Next: it repeats one behaviour: the last {FEW} returns of a seed hardly differ, and those of random actions do. More "
+            "`--steps` alone will not change that: another `--algorithm` (`lare algorithms`), or more random steps at first."
+        )
     elif len(run.random) and not better_than_chance(run):
         good = (run.return_r2 or 0) > MOSTLY
         what = "returns are predicted well, so it may depend on the algorithm" if good else "it may need more steps"
@@ -197,6 +206,13 @@ def is_rising(run: Facts) -> bool:
     """Whether the last quarter is higher than the one before by more than evaluations vary."""
     found = quarters(run)
     return found is not None and found[1] - found[0] > found[2]
+
+
+def is_stuck(run: Facts) -> bool:
+    """Whether no seed's return changes any more, compared with those of random actions, and they are no better than these."""
+    if not len(run.random) or run.returns.shape[1] < FEW or better_than_chance(run):
+        return False
+    return bool(np.all(np.ptp(run.returns[:, -FEW:], axis=1) < STUCK * deviation(run.random)))
 
 
 def fell_from(run: Facts) -> tuple[int, float] | None:

@@ -88,6 +88,10 @@ def test_runs():
     assert message("runs", trial(failing("output array is read-only"))) == (
         "E-RUN line 7: ValueError: output array is read-only (the inputs cannot be written into: copy them first)"
     )
+    ambiguous = "The truth value of an array with more than one element is ambiguous. Use a.any() or a.all()"
+    assert message("runs", trial(failing(ambiguous))) == (
+        f"E-RUN line 7: ValueError: {ambiguous} (a condition may hold for some rows only: use np.where instead of if)"
+    )
 
 
 WANTED = "factor {} must be an array of shape (batch_size, 1) = (256, 1), but is {}"

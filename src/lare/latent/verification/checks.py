@@ -20,6 +20,12 @@ from lare.latent.sandbox.worker import MOST_FACTORS
 FEW, MANY = 64, 1031
 """Two batch sizes for which a program must do the same work. The second is a prime, so that no other size divides it."""
 
+HINTS = {
+    "read-only": " (the inputs cannot be written into: copy them first)",
+    "truth value of an array": " (a condition may hold for some rows only: use np.where instead of if)",
+}
+"""What helps against an error, by words of its message."""
+
 SLOWEST = 1.0
 """The most seconds for a batch of at most `ROWS` rows."""
 
@@ -158,7 +164,7 @@ def runs(trial: Trial) -> None:
     in_time(trial, len(trial.observation))
     returned = trial.program.call(trial.observation, trial.action)
     if returned.error is not None:
-        hint = " (the inputs cannot be written into: copy them first)" if "read-only" in returned.error else ""
+        hint = next((hint for words, hint in HINTS.items() if words in returned.error), "")
         raise failed("E-RUN", returned.error + hint, returned.line)
 
 
