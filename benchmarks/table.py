@@ -2,7 +2,8 @@
 
     python benchmarks/table.py [--at STEPS] DIRECTORY ...
 
-A DIRECTORY is a run, or contains runs at any depth (`benchmarks/results/sweeps/closed-form`).
+A DIRECTORY is a run, or contains runs at any depth (`benchmarks/results/sweeps/closed-form`). With many agents, returns are the sum
+over the agents, as in the paper, and the row says so.
 """
 
 import argparse
@@ -40,6 +41,7 @@ def row(directory: Path, at: int | None) -> str:
     cells = [cell([line[key] for line in end]), cell(quarter)]
     cells += [cell([line[name] for line in end if line.get(name) is not None]) for name in COLUMNS]
     task, label = described(directory, config)
+    label += ", sum over the agents" if key == "evaluation/summed_return" else ""
     return f"| {task} | {label} | {last:,} | {' | '.join(cells)} |"
 
 

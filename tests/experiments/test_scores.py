@@ -116,9 +116,9 @@ def test_what_the_task_says_anyway_makes_no_other_method(made):
 def test_settings_in_which_runs_differ_are_named(made):
     settings = [{"td3": {"warmup": 10}}, {"td3": {"warmup": 20}, "method": "rd"}, {"algorithm": "ddpg"}]
     runs = [made(str(place), [1.0], **given) for place, given in enumerate(settings)]
-    assert differing(runs) == ["td3.warmup (10, 20)"]
+    assert differing(runs) == ["td3.warmup (10: dense; 20: rd)"]
     remarks = find_all([run.directory for run in runs[:2]], RETURN)[1]
-    assert remarks == ["the runs also differ in td3.warmup (10, 20)"]
+    assert remarks == ["the runs also differ in td3.warmup (10: dense; 20: rd)"]
     assert differing(runs[1:]) == []
 
 

@@ -133,16 +133,20 @@ IGNORED = {"seed", "seeds", "draw", "steps", "evaluate_every", "evaluation_episo
 
 
 def differing(runs: Sequence[Run]) -> list[str]:
-    """The settings, beside the methods, in which runs of one algorithm differ, with their values."""
-    found: dict[str, dict[str, None]] = {}  # the values of each setting, in order
+    """The settings, beside the methods, in which runs of one algorithm differ, with their values and the methods that have them."""
+    found: dict[str, dict[str, dict[str, None]]] = {}  # setting, value, method, in order
     plans = [run.config.settings.in_force(run.config.task) for run in runs]
     for plan, other in permutations(plans, 2):
         if other["algorithm"] != plan["algorithm"]:
             continue
         for name in plan.keys() & other.keys() - IGNORED - {"method"}:
             if plan[name] != other[name]:
-                found.setdefault(name, {})[str(plan[name])] = None
-    return [f"{name} ({', '.join(values)})" for name, values in sorted(found.items())]
+                found.setdefault(name, {}).setdefault(str(plan[name]), {})[plan["method"]] = None
+    told = {
+        name: "; ".join(f"{value}: {', '.join(methods)}" for value, methods in values.items())
+        for name, values in found.items()
+    }
+    return [f"{name} ({values})" for name, values in sorted(told.items())]
 
 
 def grouped(runs: Mapping[str, Sequence[Run | Measured]], key: str) -> tuple[list[Group], tuple[str, ...]]:
