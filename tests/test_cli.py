@@ -242,7 +242,7 @@ def test_a_new_task_of_two_teams_is_three_files(command, tmp_path):
     first, heading, sentence, *_ = out.splitlines()
     assert (first, heading) == (
         f"wrote {', '.join(files)}",
-        "  left out, because it seems to speak of rewards:",
+        "  left out or cut short, because it seems to speak of rewards:",
     )
     assert sentence.startswith("    ")
     assert "reward" in sentence

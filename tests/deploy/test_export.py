@@ -204,6 +204,20 @@ def check_reward(exported, name, config, steps, wanted, place):
         there = np.asarray(common.alive(steps, config))[:, team.agents]
         wanted = np.where(there, wanted, exported.load(name)(**given)["r_hat"])
     same(exported, name, inputs, {"r_hat": wanted})
+    if env.discrete and not config.of_state and {"before", "action", "after"} <= inputs.keys():
+        of_numbers(exported, name, inputs, env.action_size)
+
+
+def of_numbers(exported, name, inputs, count):
+    """A choice may also be given as its number."""
+    more = {key: inputs[key] for key in ("length", "alive") if key in exported.described(name)["inputs"]}
+    steps = {key: inputs[key] for key in ("before", "action", "after")}
+    number = np.argmax(steps["action"], axis=-1)
+    found = exported.reward(**{**steps, "action": number}, name=name, **more)
+    np.testing.assert_array_equal(found, exported.reward(**steps, name=name, **more))
+    for wrong in (number - count, number + 0.5):
+        with pytest.raises(ValueError, match=f"an action is a number from 0 to {count - 1}, or a one-hot row"):
+            exported.reward(**{**steps, "action": wrong}, name=name, **more)
 
 
 @pytest.fixture

@@ -19,6 +19,19 @@ def test_steps_are_from_all_over_the_log(task, judges):
     assert {row.tobytes() for row in observation} <= {row.tobytes() for row in every}
 
 
+def test_both_observations_of_a_step_are_shown_if_both_are_judged(task):
+    episodes = list(logged(40))
+    observation, action = lare.logged_steps(episodes, task.model_copy(update={"judges": "both"}))
+    assert (observation.shape, action.shape) == ((256, 2), (256, 1))
+    first, second = np.split(observation, 2)
+    every = np.concatenate([one["observations"] for one in episodes])
+    starts = {one["observations"][0].tobytes() for one in episodes}
+    ends = {one["observations"][-1].tobytes() for one in episodes}
+    assert {row.tobytes() for row in observation} <= {row.tobytes() for row in every}
+    assert not ends & {row.tobytes() for row in first}
+    assert not starts & {row.tobytes() for row in second}
+
+
 @pytest.mark.parametrize(
     ("steps", "message"),
     [

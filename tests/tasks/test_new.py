@@ -106,6 +106,7 @@ def test_whatever_speaks_of_rewards_is_left_out(tmp_path):
         '0: guess a \\o/ """; no cost',
     )
     assert "3 sentences or rows" in drafted.toml
+    assert drafted.unused == ("rewards",)
 
 
 def test_what_is_not_documented_must_be_filled_in(tmp_path):

@@ -57,9 +57,11 @@ def new_task(
         write_new(path.parent / name, text, "folder for --out")
     say(f"wrote {', '.join(map(str, (path, *(path.parent / name for name in drafted.teams))))}")
     if drafted.left_out:
-        say("  left out, because it seems to speak of rewards:")
+        say("  left out or cut short, because it seems to speak of rewards:")
     for said in drafted.left_out:
         say(f"    {said}")
+    if drafted.unused:
+        say(f"  sections of the documentation that were not used: {', '.join(drafted.unused)}")
     for key in drafted.missing:
         say(f"  fill in: {key} ({'the log' if drafted.of_logs else 'the environment'} does not document it)")
     data = f" --data {environment}" if drafted.of_logs else ""

@@ -104,6 +104,8 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
     }
     for name, graph in graphs.items():
         text[name] = described(graph)
+        if name in files and config.env.discrete and not config.of_state:
+            text[name]["choices"] = {"first": start, "count": config.env.action_size}
         if name in apart:
             text[name] |= {"phi": files[name], "judges": judged_states(run.judges, "before", "after")}
         write_arrays(out / f"{name}.npz", graph)

@@ -116,13 +116,27 @@ def as_input(key, given, like):
 def reward(before, action, after, name="reward", **more):
     """The proxy rewards r_hat of steps, (batch, ...): phi and the decoder as one function.
 
-    Observations and actions are (batch, ..., n), in the environment's units; a choice is a one-hot row. `more` holds `length`
-    or `alive`, if `export.json` lists them among the inputs.
+    Observations and actions are (batch, ..., n), in the environment's units; a choice is its number, (batch, ...), or a one-hot
+    row. `more` holds `length` or `alive`, if `export.json` lists them among the inputs.
     """
+    action = one_hot(before, action, described(name).get("choices"))
     given = {"before": before, "action": action, "after": after, **more}
     if "factors" in described(name)["inputs"]:
         given["factors"] = factors(before, action, after, name)
     return load(name)(**{key: given[key] for key in described(name)["inputs"] if key in given})["r_hat"]
+
+
+def one_hot(before, action, choices):
+    """Actions as rows: choices that are given as numbers become one-hot rows."""
+    number = np.asarray(action)
+    if choices is None or number.ndim != np.ndim(before) - 1:
+        return action
+    place, count = number - choices["first"], choices["count"]
+    if number.dtype.kind not in "iu" or np.any((place < 0) | (place >= count)):
+        raise ValueError(
+            f"an action is a number from {choices['first']} to {choices['first'] + count - 1}, or a one-hot row"
+        )
+    return np.eye(count, dtype=np.float32)[place]
 
 
 def factors(before, action, after, name="reward"):

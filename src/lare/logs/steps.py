@@ -9,7 +9,7 @@ import numpy as np
 from lare.latent.verification.verify import STEPS, Steps
 from lare.logs.source import open_logs
 from lare.tasks.play import Episode
-from lare.tasks.spec import TaskSpec, as_task
+from lare.tasks.spec import TaskSpec, as_task, judged_states
 
 EPISODES = 64
 """Steps are taken from so many first episodes."""
@@ -20,8 +20,8 @@ def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = STEPS) -
 
     Args:
         source: as in `relabel`.
-        task: a name, a path, or a spec. It says which observation is judged, the one before or the one after a step; with `both`,
-            the one after is taken.
+        task: a name, a path, or a spec. It says which observation is judged, the one before or the one after a step, or both:
+            half of the rows are then observations before a step.
         count: about how many steps. A shorter log gives fewer.
 
     Returns:
@@ -32,10 +32,12 @@ def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = STEPS) -
     """
     task, parts = as_task(task, playable=False), []
     for episode in itertools.islice(open_logs(source, task).episodes(), EPISODES):
-        observation = episode.before if task.judges == "before" else episode.after
         places = np.unique(np.linspace(0, len(episode) - 1, min(count, len(episode))).astype(int))
-        parts.append((observation[places], episode.action[places]))
-    observation, action = (np.concatenate(part) for part in zip(*parts, strict=True))
+        sides = judged_states(task.judges, episode.before[places], episode.after[places])
+        parts.append([(observation, episode.action[places]) for observation in sides])
+    observation, action = (
+        np.concatenate(part) for part in zip(*itertools.chain(*zip(*parts, strict=True)), strict=True)
+    )
     chosen = np.unique(np.linspace(0, len(action) - 1, min(count, len(action))).astype(int))
     return observation[chosen], action[chosen]
 

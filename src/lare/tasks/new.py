@@ -1,6 +1,7 @@
 """Drafts a spec for any environment: sizes from its spaces, texts from its documentation, without the rewards."""
 
 import inspect
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,6 +39,15 @@ ELSEWHERE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.I
 """References to figures, which are useless outside the original page."""
 
 
+TITLES = {
+    "description": ("", "description"),
+    "observation": ("observation space", "observation"),
+    "action": ("action space", "action"),
+}
+"""The sections that a text is taken from; "" is the text above the first title."""
+ENDINGS = ("episode end", "episode termination")
+"""The sections about the end of an episode."""
+
 WANTED = {
     "description": "what is to be solved, and what the goal is; not a word about the reward",
     "observation": "what each entry of the observation means, with its unit",
@@ -58,6 +68,8 @@ class Draft:
     """The sentences and table rows that were left out, or cut short, because they mention rewards."""
     teams: dict[str, str] = field(default_factory=dict)
     """The specs of the teams, by the file names that the spec refers to."""
+    unused: tuple[str, ...] = ()
+    """The titles of sections of the documentation that no text was taken from."""
     of_logs: bool = False
     """Whether the task has only logs and no environment."""
 
@@ -88,13 +100,10 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
     observation_size, action_size = environment.observation_space.shape[0], environment.action_space.shape[0]  # type: ignore[index]
     texts: dict[str, str] = {}
     left_out: tuple[str, ...] = ()
-    for key, names in (
-        ("description", ("description", "")),
-        ("observation", ("observation space", "observation")),
-        ("action", ("action space", "action")),
-    ):
-        found = next((sections[name] for name in names if sections.get(name, "").strip()), "")
-        texts[key], dropped = without_rewards(plain(found))
+    for key, titles in TITLES.items():
+        found = [sections[title] for title in titles if sections.get(title, "").strip()]
+        # A summary may stand above the description; of other texts, only the first is taken.
+        texts[key], dropped = without_rewards(plain("\n\n".join(found if key == "description" else found[:1])))
         left_out += dropped
     if texts["description"]:
         texts["description"] += ending(sections)
@@ -126,7 +135,9 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
         ),
         *bodies(texts, heads),
     ]
-    return Draft(name, "\n".join(lines) + "\n", missing, left_out)
+    used = {*itertools.chain(*TITLES.values()), *ENDINGS}
+    unused = tuple(title for title, body in sections.items() if title not in used and body.strip())
+    return Draft(name, "\n".join(lines) + "\n", missing, left_out, unused=unused)
 
 
 def warning(left_out: Sequence[str], origin: str = "the documentation of the environment") -> list[str]:
@@ -214,7 +225,7 @@ def without_clause(line: str) -> str:
 
 def ending(sections: dict[str, str]) -> str:
     """How an episode ends, if the documentation describes this without mentioning rewards."""
-    for title in ("episode end", "episode termination"):
+    for title in ENDINGS:
         kept, _ = without_rewards(plain(sections.get(title, "")))
         if kept:
             return "\n" + kept

@@ -16,7 +16,7 @@ from lare.latent.sandbox.jailed import JailedProgram, WorkerFailed
 from lare.latent.verification.checks import LONGEST, SLOWEST_CALL, Check, Failed, Trial, advice, examine, failed
 from lare.llm.prompts import Kind
 from lare.tasks.play import rows_of, steps_of, team_of
-from lare.tasks.spec import TaskSpec, the_role
+from lare.tasks.spec import TaskSpec, judged_states, the_role
 from lare.tasks.table import make_host_env
 
 STEPS = 256
@@ -120,8 +120,8 @@ def tried_on(task: TaskSpec, steps: Steps | None) -> Steps:
 def random_steps(task: TaskSpec, steps: int = STEPS, seed: int = 0) -> Steps:
     """Steps of whole episodes under uniformly random actions (the paper's pre-collected random state-action pairs).
 
-    The task's `judges` selects the observations before or after a step, or both. If more steps were played than requested, the
-    result is evenly spaced among them, from the first to the last.
+    The task's `judges` selects the observations before or after a step, or both: half of the rows are then observations before a
+    step. If more steps were played than requested, the result is evenly spaced among them, from the first to the last.
     """
     return known_steps(task.model_dump_json(), steps, seed)
 
@@ -132,19 +132,21 @@ def known_steps(task: str, steps: int, seed: int) -> Steps:
     role = TaskSpec.model_validate_json(task)
     with contextlib.closing(make_host_env(role)) as env:
         team, random = team_of(role, env.spec), np.random.default_rng(seed)
-        found, count, played = [], 0, 0
+        found: dict[str, list[list[np.ndarray]]] = {side: [] for side in judged_states(role.judges, "before", "after")}
+        count, played = 0, 0
         for number in itertools.count():
             for before, action, after in steps_of(env, None, random, seed + number):
                 acted = slice(None) if role.judged_from == "state" else before.alive[team.agents]
-                for shown in {"before": [before], "after": [after], "both": [before, after]}[role.judges]:
-                    found.append([rows[acted] for rows in rows_of(role, team, shown, action)])
-                    count += len(found[-1][0])
+                for side, rows_so_far in found.items():
+                    shown = before if side == "before" else after
+                    rows_so_far.append([rows[acted] for rows in rows_of(role, team, shown, action)])
+                    count += len(rows_so_far[-1][0])
                 played += 1
                 if played == LONGEST_PLAY:
                     break
             if count >= steps or played >= LONGEST_PLAY:  # at the end of an episode, to try functions on it too
                 break
-    every = [np.concatenate(part).astype(np.float32) for part in zip(*found, strict=True)]
+    every = [np.concatenate(part).astype(np.float32) for part in zip(*itertools.chain(*found.values()), strict=True)]
     if not count:
         raise LareError(f"no agent of {role.name} acted in {played} steps of random actions")
     chosen = np.linspace(0, count - 1, min(steps, count)).astype(int)
