@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 
+import gymnasium
 import pytest
 from PIL import Image
 
@@ -11,7 +12,7 @@ import lare
 from lare.experiments import evaluation, live
 from lare.experiments.evaluation import random_returns
 from lare.experiments.live import LivePage
-from toys import toy_spec
+from toys import Chase, toy_spec
 
 CHROMIUM = next(
     (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
@@ -39,6 +40,30 @@ def test_a_verdict_stands_on_top(runs, tmp_path):
     assert "than training on the return at the end alone gives here" not in verdicts[1][1]
     assert page.index("verdict") < page.index("<table>") < page.index("<svg")
     assert "<code>" in page
+
+
+def at_the_end(**settings):
+    """A chase that pays nothing before its last step."""
+    return lare.EpisodicReward(gymnasium.wrappers.TimeLimit(Chase(**settings), 20))
+
+
+gymnasium.register("toys/ChaseAtTheEnd-v0", entry_point=at_the_end, max_episode_steps=20)
+
+
+def test_nothing_is_shown_that_is_not_known(small, phi, tmp_path):
+    """True rewards of steps are unknown if only the last one is paid: no error, no correlation, no curve of them."""
+    of_true = ("credit error", "Correlation: Pearson", "true reward</text>", "correlation with the true reward")
+    task = toy_spec(environment="toys/ChaseAtTheEnd-v0")
+    run = lare.train(task, small(method="lare-bayes", steps=240), function=phi, out=tmp_path / "run", listeners=[])
+    page = lare.write_report(run, tmp_path / "report.html").read_text()
+    assert "R² of returns" in page
+    assert "proxy reward" in page
+    assert [words for words in of_true if words in page] == []
+    known = lare.train(
+        toy_spec(), small(method="lare-bayes", steps=240), function=phi, out=tmp_path / "known", listeners=[]
+    )
+    page = lare.write_report(known, tmp_path / "known.html").read_text()
+    assert [words for words in of_true if words not in page] == []
 
 
 def test_random_play_is_bounded(monkeypatch):

@@ -30,6 +30,8 @@ class Credit:
     uncertainty: Float[np.ndarray, " steps"] | None
     """Two posterior standard deviations of the proxy reward, for a single agent and a closed-form decoder."""
     factors: Float[np.ndarray, "steps rows factors"]
+    known: bool
+    """Whether the true rewards of single steps are known. They are not if only the last step of an episode is paid."""
     correlations: Float[np.ndarray, " factors"]
     """Pearson's correlation of each factor with the true reward, over the last steps of all seeds. NaN if one of the two never
     varies."""
@@ -60,7 +62,8 @@ def credit_of(run: Run) -> Credit | None:
         uncertainty = 2 * np.asarray(known) / np.where(one.credit[0].average, steps.length, 1)
     factors = np.asarray(steps.before["factors"]) if "factors" in steps.before else np.zeros((len(proxy), 1, 0))
     correlations = factor_correlations(learner, config)
-    return Credit(np.asarray(steps.before["reward"]), np.asarray(proxy), uncertainty, factors, correlations)
+    reward = np.asarray(steps.before["reward"])
+    return Credit(reward, np.asarray(proxy), uncertainty, factors, bool(reward[:-1].any()), correlations)
 
 
 def correlations(

@@ -161,31 +161,37 @@ def window(steps: int) -> slice:
 
 
 def credit(
-    reward: Float[np.ndarray, " steps"],
+    reward: Float[np.ndarray, " steps"] | None,
     proxy: Float[np.ndarray, " steps"],
     uncertainty: Float[np.ndarray, " steps"] | None = None,
 ) -> str:
-    """Proxy and true rewards of an episode: curves over the steps, and a scatter plot with a point for each step."""
+    """Proxy rewards of an episode over the steps.
+
+    If true rewards are known, they are drawn too, and a scatter plot has a point for each step.
+    """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 3.2), layout="constrained")
-        axes, scatter = figure.subplots(1, 2, width_ratios=(2.1, 1))
-    shown = window(len(reward))
+        ratios = (2.1,) if reward is None else (2.1, 1)
+        axes, *scatter = figure.subplots(1, len(ratios), width_ratios=ratios, squeeze=False)[0]
+    shown, known = window(len(proxy)), proxy if reward is None else reward
     x = np.arange(shown.start, shown.stop)
     if uncertainty is not None:
         band = (proxy[shown] - uncertainty[shown], proxy[shown] + uncertainty[shown])
         axes.fill_between(x, *band, color=COLOURS[0], alpha=0.2, linewidth=0)
         # A wide band must not flatten the curves.
-        low, high = (pick(np.append(reward[shown], proxy[shown])) for pick in (np.min, np.max))
+        low, high = (pick(np.append(known[shown], proxy[shown])) for pick in (np.min, np.max))
         if high > low:
             axes.set_ylim(low - (high - low), high + (high - low))
-    axes.plot(x, reward[shown], color="#777777", linewidth=1.8, label="true reward")
+    if reward is not None:
+        axes.plot(x, reward[shown], color="#777777", linewidth=1.8, label="true reward")
     axes.plot(x, proxy[shown], color=COLOURS[0], linewidth=1.2, label="proxy reward")
     axes.set(xlabel="step of the episode", ylabel="reward")
     legend_above(axes)
-    ends = [pick(np.append(reward, proxy)) for pick in (np.min, np.max)]
-    scatter.plot(ends, ends, color="#999999", linewidth=1)
-    scatter.scatter(reward, proxy, color=COLOURS[0], s=6, alpha=0.4, linewidths=0)
-    scatter.set(xlabel="true reward", ylabel="proxy reward")
+    ends = [pick(np.append(known, proxy)) for pick in (np.min, np.max)]
+    for points in scatter:
+        points.plot(ends, ends, color="#999999", linewidth=1)
+        points.scatter(known, proxy, color=COLOURS[0], s=6, alpha=0.4, linewidths=0)
+        points.set(xlabel="true reward", ylabel="proxy reward")
     return svg(figure)
 
 

@@ -53,12 +53,12 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[
 
 
 def factor_table(labels: Iterable[tuple[str, str]], correlations: Iterable[float]) -> str:
-    """Names and meanings of factors, and their correlations with the true reward."""
-    rows = [
-        (name, meaning, "-" if math.isnan(value) else f"{value:.2f}")
-        for (name, meaning), value in zip(labels, correlations, strict=True)
-    ]
-    return table(("factor", "meaning, by the comments in phi", "correlation with the true reward"), rows, (2,))
+    """Names and meanings of factors and, if any is known, their correlations with the true reward."""
+    values, head = list(correlations), ("factor", "meaning, by the comments in phi")
+    if all(map(math.isnan, values)):
+        return table(head, labels)
+    rows = [(*label, "-" if math.isnan(value) else f"{value:.2f}") for label, value in zip(labels, values, strict=True)]
+    return table((*head, "correlation with the true reward"), rows, (2,))
 
 
 def note(text: str) -> str:

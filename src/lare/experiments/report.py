@@ -154,26 +154,32 @@ def at_the_end(run: Run, key: str) -> str:
     return plus_minus(*mean_and_deviation(known)) if len(known) else "-"
 
 
+MEANINGS = {
+    RETURN: ("return", "Return: mean true return at the last evaluation."),
+    ERROR: ("credit error", "Credit error: mean |proxy reward - true reward| over the newest steps."),
+    CORRELATION: ("correlation", "Correlation: Pearson's, of proxy and true rewards over the newest steps."),
+    RETURN_R2: (
+        "R² of returns",
+        "R² of returns: how well the last episodes' returns were predicted before anything was fitted to them.",
+    ),
+}
+"""The columns of the summary, by their metrics: title and meaning."""
+
+
 def summary(runs: Sequence[Run], names: Sequence[str]) -> str:
-    head = ("task", "method", "seeds", "steps", "return", "credit error", "correlation", "R² of returns")
-    rows = [
-        (
-            run.config.task.name,
-            name,
-            str(len(run.seeds)),
-            f"{run.metrics()[-1]['step']:,}",
-            *(at_the_end(run, key) for key in (RETURN, ERROR, CORRELATION, RETURN_R2)),
-        )
+    """A row for each run. A metric that no run has is left out."""
+    ends = {key: [at_the_end(run, key) for run in runs] for key in MEANINGS}
+    shown = [key for key, column in ends.items() if any(cell != "-" for cell in column)]
+    head = "task", "method", "seeds", "steps", *(MEANINGS[key][0] for key in shown)
+    first = [
+        (run.config.task.name, name, str(len(run.seeds)), f"{run.metrics()[-1]['step']:,}")
         for name, run in zip(names, runs, strict=True)
     ]
-    explained = (
-        "Return: mean true return at the last evaluation. Credit error: mean |proxy reward - "
-        "true reward| over the newest steps; correlation: Pearson's, over the same; both only where "
-        "the environment pays before the end of an episode. R² of returns: how well the last episodes' returns were predicted "
-        "before anything was fitted to them."
-        + (" ±: standard deviation over seeds." if max(len(run.seeds) for run in runs) > 1 else "")
-    )
-    return table(head, rows, range(2, 8)) + note(explained)
+    rows = [(*cells, *(ends[key][place] for key in shown)) for place, cells in enumerate(first)]
+    explained = [MEANINGS[key][1] for key in shown]
+    if max(len(run.seeds) for run in runs) > 1:
+        explained.append("±: standard deviation over seeds.")
+    return table(head, rows, range(2, len(head))) + note(" ".join(explained))
 
 
 def learning(task: str, runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> Iterable[str]:
@@ -290,11 +296,11 @@ def one_agent_details(run: Run) -> Iterable[str]:
     credit = credit_of(run)
     if credit is not None:
         yield f"<h3>Credit over one episode ({len(credit.reward)} steps)</h3>"
-        yield figures.credit(credit.reward[:, 0], credit.proxy[:, 0], credit.uncertainty)
+        yield figures.credit(credit.reward[:, 0] if credit.known else None, credit.proxy[:, 0], credit.uncertainty)
         steps = figures.window(len(credit.reward))
         yield note(
             "The last training episode of the first seed, exploration included, judged by the newest decoder: "
-            f"the curves show steps {steps.start} to {steps.stop}, the points all steps. "
+            f"the curve shows steps {steps.start} to {steps.stop}{', the points all steps' if credit.known else ''}. "
             f"Return {credit.reward.sum():.1f}, sum of the proxy rewards {credit.proxy.sum():.1f}."
             + (
                 ""
