@@ -2,11 +2,13 @@
 
     python benchmarks/pairs.py DIRECTORY ... --over DIRECTORY ... [--key KEY] [--late]
 
-The seeds of all runs of a group are put together, so that a group may have runs of one seed at two commits, or a run of another
-library. Scores are those at the last step that all runs share or, with `--late`, means over the last quarter of these steps.
+A DIRECTORY is a run, or a .jsonl file of `plugs_sb3.py`. The seeds of all runs of a group are put together, so that a group may
+have runs of one seed at two commits, or a run of another library. Scores are those at the last step that all runs share or, with
+`--late`, means over the last quarter of these steps.
 """
 
 import argparse
+import json
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +19,13 @@ from learning import mean_and_spread, read
 
 def curves(directory: Path, key: str) -> list[dict[int, float]]:
     """For each seed of a run: step and value."""
+    lines = (
+        [json.loads(line) for line in directory.read_text().splitlines()[1:]]
+        if directory.is_file()
+        else read(directory)[1]
+    )
     found: dict[int, dict[int, float]] = {}
-    for line in read(directory)[1]:
+    for line in lines:
         found.setdefault(line["seed"], {})[line["step"]] = line[key]
     return list(found.values())
 

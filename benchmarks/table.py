@@ -64,8 +64,11 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|")
     for directory in given.directories:
-        for metrics in sorted(directory.rglob("metrics.jsonl")):
-            print(row(metrics.parent, given.at))
+        runs = sorted(metrics.parent for metrics in directory.rglob("metrics.jsonl"))
+        if not runs:
+            parser.error(f"there is no run in {directory}")
+        for run in runs:
+            print(row(run, given.at))
 
 
 if __name__ == "__main__":

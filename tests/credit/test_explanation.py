@@ -91,3 +91,22 @@ def test_the_shares_of_the_factors_add_up_to_what_they_explain(noise):
     found = explain(summed(basis, np.array([2.0, -1.0, 0.5, 1.0, 0]), count=30, noise=noise), 0, basis)
     assert 0 < float(found.by_factors) < 1
     assert float(found.share.sum()) == pytest.approx(float(found.by_factors))
+
+
+def test_a_factor_that_offsets_another_has_a_share_below_0():
+    """A cost that grows with the gain: its share is -Cov(cost, return) / Var(return), and that of the gain is above 1."""
+    basis, random = Basis(2, 0, extended=False), np.random.default_rng(3)
+    gain = random.normal(size=200)
+    means = np.stack([gain, 0.8 * gain + 0.3 * random.normal(size=200)], axis=1)
+    returns, length = means @ [2.0, -1.0], np.full(200, 20)
+    sums = evidence.add_episodes(
+        evidence.no_sums(2), jnp.asarray(means), jnp.asarray(20 * returns), jnp.asarray(length)
+    )
+    found = explain(sums, 0, basis)
+    np.testing.assert_allclose(found.weight, [2, -1], rtol=1e-3)
+    want = [
+        weight * np.cov(column, returns)[0, 1] / returns.var(ddof=1)
+        for weight, column in zip([2, -1], means.T, strict=True)
+    ]
+    assert want[1] < -0.3
+    np.testing.assert_allclose(found.share, want, rtol=1e-2)

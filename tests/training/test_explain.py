@@ -28,8 +28,8 @@ def found(**changes):
 
 
 SHARES = (
-    "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes), and by "
-    "how much a step's reward rises with one standard deviation of it:"
+    "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes; below "
+    "0%: it offsets others), and by how much a step's reward rises with one standard deviation of it:"
 )
 FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
 
@@ -65,7 +65,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             ],
         ),
         (
-            found(by_factors=0.99, by_all=0.99, share=np.array([0.99, 0.001])),
+            found(by_factors=0.99, by_all=0.99, share=np.array([0.99, -0.001])),
             "sum",
             FACTORS,
             [],

@@ -6,9 +6,9 @@ beta of the noise of a step, a fit explains the share
     1 - (1 / beta) / (q / (N - 1))
 
 of the variation. This is an R^2 that is corrected for the degrees of freedom of the fit. A factor's part of this share is
-proportional to the covariance of its features with the prediction, the sum of their mu_i (S mu)_i, or 0 if that is negative. The
-parts of all factors add up to the share. The correlation of the residual of a fit on the factors alone with the mean of raw
-entry j over an episode is
+proportional to the covariance of its features with the prediction, the sum of their mu_i (S mu)_i. The parts of all factors add
+up to the share. A part is negative if the factor offsets others: if it pays less in episodes in which they pay more. The
+correlation of the residual of a fit on the factors alone with the mean of raw entry j over an episode is
 
     (p - S mu)_j / sqrt(S_jj (q - 2 mu . p + mu . S mu))
 """
@@ -41,7 +41,8 @@ class Explanation(NamedTuple):
     deviation: Float[Array, " factors"]
     """Posterior deviation of `weight`."""
     share: Float[Array, " factors"]
-    """Share of the returns' variation that each factor explains, with its shapes and half of its pairs."""
+    """Share of the returns' variation that each factor explains, with its shapes and half of its pairs; below 0 if it offsets
+    others."""
     left: Float[Array, " entries"]
     """Correlation of each raw entry with the residual of the fit on factors; 0 for an entry that has never varied."""
 
@@ -62,8 +63,8 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     unit = jnp.where(given.unit > 0, given.unit, 1)
     part = fitted.weight / unit * (given.s @ (fitted.weight / unit))
     by_factors = explained(alone, form, numbers, fitted)
-    share = jnp.maximum(of_each(part, basis), 0)
-    share = by_factors * share / jnp.where(jnp.any(share > 0), jnp.sum(share), 1)
+    share = of_each(part, basis)
+    share = by_factors * share / jnp.where(jnp.sum(share) > 0, jnp.sum(share), 1)
     steps = jnp.where(form == 1, sums.steps / jnp.maximum(sums.episodes, 1), 1)  # r_hat of an average is divided by T
     return Explanation(
         sums.episodes,

@@ -92,13 +92,13 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
         )
     else:
         said.append(
-            "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes), "
-            "and by how much a step's reward rises with one standard deviation of it:"
+            "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes; "
+            "below 0%: it offsets others), and by how much a step's reward rises with one standard deviation of it:"
         )
         said += [
-            f"- {factors[i]}: {found.share[i]:.0%}, {found.weight[i]:+.3g} ± {found.deviation[i]:.1g}"
+            f"- {factors[i]}: {found.share[i]:z.0%}, {found.weight[i]:+.3g} ± {found.deviation[i]:.1g}"
             + (" (its effect is curved)" if is_bent(found, i) else "")
-            for i in np.argsort(-found.share, kind="stable").tolist()
+            for i in np.argsort(-np.abs(found.share), kind="stable").tolist()
         ]
         if any(name.endswith("(before)") for name in factors):
             said.append(
