@@ -122,6 +122,17 @@ def test_settings_in_which_runs_differ_are_named(made):
     assert differing(runs[1:]) == []
 
 
+def test_several_versions_of_the_package_are_named(made):
+    warmup = {"td3": {"warmup": 10}}
+    one, other = made("a", [1.0], **warmup), made("b", [2.0], method="rd", **warmup)
+    assert find_all([one.directory, other.directory], RETURN)[1] == []
+    config = other.directory / "config.json"
+    config.write_text(config.read_text().replace(other.config.lare, "0.2.0 (0123456789)"))
+    assert find_all([one.directory, other.directory], RETURN)[1] == [
+        f"the runs were trained by several versions of LaRe: {one.config.lare}, 0.2.0 (0123456789)"
+    ]
+
+
 def test_another_metric(made):
     run = made("a", [1.0, 3.0])
     with pytest.raises(LareError) as error:

@@ -35,6 +35,8 @@ def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | 
         remarks += other_ends(runs, of_tables, metric)
     if len(found) > 1 and (names := differing(runs)):
         remarks.append(f"the runs also differ in {', '.join(names)}")
+    if len(versions := dict.fromkeys(run.config.lare for run in runs)) > 1:
+        remarks.append(f"the runs were trained by several versions of LaRe: {', '.join(versions)}")
     return found, remarks
 
 
@@ -137,11 +139,11 @@ def what_scores_are(comparison: Comparison) -> str:
 
 
 MEANINGS = (
-    "IQM: interquartile mean; of fewer than four seeds it is the mean. sd: standard deviation over the seeds (n - 1). Above "
-    "baseline: the probability that a run scores more than one of the baseline, the first method; of a single seed it is not "
-    "given, and a probability of 0 or 1 has no interval. If the score is an error or a loss, a low probability is good. p: the "
-    "probability of at least so many won pairs of runs by chance or, if fewer than half were won, of so many lost ones (exact "
-    "Mann-Whitney test, one-sided: a two-sided p is twice as large)."
+    "IQM: interquartile mean over seeds and tasks; of fewer than four scores it is the mean. sd: standard deviation over the "
+    "seeds (n - 1). Above baseline: the probability that a run scores more than one of the baseline, the first method; of a "
+    "single seed it is not given, and a probability of 0 or 1 has no interval. If the score is an error or a loss, a low "
+    "probability is good. p: the probability of at least so many won pairs of runs by chance or, if fewer than half were won, of "
+    "so many lost ones (exact Mann-Whitney test, one-sided: a two-sided p is twice as large)."
 )
 
 
