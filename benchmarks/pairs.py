@@ -4,11 +4,12 @@
 
 A DIRECTORY is a run, or a .jsonl file of `plugs_sb3.py`. The seeds of all runs of a group are put together, so that a group may
 have runs of one seed at two commits, or a run of another library. Scores are those at the last step that all runs share or, with
-`--late`, means over the last quarter of these steps.
+`--late`, means over the last quarter of these steps. The ratio of means is nan unless both means are positive.
 """
 
 import argparse
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,8 @@ def main() -> None:
     for values in (ours, theirs):
         mean, spread = mean_and_spread(list(values))
         print(f"{mean:,.5g} ± {spread:,.3g} ({', '.join(f'{value:,.5g}' for value in values)})")
-    print(f"ratio of the means {np.mean(ours) / np.mean(theirs):.3g}, at step {last:,}")
+    positive = min(np.mean(ours), np.mean(theirs)) > 0
+    print(f"ratio of the means {np.mean(ours) / np.mean(theirs) if positive else math.nan:.3g}, at step {last:,}")
     more, fewer = mann_whitney([(ours, theirs)])
     print(
         f"{mann_whitney_u(ours, theirs):g} of {ours.size * theirs.size} pairs won; p of at least so many {more:.2g}, of at most so "

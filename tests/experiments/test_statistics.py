@@ -161,6 +161,8 @@ def test_what_few_seeds_or_draws_cannot_say(tasks, runs, said, made):
         (0.4505, 0.115, "0.451 ± 0.115"),
         (0.0002, 0.00021, "0.000200 ± 0.000210"),
         (0.5, 0.0, "0.5000 ± 0.000"),
+        (1.23e-7, 4e-8, "1.23e-07 ± 4.00e-08"),
+        (3.0, 1e-9, "3.000000 ± 1.00e-09"),
     ],
 )
 def test_three_digits_of_the_spread(mean, spread, shown):

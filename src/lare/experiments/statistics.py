@@ -49,10 +49,15 @@ class Estimate:
 
 
 def rounded(number: float, spread: float) -> str:
-    """A number rounded to three digits of its spread, or to four of its own if the spread is 0; at most six decimal places."""
+    """A number rounded to three digits of its spread, or to four of its own if the spread is 0; at most six decimal places.
+
+    A number that six places would not show is written with an exponent.
+    """
     digits, size = (2, spread) if spread > 0 else (3, abs(number))
-    places = min(max(digits - math.floor(math.log10(size)), 0), 6) if size > 0 else 3
-    return f"{number:.{places}f}"
+    places = max(digits - math.floor(math.log10(size)), 0) if size > 0 else 3
+    if places > 6 and 0 < abs(number) < 1e-4:
+        return f"{number:.2e}"
+    return f"{number:.{min(places, 6)}f}"
 
 
 def plus_minus(mean: float, deviation: float | None) -> str:
