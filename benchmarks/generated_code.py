@@ -30,7 +30,7 @@ from lare.latent.verification.checks import Trial, examine
 from lare.latent.verification.verify import verify
 from lare.llm.recording import SHIPPED, read_recording
 from lare.llm.reply import parse
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from lare.training import session as sessions
 from measure import advance, interleave, new_session, show, summary, write
 

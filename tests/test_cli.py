@@ -12,7 +12,7 @@ from lare.credit.methods import METHODS
 from lare.latent.verification.checks import CHECKS
 from lare.llm.prompts import candidate
 from lare.source import source
-from lare.tasks.spec import read_task, shipped_tasks
+from lare.tasks.load import read_task, shipped_tasks
 from toys import PHI
 
 TINY = (

@@ -100,6 +100,7 @@ def test_another_name_is_not():
         "lare",
         "lare.latent.sandbox.worker",
         "lare.latent.design",
+        "lare.tasks.load",
         "lare.tasks.spec",
         "lare.tasks.pettingzoo",
         "lare.tasks.workers",

@@ -17,7 +17,7 @@ from lare.llm import prompts
 from lare.llm.budget import Budget
 from lare.llm.live import LiveModel
 from lare.llm.recording import read_recording, shipped_recordings
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from servers import Server, refuses, says
 from toys import PHI, toy_spec
 

@@ -10,8 +10,9 @@ from lare.experiments.credit import correlations
 from lare.latent.design import DesignFailed, design, examine
 from lare.latent.function import LatentFunction
 from lare.llm.recording import shipped_recordings
+from lare.tasks.load import load_task
 from lare.tasks.play import Episode, episodes_of
-from lare.tasks.spec import Judges, TaskSpec, load_task
+from lare.tasks.spec import Judges, TaskSpec
 from paper.exhibits import Budget
 from paper.pages import Page, items, table
 

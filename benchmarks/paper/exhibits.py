@@ -20,7 +20,7 @@ from lare.experiments.scores import RETURN
 from lare.foreign import LARGEST_SETTINGS, read_text, read_toml
 from lare.run.settings import Settings
 from lare.run.usual import algorithm_of
-from lare.tasks.spec import load_task
+from lare.tasks.load import load_task
 from lare.tasks.table import env_spec
 
 PLACE = Path(__file__).parent

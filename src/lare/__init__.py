@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from lare.run.directory import open_run as open_run
     from lare.run.settings import Settings as Settings
     from lare.tasks.episodic import EpisodicReward as EpisodicReward
+    from lare.tasks.load import load_task as load_task
     from lare.tasks.spec import TaskSpec as TaskSpec
-    from lare.tasks.spec import load_task as load_task
     from lare.training.reflect import reflect as reflect
     from lare.training.train import resume as resume
     from lare.training.train import train as train
@@ -46,7 +46,7 @@ HOMES = {
     "CreditAssigner": "lare.plugs.assigner",
     "EpisodicReward": "lare.tasks.episodic",
     "TaskSpec": "lare.tasks.spec",
-    "load_task": "lare.tasks.spec",
+    "load_task": "lare.tasks.load",
     "Run": "lare.run.directory",
     "open_run": "lare.run.directory",
     "Settings": "lare.run.settings",

@@ -20,7 +20,7 @@ from lare.deploy import onnx
 from lare.errors import pip_install
 from lare.latent.function import verified
 from lare.tasks.env import env_action
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from lare.training import learner as common
 from lare.training import on_policy
 from lare.training.compiled import compiled, new_memory

@@ -13,7 +13,7 @@ from lare.experiments.evaluation import evaluate_run
 from lare.experiments.policy import policy_of
 from lare.experiments.video import check_video, write_video
 from lare.tasks.gymnasium import GymnasiumEnv
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from lare.tasks.table import make_host_env
 from lare.tasks.workers import LocalEnvs
 from lare.training.collect_host import evaluate, policy

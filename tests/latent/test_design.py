@@ -13,7 +13,7 @@ from lare.latent.verification.checks import Check
 from lare.latent.verification.verify import Verdict
 from lare.llm.prompts import candidate, combine, correct
 from lare.llm.recording import read_recording
-from lare.tasks.spec import read_task, shipped_tasks
+from lare.tasks.load import read_task, shipped_tasks
 from tiers import long
 from toys import PHI, Chase, phi, toy_spec
 

@@ -8,7 +8,7 @@ import pytest
 from lare.errors import LareError
 from lare.llm.prompts import candidate, combine
 from lare.llm.recording import RecordedModel, Recorder, read_recording, shipped_recordings
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from toys import toy_spec
 
 KNOWN = [{"role": "user", "content": "Write some."}]

@@ -8,7 +8,7 @@ from lare.credit.methods import find_method
 from lare.errors import LareError
 from lare.run.decide import check_credit, decide
 from lare.run.settings import Settings
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from lare.tasks.table import env_spec
 from toys import pick_spec, toy_spec
 

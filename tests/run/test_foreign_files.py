@@ -20,7 +20,7 @@ from lare.run import checkpoint, directory
 from lare.run.decide import decide
 from lare.run.directory import describe, open_run, read_config, read_metrics
 from lare.run.settings import Settings
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from toys import PHI, toy_spec
 
 DEEP = "[" * 50_000

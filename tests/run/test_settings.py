@@ -9,7 +9,7 @@ from lare.credit.settings import CreditSettings
 from lare.errors import LareError
 from lare.run.decide import decide
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from toys import pick_spec
 
 

@@ -7,7 +7,7 @@ from lare.credit.settings import RECENT, CreditSettings
 from lare.run.decide import decide
 from lare.run.settings import Settings
 from lare.run.usual import MANY_AGENTS
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from toys import pick_spec, toy_spec
 
 

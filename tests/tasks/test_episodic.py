@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lare.errors import LareError
 from lare.tasks.environment import make
 from lare.tasks.episodic import TRUE_REWARD, EpisodicReward
-from lare.tasks.spec import read_task, shipped_tasks
+from lare.tasks.load import read_task, shipped_tasks
 
 
 class Scripted(gymnasium.Env):

@@ -6,7 +6,7 @@ import pytest
 import lare
 from lare.tasks.environment import make
 from lare.tasks.hidden import BODIES, FOOT, SCORES, SPEED, register
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 
 NAMES = [f"{body}{score}-v4" for body in BODIES for score in SCORES]
 

@@ -8,8 +8,10 @@ from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from lare.errors import LareError
 from lare.latent.function import verified
 from lare.llm.prompts import candidate
-from lare.tasks.new import draft, without_clause
-from lare.tasks.spec import FILL_IN, load_task
+from lare.tasks.documentation import without_clause
+from lare.tasks.load import load_task
+from lare.tasks.new import draft
+from lare.tasks.spec import FILL_IN
 from toys import Chase
 
 CONTINUOUS = (

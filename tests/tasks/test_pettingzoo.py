@@ -13,8 +13,9 @@ from pettingzoo.test import parallel_api_test
 from lare.errors import LareError
 from lare.tasks import agents as rows_of
 from lare.tasks.env import Team
+from lare.tasks.load import load_task
 from lare.tasks.pettingzoo import ParallelHost, make
-from lare.tasks.spec import TaskSpec, load_task
+from lare.tasks.spec import TaskSpec
 from lare.tasks.table import make_env
 from parallel_toys import Toy
 from toys import toy_spec

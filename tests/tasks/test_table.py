@@ -9,9 +9,10 @@ from hosts import Host
 from jax_toys import Echo
 from lare.errors import LareError
 from lare.tasks.env import EnvSpec, Team
+from lare.tasks.load import read_task
 from lare.tasks.on_host import OnHost
 from lare.tasks.pettingzoo import ParallelHost
-from lare.tasks.spec import TaskSpec, read_task
+from lare.tasks.spec import TaskSpec
 from lare.tasks.table import FAMILIES, GYMNASIUM, NOT_FOR_ALL, Family, check, env_spec, make_env, make_host_env
 from toys import toy_spec
 

@@ -8,7 +8,7 @@ import lare
 from lare.credit.explanation import Explanation
 from lare.credit.words import entry_names, words
 from lare.latent.function import verified
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from lare.training.explain import explanation_of
 from tiers import long
 from toys import Ear, toy_spec

@@ -14,7 +14,7 @@ from lare.data import replay
 from lare.latent.function import verified
 from lare.run.decide import decide
 from lare.run.directory import create
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from lare.training import first_fit, session
 from lare.training.compiled import compiled
 from lare.training.first_fit import PATIENCE, fit_until_it_stops_helping, held_out, with_smaller_updates

@@ -9,7 +9,7 @@ from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import METHODS
 from lare.errors import LareError
 from lare.latent.function import verified
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from lare.training import session as sessions
 from tiers import long
 from toys import pick_spec, toy_spec

@@ -13,7 +13,7 @@ from lare.errors import LareError
 from lare.latent.function import verified
 from lare.llm.recording import RecordedModel, read_recording
 from lare.run.directory import open_run
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from lare.training.explain import explanation_of
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner

@@ -75,7 +75,7 @@ def design(
     from lare.llm.budget import Budget
     from lare.llm.live import LiveModel
     from lare.llm.model import RECORDED, recorded_model
-    from lare.tasks.spec import load_task, read_task
+    from lare.tasks.load import load_task, read_task
 
     shipped = model in (None, RECORDED)
     live = not shipped and not str(model).endswith(".json")

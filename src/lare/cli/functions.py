@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lare.latent.function import LatentFunction
-    from lare.tasks.new import Draft
+    from lare.tasks.draft import Draft
     from lare.tasks.play import Episode, Policy
     from lare.tasks.spec import TaskSpec
 
@@ -29,7 +29,8 @@ def prompt(task: Task, kind: Kind = "factors") -> None:
         kind: what the function returns: several factors, or one reward.
     """
     from lare.llm.prompts import candidate
-    from lare.tasks.spec import load_task, the_role
+    from lare.tasks.load import load_task
+    from lare.tasks.spec import the_role
 
     for message in candidate(the_role(load_task(task)), kind):
         say(f"--- {message['role']} ---\n{message['content']}\n")
@@ -120,7 +121,8 @@ def verify(
     from lare.latent.function import of_verdict
     from lare.latent.saved import read_source
     from lare.latent.verification.verify import verify as verify_source
-    from lare.tasks.spec import load_task, read_task, the_role
+    from lare.tasks.load import load_task, read_task
+    from lare.tasks.spec import the_role
 
     source, changed, written_for = read_source(file)
     if fit and fit < FEWEST:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 def tasks() -> None:
     """List the tasks that come with the package. `lare prompt TASK` describes one of them."""
-    from lare.tasks.spec import read_task, shipped_tasks
+    from lare.tasks.load import read_task, shipped_tasks
     from lare.tasks.table import FAMILIES
 
     specs = [read_task(name) for name in shipped_tasks()]

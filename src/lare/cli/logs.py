@@ -46,7 +46,7 @@ def relabel(
     """
     import lare
     from lare.errors import LareError
-    from lare.tasks.spec import read_task
+    from lare.tasks.load import read_task
 
     spec = None if task is None else read_task(task)
     phi = None

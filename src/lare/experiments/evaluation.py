@@ -11,8 +11,9 @@ from jaxtyping import Float
 from lare.errors import LareError
 from lare.run.directory import Run, as_run
 from lare.tasks.env import HostEnv
+from lare.tasks.load import check_against_environment
 from lare.tasks.play import episode_of
-from lare.tasks.spec import TaskSpec, check_against_environment
+from lare.tasks.spec import TaskSpec
 from lare.tasks.table import make_env, make_host_env
 from lare.tasks.trust import unknown_module
 from lare.tasks.workers import LocalEnvs

@@ -28,7 +28,8 @@ from lare.run.directory import Run, function_places, open_run, read_config
 from lare.run.settings import Settings
 from lare.run.usual import resolve
 from lare.source import source
-from lare.tasks.spec import TaskSpec, shipped_tasks
+from lare.tasks.load import shipped_tasks
+from lare.tasks.spec import TaskSpec
 from lare.tasks.table import env_spec
 from lare.tasks.trust import TRUSTED, unknown_module
 from lare.training.explain import explanation_of

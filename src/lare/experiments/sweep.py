@@ -20,7 +20,7 @@ from lare.experiments.jobs import Job, check, job_of
 from lare.experiments.processes import in_processes
 from lare.foreign import LARGEST_SETTINGS, read_text, read_toml
 from lare.run.settings import Settings, set_in_vain
-from lare.tasks.spec import load_task
+from lare.tasks.load import load_task
 from lare.training.train import Interrupted
 
 Texts = Annotated[tuple[str, ...], Field(min_length=1)]

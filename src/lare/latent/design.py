@@ -19,7 +19,8 @@ from lare.llm.model import Model, recorded_model
 from lare.llm.prompts import Kind, Message, Stage
 from lare.llm.recording import Recorder
 from lare.llm.reply import MalformedReply, parse
-from lare.tasks.spec import TaskSpec, as_task, the_role
+from lare.tasks.load import as_task
+from lare.tasks.spec import TaskSpec, the_role
 
 ATTEMPTS = 5
 """How often a function is verified, the first time included, before the loop gives up."""

@@ -13,7 +13,8 @@ from lare.latent.function import CHANGED, HEADER, LatentFunction, normal, sha256
 from lare.latent.verification.verify import Steps
 from lare.llm.prompts import Kind
 from lare.llm.recording import Exchange
-from lare.tasks.spec import TaskSpec, as_task
+from lare.tasks.load import as_task
+from lare.tasks.spec import TaskSpec
 
 LARGEST_FILE = 1 << 20
 """The largest size of a function file, in bytes."""

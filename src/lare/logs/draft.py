@@ -5,7 +5,8 @@ from typing import Any
 
 from lare.logs.source import Source, open_logs
 from lare.plugs.layout import Layout
-from lare.tasks.new import SCORE, Draft, bodies, entries, plain, warning, without_rewards
+from lare.tasks.documentation import plain, without_rewards
+from lare.tasks.draft import SCORE, Draft, bodies, entries, warning
 from lare.tasks.spec import NO_ENVIRONMENT
 
 LIMIT = "# max_episode_steps = 1000 # episodes that did not terminate, and are shorter, were cut"

@@ -19,7 +19,8 @@ from lare.latent.function import LatentFunction
 from lare.logs.episode import Logged, Paid
 from lare.logs.source import Source, open_logs
 from lare.plugs.assigner import CreditAssigner
-from lare.tasks.spec import TaskSpec, as_task
+from lare.tasks.load import as_task
+from lare.tasks.spec import TaskSpec
 
 PIECE = 8192
 """Steps whose rewards are computed at a time: `phi` takes about as long for many steps as for few."""

@@ -8,8 +8,9 @@ import numpy as np
 
 from lare.latent.verification.verify import STEPS, Steps
 from lare.logs.source import open_logs
+from lare.tasks.load import as_task
 from lare.tasks.play import Episode
-from lare.tasks.spec import TaskSpec, as_task, judged_states
+from lare.tasks.spec import TaskSpec, judged_states
 
 EPISODES = 64
 """Steps are taken from so many first episodes."""

@@ -27,7 +27,8 @@ from lare.plugs.learner import CHUNK, PIECE, WAITING, Learner
 from lare.plugs.payment import payment
 from lare.plugs.store import Store
 from lare.run.usual import MANY_AGENTS
-from lare.tasks.spec import Judges, TaskSpec, as_task
+from lare.tasks.load import as_task
+from lare.tasks.spec import Judges, TaskSpec
 
 SAMPLE = 256
 """About how many steps are kept to verify `phi` on, when it is loaded from a file."""

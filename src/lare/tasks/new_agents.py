@@ -11,21 +11,9 @@ from typing import Any
 from lare.tasks import agents as rows_of
 from lare.tasks.agents import Agent, kind
 from lare.tasks.construct import construct, limit_of
+from lare.tasks.documentation import ending, plain, sections_of, without_rewards
+from lare.tasks.draft import JUDGES, SCORE, Draft, bodies, bounds, entries, flattened, warning
 from lare.tasks.env import Team
-from lare.tasks.new import (
-    JUDGES,
-    SCORE,
-    Draft,
-    bodies,
-    bounds,
-    ending,
-    entries,
-    flattened,
-    plain,
-    sections_of,
-    warning,
-    without_rewards,
-)
 from lare.tasks.pettingzoo import ParallelHost
 from lare.tasks.spec import PETTINGZOO, TaskSpec
 

@@ -18,8 +18,9 @@ from lare.credit.words import FEWEST, FORMS, entry_names, words
 from lare.errors import LareError
 from lare.latent.function import LatentFunction
 from lare.latent.improve import Evidence, Model, improve
+from lare.tasks.load import as_task
 from lare.tasks.play import Episode, Policy, episodes_of
-from lare.tasks.spec import TaskSpec, as_task, judged_states, the_role
+from lare.tasks.spec import TaskSpec, judged_states, the_role
 
 EPISODES = 40
 """The number of episodes to play, if none are given."""

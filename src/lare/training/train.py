@@ -18,7 +18,8 @@ from lare.latent.saved import load
 from lare.run.decide import decide
 from lare.run.directory import Run, as_run, create, default_directory, isolation, locked
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain
-from lare.tasks.spec import TaskSpec, as_task
+from lare.tasks.load import as_task
+from lare.tasks.spec import TaskSpec
 from lare.training import first_fit
 from lare.training import session as sessions
 from lare.training.collect_host import Diverged

@@ -4,7 +4,7 @@ import numpy as np
 
 from lare.latent.design import DesignFailed
 from lare.llm.recording import Recorder
-from lare.tasks.spec import load_task
+from lare.tasks.load import load_task
 from paper import correlations
 from paper.exhibits import budgets
 from toys import toy_spec

@@ -15,7 +15,7 @@ from lare.latent.verification.checks import CHECKS, Check
 from lare.latent.verification.verify import random_steps, verify
 from lare.llm.recording import SHIPPED, read_recording
 from lare.llm.reply import parse
-from lare.tasks.spec import read_task
+from lare.tasks.load import read_task
 from tiers import long
 from toys import PHI, phi, toy_spec
 

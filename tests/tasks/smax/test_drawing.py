@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.patches import Circle
 
-from lare.tasks.smax.battle import ATTACK, STOP
+from lare.tasks.smax.battle import ATTACK, STOP, Battle
 from lare.tasks.smax.drawing import OURS, THEIRS, draw, shots
 from lare.tasks.smax.env import SMAX, State
 
@@ -27,12 +27,12 @@ def played(env) -> State:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
 
 
-def at(states: State, step: int) -> State:
-    return jax.tree.map(lambda leaf: leaf[step], states)
+def at(states: State, step: int) -> Battle:
+    return jax.tree.map(lambda leaf: leaf[step], states.battle)
 
 
 def test_the_living_are_discs_in_the_colours_of_their_sides(env, played):
-    figure = draw(env, at(played, 0))
+    figure = draw(env.scenario, at(played, 0))
     circles = [patch for patch in figure.axes[0].patches if isinstance(patch, Circle)]
     assert len(circles) == 8
     colours = [circle.get_edgecolor() for circle in circles]
@@ -42,14 +42,16 @@ def test_the_living_are_discs_in_the_colours_of_their_sides(env, played):
 
 
 def test_a_shot_is_shown_in_the_step_that_it_was_fired_in(env, played):
-    steps = [at(played, step).battle for step in range(4)]
+    steps = [at(played, step) for step in range(4)]
     assert (0, 5) in shots(env.scenario, steps[1], steps[0])
     # It still chooses to attack, but its weapon is not ready.
     assert (0, 5) not in shots(env.scenario, steps[2], steps[1])
-    assert len(draw(env, at(played, 1), at(played, 0)).axes[0].lines) > len(draw(env, at(played, 1)).axes[0].lines)
+    assert len(draw(env.scenario, at(played, 1), at(played, 0)).axes[0].lines) > len(
+        draw(env.scenario, at(played, 1)).axes[0].lines
+    )
 
 
 def test_the_credit_is_written_beside_the_step(env, played):
-    texts = [text.get_text() for text in draw(env, at(played, 2), credit=0.25).axes[0].texts]
+    texts = [text.get_text() for text in draw(env.scenario, at(played, 2), credit=0.25).axes[0].texts]
     assert texts[-1] == "step 2   credit 0.25"
-    assert draw(env, at(played, 2)).axes[0].texts[-1].get_text() == "step 2"
+    assert draw(env.scenario, at(played, 2)).axes[0].texts[-1].get_text() == "step 2"

@@ -11,37 +11,35 @@ from matplotlib.patches import Circle, Rectangle, Wedge
 
 from lare.tasks.canvas import blank, pixels
 from lare.tasks.smax.battle import ATTACK, FIELD, Battle
-from lare.tasks.smax.env import SMAX, State
 from lare.tasks.smax.scenarios import Scenario
 
 OURS, THEIRS, FALLEN = "#0072b2", "#d55e00", "#bbbbbb"
 
 
-def draw(env: SMAX, state: State, before: State | None = None, credit: float | None = None) -> Figure:
+def draw(scenario: Scenario, battle: Battle, before: Battle | None = None, credit: float | None = None) -> Figure:
     """A state. Each unit is a disc, filled in proportion to its health. With the state `before`, lines show the hits."""
     figure, axes = blank()
-    last = None if before is None else before.battle
-    paint(axes, env.scenario, state.battle, last, credit)
+    paint(axes, scenario, battle, before, credit)
     return figure
 
 
 def frames(
-    env: SMAX, states: State, credit: Float[np.ndarray, " steps"] | None = None
+    scenario: Scenario, battles: Battle, credit: Float[np.ndarray, " steps"] | None = None
 ) -> list[UInt8[np.ndarray, "height width 3"]]:
     """An episode as pictures.
 
     Args:
-        env: the environment.
-        states: one state for each picture, along a leading axis.
+        scenario: the units.
+        battles: one state for each picture, along a leading axis.
         credit: for each state, the credit of the step that led to it. It is shown as a number.
     """
     figure, axes = blank()
-    battles = jax.tree.map(np.asarray, states.battle)
+    battles = jax.tree.map(np.asarray, battles)
     found, before = [], None
     for step in range(len(battles.step)):
         axes.clear()
         battle = jax.tree.map(itemgetter(step), battles)
-        paint(axes, env.scenario, battle, before, None if credit is None else float(credit[step]))
+        paint(axes, scenario, battle, before, None if credit is None else float(credit[step]))
         before = battle
         found.append(pixels(figure))
     return found

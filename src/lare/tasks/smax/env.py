@@ -99,7 +99,7 @@ class SMAX:
 
         if credit is not None:  # all living units have the same credit, dead units none
             credit = np.take_along_axis(credit, np.abs(credit).argmax(axis=1)[:, None], axis=1)[:, 0]
-        return frames(self, states, credit)
+        return frames(self.scenario, states.battle, credit)
 
 
 def reward(scenario: Scenario, before: Battle, after: Battle) -> Float[Array, ""]:
