@@ -100,6 +100,17 @@ def test_a_step_is_the_same_step_however_it_is_shown(method, function):
     np.testing.assert_allclose(scored.rewards_at(every), single.rewards_at(every), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("method", ["lare-bayes", "lare-linear"])
+def test_the_third_return_is_the_first_that_is_predicted(method, phi):
+    """From one episode a decoder in closed form learns the mean reward only. R^2 needs eight predicted returns."""
+    credit = assigner(method, phi)
+    known = []
+    for one in episodes([10] * 12):
+        credit.add_episode(*one)
+        known.append(bool(np.isfinite(credit.metrics()["credit/return_r2"])))
+    assert known == [False] * 9 + [True] * 3
+
+
 @pytest.mark.parametrize("asked", ["after each episode", "at the end"])
 def test_returns_are_predicted_by_fits_to_those_before_whenever_it_is_asked(asked, phi):
     credit = assigner("lare-linear", phi)
