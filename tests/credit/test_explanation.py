@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from lare.credit import evidence
-from lare.credit.basis import Basis, expand
+from lare.credit.basis import Basis, expand, shapes
+from lare.credit.explanation import covariance_of_effect
 from lare.credit.explanation import explain as explain_sums
 
 explain = jax.jit(explain_sums, static_argnames="basis")
@@ -42,7 +43,7 @@ def test_factors_that_tell_all(extended, form):
     assert float(found.episodes) == 120
     assert float(found.by_factors) > 0.98
     np.testing.assert_allclose(found.share, [0.8, 0.2, 0], atol=0.1)
-    weight, deviation = np.asarray(found.weight) * steps, np.asarray(found.deviation) * steps
+    weight, deviation = np.asarray(found.slope) * steps, np.asarray(found.deviation) * steps
     np.testing.assert_allclose(weight, [2, -1, 0], atol=0.15)
     assert (deviation > 0).all()
     assert (np.abs(weight - [2, -1, 0]) < 4 * deviation + 0.02).all()
@@ -67,7 +68,7 @@ def test_factors_that_tell_nothing():
 
 def test_without_factors_the_entries_tell():
     found = explain(summed(Basis(0, 3, extended=False), np.array([1.0, 0, 0])), 0, Basis(0, 3, extended=False))
-    assert (float(found.by_factors), found.share.shape, found.weight.shape) == (0, (0,), (0,))
+    assert (float(found.by_factors), found.share.shape, found.slope.shape) == (0, (0,), (0,))
     assert float(found.by_all) > 0.98
 
 
@@ -103,10 +104,43 @@ def test_a_factor_that_offsets_another_has_a_share_below_0():
         evidence.no_sums(2), jnp.asarray(means), jnp.asarray(20 * returns), jnp.asarray(length)
     )
     found = explain(sums, 0, basis)
-    np.testing.assert_allclose(found.weight, [2, -1], rtol=1e-3)
+    np.testing.assert_allclose(found.slope, [2, -1], rtol=1e-3)
     want = [
         weight * np.cov(column, returns)[0, 1] / returns.var(ddof=1)
         for weight, column in zip([2, -1], means.T, strict=True)
     ]
     assert want[1] < -0.3
     np.testing.assert_allclose(found.share, want, rtol=1e-2)
+
+
+def paid(reward, count, seed=0):
+    """Sums over episodes that pay `reward(u)` for two factors, the first of which leans to one side in each episode."""
+    random = np.random.default_rng(seed)
+    u = 0.7 * random.normal(size=(count, 1, 2)) + 0.7 * random.normal(size=(count, 40, 2))
+    features = np.asarray(expand(Basis(2, 0, True), jnp.asarray(u))).mean(axis=1)
+    given = (jnp.asarray(part) for part in (features, reward(u).sum(axis=1), np.full(count, 40)))
+    return explain(evidence.add_episodes(evidence.no_sums(features.shape[1]), *given), 0, Basis(2, 0, True))
+
+
+@pytest.mark.parametrize("count", [30, 100])
+def test_the_slope_is_that_of_the_closest_line_whatever_features_express_it(count):
+    """|u| bends the shapes of all factors, and a sine then takes the place of the second factor's line."""
+    found = paid(lambda u: -2 * np.abs(u[..., 0]) + 0.5 * u[..., 1], count)
+    np.testing.assert_allclose(found.slope, [0, 0.5], atol=0.1)
+    assert float(found.linear[0]) < 0.1
+    assert float(found.linear[1]) > 0.9
+    np.testing.assert_allclose(found.paired, 0, atol=0.02)
+
+
+def test_the_effect_of_a_pair_is_told_apart():
+    found = paid(lambda u: u[..., 0] * u[..., 1], 100)
+    np.testing.assert_allclose(found.paired, found.share, atol=0.1)
+    np.testing.assert_allclose(found.slope, 0, atol=0.1)
+
+
+def test_the_covariance_of_an_effect_is_that_of_a_standard_normal():
+    covariance = covariance_of_effect()
+    u = np.random.default_rng(0).normal(size=(400_000, 1))
+    sampled = np.cov(np.asarray(jnp.concatenate([jnp.asarray(u), shapes(jnp.asarray(u), 3)], axis=1)), rowvar=False)
+    np.testing.assert_allclose(covariance, sampled, atol=0.01)
+    assert covariance[0, 0] == pytest.approx(1)

@@ -22,7 +22,7 @@ def made(tmp_path):
         config = describe(spec, settings, ())
         (directory / "config.json").write_text(config.model_dump_json())
         lines = [
-            {"step": step, "seed": seed, "evaluation/return": value * share}
+            {"step": step, "seed": seed, "evaluation/return": value * share, "critic/loss": 1.0}
             for step, share in zip(steps, (0.5, 1.0), strict=bool(steps))
             for seed, value in zip(settings.all_seeds, returns, strict=True)
         ]

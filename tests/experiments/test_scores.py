@@ -122,6 +122,15 @@ def test_settings_in_which_runs_differ_are_named(made):
     assert differing(runs[1:]) == []
 
 
+def test_runs_whose_step_sizes_fall_over_other_numbers_of_steps_are_told_apart(made):
+    short = made("a", [1.0], algorithm="ppo", rollout_steps=50)
+    settings = short.config.settings.model_copy(update={"steps": 500})
+    config = short.config.model_copy(update={"settings": settings})
+    longer = Run(short.directory, config, ())
+    assert list(by_label([short, longer])) == ["dense, steps 100", "dense, steps 500"]
+    assert differing([short, longer]) == ["steps (100: dense; 500: dense)"]
+
+
 def test_several_versions_of_the_package_are_named(made):
     warmup = {"td3": {"warmup": 10}}
     one, other = made("a", [1.0], **warmup), made("b", [2.0], method="rd", **warmup)
@@ -138,8 +147,8 @@ def test_another_metric(made):
     with pytest.raises(LareError) as error:
         grouped(by_label([run]), "evaluation/returns")
     assert str(error.value) == (
-        f"{run.directory} has no metric 'evaluation/returns' (did you mean 'evaluation/return'?); it has evaluation/return. "
-        "Leave it out, or compare another metric"
+        f"{run.directory} has no metric 'evaluation/returns' (did you mean 'evaluation/return'?); it has critic/loss, "
+        "evaluation/return. Leave it out, or compare another metric"
     )
     runs = [made("b", [1.0], "Walker2d-v4"), made("b", [1.0], "Reacher-v4")]
     for lines in (one.directory / "metrics.jsonl" for one in runs):

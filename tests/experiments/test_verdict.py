@@ -25,7 +25,8 @@ def said(returns, random=CHANCE, **facts):
             np.vstack([RISING, RISING + 2]),
             {"return_r2": 0.97, "latent": True, "at_the_end": 12.0},
             [
-                "It learned. The return is 71 ± 1.41 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1.",
+                "It learned. The return is 71 ± 1.41 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1 in 3 "
+                "episodes.",
                 "That is more than training on the return at the end alone gives here (12).",
                 "Its proxy rewards, from factors and raw features, explain nearly all of the score: R² of the last returns, before "
                 "they were learned from, is 0.97.",
@@ -36,7 +37,7 @@ def said(returns, random=CHANCE, **facts):
             FLAT - 50,
             {"return_r2": -3.0, "latent": True},
             [
-                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1.",
+                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from factors and raw features, explain next to nothing of the score: R² of the last returns, "
                 "before they were learned from, is -3.00.",
                 "Next: the score depends on something else. `lare design Toy --reflect 2 --model NAME` asks for another phi; "
@@ -48,7 +49,7 @@ def said(returns, random=CHANCE, **facts):
             FLAT - 50,
             {"return_r2": 0.9},
             [
-                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1.",
+                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from raw features, explain nearly all of the score: R² of the last returns, before they were "
                 "learned from, is 0.90.",
                 "Next: returns are predicted well, so it may depend on the algorithm: more `--steps`, or another `--algorithm` "
@@ -62,7 +63,7 @@ def said(returns, random=CHANCE, **facts):
             FELL,
             {"at_the_end": 40.0},
             [
-                "It learned. The return is 31 after 8,000 steps; random actions get 0 ± 1.",
+                "It learned. The return is 31 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "That is no more than training on the return at the end alone gives here (40).",
                 "Next: it was better before, 92 at step 4,000. `lare evaluate runs/x --best` plays the best policy of each seed.",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
@@ -72,7 +73,7 @@ def said(returns, random=CHANCE, **facts):
             FELL - 200,
             {},
             [
-                "It got worse than random actions. The return is -169 after 8,000 steps; random actions get 0 ± 1.",
+                "It got worse than random actions. The return is -169 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
@@ -81,7 +82,7 @@ def said(returns, random=CHANCE, **facts):
             FLAT - 1000,
             {},
             [
-                "It got worse than random actions. The return is -949 after 8,000 steps; random actions get 0 ± 1.",
+                "It got worse than random actions. The return is -949 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
@@ -90,7 +91,7 @@ def said(returns, random=CHANCE, **facts):
             FLAT / 100 - 52,
             {"return_r2": 0.99, "latent": True},
             [
-                "It got worse than random actions. The return is -51.5 after 8,000 steps; random actions get 0 ± 1.",
+                "It got worse than random actions. The return is -51.5 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from factors and raw features, explain nearly all of the score: R² of the last returns, before "
                 "they were learned from, is 0.99.",
                 "Next: it repeats one behaviour: the last 5 returns of a seed hardly differ, and those of random actions do. More "
@@ -102,7 +103,8 @@ def said(returns, random=CHANCE, **facts):
             np.vstack([FLAT - 50, FLAT - 50]),
             {"return_r2": -0.93, "usual_r2": 0.98, "latent": True},
             [
-                "It has not learned yet. The return is 1 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1.",
+                "It has not learned yet. The return is 1 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1 in 3 "
+                "episodes.",
                 "Its proxy rewards, from factors and raw features, usually explain the score (median R² of returns: 0.98), but not "
                 "the last episodes (R² -0.93): the policy has changed, and the decoder has to adapt.",
                 "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
@@ -113,7 +115,7 @@ def said(returns, random=CHANCE, **facts):
             {},
             [
                 "It has not learned yet. The return is 0.5 ± 0.707 after 8,000 steps (mean over 2 seeds); random actions get "
-                "0 ± 1.",
+                "0 ± 1 in 3 episodes.",
                 "Next: one seed was better than random actions at step 3,000 (38). `lare evaluate runs/x --best` plays the best "
                 "policy of each seed. To continue: more `--steps`, or another `--algorithm`.",
             ],
@@ -127,9 +129,16 @@ def test_what_is_said(returns, facts, sentences):
 
 def test_seeds_that_learned_are_counted_where_their_mean_says_too_little():
     returns = np.vstack([FLAT, FLAT - 52, FLAT - 51])
-    found = "The return is 16.7 ± 29.7 after 8,000 steps (mean over 3 seeds); random actions get 0 ± 1"
+    found = "The return is 16.7 ± 29.7 after 8,000 steps (mean over 3 seeds); random actions get 0 ± 1 in 3 episodes"
     assert said(returns)[0] == f"It learned with 1 of 3 seeds. {found}."
     assert said(returns, before=51.0)[0] == f"It has not learned yet. {found}, the policy before training 51."
+
+
+def test_a_return_that_differs_by_less_than_its_own_error_is_no_better_and_no_worse():
+    """Two errors of 3 and 4 make one of 5, so two standard errors are 10."""
+    random = 3 * np.sqrt(3) * CHANCE
+    for last, begins in ((10.1, "It learned. "), (9.9, "It has not"), (-9.9, "It has not"), (-10.1, "It got worse")):
+        assert said(np.full((1, 8), last), random, of_evaluation=4.0)[0].startswith(begins)
 
 
 def test_a_policy_that_was_never_updated_has_learned_nothing():
@@ -139,7 +148,7 @@ def test_a_policy_that_was_never_updated_has_learned_nothing():
 
 
 def test_better_than_chance_is_not_learned_if_the_policy_was_so_before_training():
-    began = "after 8,000 steps; random actions get 0 ± 1, the policy before training"
+    began = "after 8,000 steps; random actions get 0 ± 1 in 3 episodes, the policy before training"
     assert said(FLAT, before=51.0)[0] == f"It has not learned yet. The return is 51 {began} 51."
     assert said(FLAT, before=30.0)[0] == f"It learned. The return is 51 {began} 30."
 

@@ -19,9 +19,11 @@ def found(**changes):
         "episodes": 40,
         "by_factors": 0.9,
         "by_all": 0.97,
-        "weight": np.array([1.0, 2.0]),
+        "slope": np.array([1.0, 2.0]),
         "deviation": np.array([0.1, 0.1]),
+        "linear": np.ones(2),
         "share": np.array([0.25, 0.65]),
+        "paired": np.zeros(2),
         "left": np.array([0.1, -0.8]),
     }
     return Explanation(**(values | changes))
@@ -91,15 +93,27 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             ],
         ),
         (
-            found(by_factors=0.99, by_all=0.99, weight=np.array([0.15, 0.02]), share=np.array([0.95, 0.04])),
+            found(by_factors=0.99, by_all=0.99, linear=np.array([0.49, 0.1]), share=np.array([0.95, 0.04])),
             None,
             FACTORS,
             [],
             [
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
                 SHARES,
-                "- speed: 95%, +0.15 ± 0.1 (its effect is curved)",
-                "- cost: 4%, +0.02 ± 0.1",
+                "- speed: 95%, +1 ± 0.1 (its effect is curved)",
+                "- cost: 4%, +2 ± 0.1",
+            ],
+        ),
+        (
+            found(by_all=0.9, paired=np.array([0.13, 0.3]), linear=np.zeros(2)),
+            None,
+            FACTORS,
+            [],
+            [
+                "The factors explain 90% of the variation of the returns of 40 episodes.",
+                SHARES,
+                "- cost: 65%, +2 ± 0.1 (its effect is curved)",
+                "- speed: 25%, +1 ± 0.1 (its effect depends on another factor)",
             ],
         ),
         (found(), None, [], [], ["Raw features explain 97% of the variation of the returns of 40 episodes."]),

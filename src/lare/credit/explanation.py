@@ -11,8 +11,13 @@ up to the share. A part is negative if the factor offsets others: if it pays les
 correlation of the residual of a fit on the factors alone with the mean of raw entry j over an episode is
 
     (p - S mu)_j / sqrt(S_jj (q - 2 mu . p + mu . S mu))
+
+The effect of factor i is g_i(u_i), the sum of its linear feature and its shapes times their weights. The weights alone do not
+tell how the reward rises with the factor, because a sine can take the place of a line. With u standard normal, the line that
+is closest to g_i has the slope E[u g_i(u)], and it has the part E[u g_i(u)]^2 / Var g_i(u) of the variance of the effect.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -20,11 +25,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from lare.credit import evidence
-from lare.credit.basis import FREQUENCIES, Basis
+from lare.credit.basis import FREQUENCIES, HALF_PERIOD, Basis
 from lare.credit.evidence import Posterior, Sums
 
 ROUNDS = 100
 """Maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
+SHAPED = 1 + 2 * FREQUENCIES
+"""The number of features that a factor has alone: itself and its shapes."""
 
 
 class Explanation(NamedTuple):
@@ -35,14 +42,18 @@ class Explanation(NamedTuple):
     """Share of the returns' variation that the factors explain, with their shapes and pairs; 0 if there are no factors."""
     by_all: Float[Array, ""]
     """Share of the variation that factors and raw entries explain together."""
-    weight: Float[Array, " factors"]
-    """How much a step's reward rises if a factor rises by one standard deviation, by the linear part of the fit on factors. If the
-    score is an average: the rise for a step of an episode of average length."""
+    slope: Float[Array, " factors"]
+    """How much a step's reward rises if a factor rises by one standard deviation: the slope of the line that is closest to its
+    effect in the fit on factors. If the score is an average: the rise for a step of an episode of average length."""
     deviation: Float[Array, " factors"]
-    """Posterior deviation of `weight`."""
+    """Posterior deviation of `slope`."""
+    linear: Float[Array, " factors"]
+    """The part of the variance of each factor's effect that this line has; 1 for a factor without effect."""
     share: Float[Array, " factors"]
     """Share of the returns' variation that each factor explains, with its shapes and half of its pairs; below 0 if it offsets
     others."""
+    paired: Float[Array, " factors"]
+    """The part of `share` that comes from the factor's pairs with other factors."""
     left: Float[Array, " entries"]
     """Correlation of each raw entry with the residual of the fit on factors; 0 for an entry that has never varied."""
 
@@ -55,7 +66,7 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     none = jnp.zeros(0)
     if not of_factors.any():
         left = jnp.zeros(basis.used_entries)
-        return Explanation(sums.episodes, jnp.zeros(()), by_all, none, none, none, left)
+        return Explanation(sums.episodes, jnp.zeros(()), by_all, none, none, none, none, none, left)
     alone, numbers = restricted(sums, np.flatnonzero(of_factors)), group[of_factors]
     fitted = evidence.fit(alone, form, numbers, evidence.unknown(len(numbers), int(numbers.max()) + 1), ROUNDS)
     sigma = evidence.covariance(alone, form, numbers, fitted)
@@ -63,16 +74,19 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     unit = jnp.where(given.unit > 0, given.unit, 1)
     part = fitted.weight / unit * (given.s @ (fitted.weight / unit))
     by_factors = explained(alone, form, numbers, fitted)
-    share = of_each(part, basis)
-    share = by_factors * share / jnp.where(jnp.sum(share) > 0, jnp.sum(share), 1)
+    own, paired = of_each(part, basis)
+    scale = by_factors / jnp.where(jnp.sum(part) > 0, jnp.sum(part), 1)
+    slope, deviation, linear = effects(fitted.weight, sigma, basis)
     steps = jnp.where(form == 1, sums.steps / jnp.maximum(sums.episodes, 1), 1)  # r_hat of an average is divided by T
     return Explanation(
         sums.episodes,
         by_factors,
         jnp.maximum(by_all, by_factors),
-        fitted.weight[: basis.factors] / steps,
-        jnp.sqrt(jnp.diagonal(sigma)[: basis.factors]) / steps,
-        share,
+        slope / steps,
+        deviation / steps,
+        linear,
+        scale * (own + paired),
+        scale * paired,
         residual(sums, form, basis, fitted, of_factors),
     )
 
@@ -93,15 +107,40 @@ def explained(
     return jnp.where((given.free > 1) & (given.unit > 0), jnp.clip(share, 0, 1), jnp.nan)
 
 
-def of_each(part: Float[Array, " features"], basis: Basis) -> Float[Array, " factors"]:
-    """The sum of the features' parts for each factor. Each factor of a pair gets half of the pair's part."""
+def of_each(part: Float[Array, " features"], basis: Basis) -> tuple[Float[Array, " factors"], Float[Array, " factors"]]:
+    """The sums of the features' parts for each factor: of its own features, and of its pairs. A pair gives half to each factor."""
     total = part[: basis.factors]
     if not basis.extended:
-        return total
-    shapes = part[basis.factors : basis.factors * (1 + 2 * FREQUENCIES)].reshape(2 * FREQUENCIES, basis.factors)
+        return total, jnp.zeros_like(total)
     one, other = np.triu_indices(basis.factors, 1)
-    pairs = part[basis.factors * (1 + 2 * FREQUENCIES) :] / 2
-    return (total + jnp.sum(shapes, axis=0)).at[one].add(pairs).at[other].add(pairs)
+    pairs = part[basis.factors * SHAPED :] / 2
+    own = jnp.sum(part[: basis.factors * SHAPED].reshape(SHAPED, basis.factors), axis=0)
+    return own, jnp.zeros_like(total).at[one].add(pairs).at[other].add(pairs)
+
+
+def effects(
+    weight: Float[Array, " features"], sigma: Float[Array, "features features"], basis: Basis
+) -> tuple[Float[Array, " factors"], Float[Array, " factors"], Float[Array, " factors"]]:
+    """Slope of each factor's effect, its posterior deviation, and the linear part of the effect's variance."""
+    if not basis.extended:
+        slope = weight[: basis.factors]
+        return slope, jnp.sqrt(jnp.diagonal(sigma)[: basis.factors]), jnp.ones_like(slope)
+    covariance = covariance_of_effect()
+    own = np.arange(basis.factors)[:, None] + basis.factors * np.arange(SHAPED)
+    of_own = weight[own]
+    slope = of_own @ covariance[0]
+    variance = jnp.einsum("fi,ij,fj->f", of_own, covariance, of_own)
+    deviation = jnp.einsum("i,fij,j->f", covariance[0], sigma[own[:, :, None], own[:, None, :]], covariance[0])
+    return slope, jnp.sqrt(deviation), jnp.where(variance > 0, slope**2 / jnp.where(variance > 0, variance, 1), 1)
+
+
+@lru_cache(maxsize=1)
+def covariance_of_effect() -> Float[np.ndarray, "shaped shaped"]:
+    """The covariance of the features of one factor, u and its shapes, for a standard normal u. It has Var u = 1 in front."""
+    u = np.linspace(-8, 8, 4001)
+    angle = np.pi / HALF_PERIOD * np.clip(u, -HALF_PERIOD, HALF_PERIOD)
+    waves = [wave(k * angle) / k for k in range(1, FREQUENCIES + 1) for wave in (np.cos, np.sin)]
+    return np.cov(np.stack([u, *waves]), aweights=np.exp(-(u**2) / 2), ddof=0)
 
 
 def residual(

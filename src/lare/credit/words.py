@@ -11,7 +11,7 @@ FEWEST = 20
 NEXT_TO_NOTHING = 0.1
 """There is a warning if the factors explain less than this share of the variation of the returns."""
 NOTICEABLE = 0.05
-"""The effect of a factor can only be called curved if its share of the variation is larger than this."""
+"""The form of a factor's effect is only reported if its share of the variation is larger than this."""
 STRIKING = 0.3
 """A raw entry is reported if its correlation with the residual of the factors is larger than this."""
 FORMS = ("sum", "average")
@@ -43,9 +43,13 @@ def entry_names(observation: str, action: str, entries: int, action_size: int, b
     return of_observations + named(action, entries - shown, "action")
 
 
-def is_bent(found: Explanation, factor: int) -> bool:
-    """Whether the score depends on a factor but does not simply rise or fall with it: a factor with a target value, for example."""
-    return bool(found.share[factor] > NOTICEABLE and abs(found.weight[factor]) < 2 * found.deviation[factor])
+def form_of_effect(found: Explanation, factor: int) -> str:
+    """A remark on a factor whose reward does not simply rise or fall with it; empty if it does."""
+    if found.share[factor] <= NOTICEABLE:
+        return ""
+    if found.paired[factor] > found.share[factor] / 2:
+        return " (its effect depends on another factor)"
+    return " (its effect is curved)" if found.linear[factor] < 1 / 2 else ""
 
 
 def words(found: Explanation, form: str | None, factors: list[str], entries: list[str]) -> list[str]:
@@ -96,8 +100,7 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
             "below 0%: it offsets others), and by how much a step's reward rises with one standard deviation of it:"
         )
         said += [
-            f"- {factors[i]}: {found.share[i]:z.0%}, {found.weight[i]:+.3g} ± {found.deviation[i]:.1g}"
-            + (" (its effect is curved)" if is_bent(found, i) else "")
+            f"- {factors[i]}: {found.share[i]:z.0%}, {found.slope[i]:+.3g} ± {found.deviation[i]:.1g}{form_of_effect(found, i)}"
             for i in np.argsort(-np.abs(found.share), kind="stable").tolist()
         ]
         if any(name.endswith("(before)") for name in factors):

@@ -99,7 +99,7 @@ def comparable(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], li
                 f"{run.directory} has only reached step {reached:,} of {run.config.settings.steps:,}, so no run is compared at a "
                 "later step"
             )
-        if warning := run.config.settings.untrained:
+        if warning := run.untrained:
             remarks.append(f"{run.directory}: {warning}")
     if not found + without:
         raise LareError(f"{', '.join(str(run.directory) for run in runs)}: no run has an evaluation yet")

@@ -103,17 +103,26 @@ def verdicts(runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> It
         method, predicted = find_method(run.config.settings.method), curve(run, RETURN_R2)
         facts = Facts(
             *(name, *found, random),
+            of_evaluation=standard_error(run),
             at_the_end=next((at_the_end[one] for one in without if one != name), None),
             return_r2=None if predicted is None else last_known(predicted[1]),
             usual_r2=None if predicted is None else median_of_known(predicted[1]),
             latent=method.latent,
-            untrained=run.config.settings.untrained,
+            untrained=run.untrained,
             before=before_training(run),
             directory=str(run.directory),
-            task=run.config.task.name if run.config.task.name in shipped_tasks() else f"{run.config.task.name}.toml",
+            task=run.config.task.name if run.config.task.name in shipped_tasks() else "TASK.toml",
         )
         said = COMMAND.sub(r"<code>\1</code>", escape(" ".join(verdict(facts))))
         yield f'<p class="verdict"><strong>{escape(name)}.</strong> {said}</p>'
+
+
+def standard_error(run: Run) -> float:
+    """The standard error of the mean return of the last evaluation, from episode to episode, all seeds together."""
+    if (found := curve(run, RETURN_STD)) is None or not np.isfinite(of_seeds := found[1][:, -1]).all():
+        return 0.0
+    episodes = max(1, run.config.settings.evaluation_episodes - 1)  # the deviations are those of a population
+    return float(np.sqrt(np.mean(of_seeds**2) / episodes / len(of_seeds)))
 
 
 def before_training(run: Run) -> float | None:

@@ -84,7 +84,9 @@ def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
     found: dict[str, list[Run]] = {}
     for run, plan in zip(runs, plans, strict=True):
         alike = [other for other in plans if all(other[name] == plan[name] for name in ("method", "algorithm"))]
-        told = (name for name in plan if name not in IGNORED and any(other[name] != plan[name] for other in alike))
+        told = (
+            name for name in plan if name not in ignored(plan) and any(other[name] != plan[name] for other in alike)
+        )
         parts = [plan["method"], *([plan["algorithm"]] if several else []), *(f"{name} {plan[name]}" for name in told)]
         found.setdefault(", ".join(parts), []).append(run)
     functions = {name: some for label, of_label in found.items() for name, some in by_function(label, of_label).items()}
@@ -132,6 +134,11 @@ IGNORED = {"seed", "seeds", "draw", "steps", "evaluate_every", "evaluation_episo
 """Settings that do not distinguish methods."""
 
 
+def ignored(plan: Mapping[str, Any]) -> set[str]:
+    """The settings of a plan that do not distinguish methods. Its steps do if step sizes fall to 0 over them."""
+    return IGNORED - {"steps"} if plan.get(f"{plan['algorithm']}.anneal") else IGNORED
+
+
 def differing(runs: Sequence[Run]) -> list[str]:
     """The settings, beside the methods, in which runs of one algorithm differ, with their values and the methods that have them."""
     found: dict[str, dict[str, dict[str, None]]] = {}  # setting, value, method, in order
@@ -139,7 +146,7 @@ def differing(runs: Sequence[Run]) -> list[str]:
     for plan, other in permutations(plans, 2):
         if other["algorithm"] != plan["algorithm"]:
             continue
-        for name in plan.keys() & other.keys() - IGNORED - {"method"}:
+        for name in plan.keys() & other.keys() - ignored(plan) - {"method"}:
             if plan[name] != other[name]:
                 found.setdefault(name, {}).setdefault(str(plan[name]), {})[plan["method"]] = None
     told = {

@@ -30,6 +30,8 @@ class Facts:
     """True returns, means over the episodes of an evaluation."""
     random: Float[np.ndarray, " episodes"] = field(default_factory=lambda: np.zeros(0))
     """True returns of random actions; empty if they are not known."""
+    of_evaluation: float = 0.0
+    """The standard error of the mean return at the end, from episode to episode of the last evaluation."""
     at_the_end: float | None = None
     """The last return of another run, which was trained on the return at the end alone; None without such a run."""
     return_r2: float | None = None
@@ -44,7 +46,7 @@ class Facts:
     """The return of the policy before its first update; None if it was not evaluated."""
     directory: str = "RUN"
     task: str = "TASK"
-    """The name of a shipped task, or the name of a task file."""
+    """The name of a shipped task, or a placeholder for a task file."""
 
     @property
     def last(self) -> float:
@@ -84,7 +86,8 @@ def learned(run: Facts) -> str:
     reached += f" (mean over {len(run.returns)} seeds)" if len(run.returns) > 1 else ""
     if not len(run.random):
         return f"{reached}."
-    by_chance = f"random actions get {shown(float(run.random.mean()))} ± {shown(deviation(run.random))}"
+    episodes = "1 episode" if len(run.random) == 1 else f"{len(run.random)} episodes"
+    by_chance = f"random actions get {shown(float(run.random.mean()))} ± {shown(deviation(run.random))} in {episodes}"
     if run.before is not None:
         by_chance += f", the policy before training {shown(run.before)}"
     if better_than_chance(run) and (run.before is None or run.last > run.before + 2 * noise(run)):
@@ -103,14 +106,18 @@ def successes(run: Facts) -> int:
 
 
 def better_than_chance(run: Facts) -> bool:
-    """Whether the mean return over the seeds is above that of random actions by two standard errors."""
+    """Whether the mean return over the seeds is above that of random actions by two standard errors of their difference."""
     return run.last > float(run.random.mean()) + 2 * noise(run)
 
 
 def noise(run: Facts) -> float:
-    """The larger one of two standard errors: of the mean return of random actions, and of the mean over the seeds."""
+    """The standard error of the difference between the mean return over the seeds and that of random actions.
+
+    The first has two standard errors, from seed to seed and from episode to episode; the larger one counts.
+    """
     of_random = deviation(run.random) / math.sqrt(max(1, len(run.random)))
-    return max(of_random, run.spread / math.sqrt(len(run.returns)), 1e-9)
+    of_run = max(run.of_evaluation, run.spread / math.sqrt(len(run.returns)))
+    return max(math.hypot(of_random, of_run), 1e-9)
 
 
 def deviation(values: Float[np.ndarray, " episodes"]) -> float:

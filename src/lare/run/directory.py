@@ -133,6 +133,23 @@ class Run:
         """Which observation of a step the factors judge."""
         return self.config.settings.judged_by(self.config.task)
 
+    @property
+    def untrained(self) -> str | None:
+        """Why the policy has not been updated; None if it has been, or if there is no evaluation yet."""
+        settings, lines = self.config.settings, self.metrics()
+        if settings.untrained or not lines:
+            return settings.untrained
+        if any(name.startswith("critic/loss") and line[name] is not None for line in lines for name in line):
+            return None
+        step = lines[-1]["step"]
+        if step <= settings.warmup:
+            return f"all {step:,} steps so far were random ({settings.algorithm}.warmup is {settings.warmup:,})"
+        return (
+            f"the policy has not been updated in {step:,} steps: {settings.algorithm} needs "
+            f"{getattr(settings.hyperparameters, 'batch_size', 1)} finished episodes for its first update "
+            f"({settings.algorithm}.batch_size)"
+        )
+
     def place_of(self, seed: int | None) -> int:
         """The index of a seed among those of the run; 0 for None. Raises `LareError` if there is no such seed."""
         if seed is None:

@@ -256,6 +256,8 @@ def finish(
                         for line in sentences:
                             say(line)
                         explained = explained or bool(sentences)
+                    if session.step == settings.steps and not settings.untrained and (why := run.untrained):
+                        say(why)
                 if model is not None and due(session.step, settings.reflect_every, settings.steps):
                     session.reflect(model, say)
                 if stop.is_set() and session.step < settings.steps:
