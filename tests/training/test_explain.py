@@ -21,7 +21,7 @@ def found(**changes):
         "by_all": 0.97,
         "slope": np.array([1.0, 2.0]),
         "deviation": np.array([0.1, 0.1]),
-        "linear": np.ones(2),
+        "linear": np.array([0.81, 1.0]),
         "share": np.array([0.25, 0.65]),
         "paired": np.zeros(2),
         "left": np.array([0.1, -0.8]),
@@ -93,7 +93,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             ],
         ),
         (
-            found(by_factors=0.99, by_all=0.99, linear=np.array([0.49, 0.1]), share=np.array([0.95, 0.04])),
+            found(by_factors=0.99, by_all=0.99, linear=np.array([0.79, 0.1]), share=np.array([0.95, 0.04])),
             None,
             FACTORS,
             [],

@@ -12,6 +12,8 @@ NEXT_TO_NOTHING = 0.1
 """There is a warning if the factors explain less than this share of the variation of the returns."""
 NOTICEABLE = 0.05
 """The form of a factor's effect is only reported if its share of the variation is larger than this."""
+STRAIGHT = 0.8
+"""The effect of a factor is curved if the closest line has less than this part of its variance."""
 STRIKING = 0.3
 """A raw entry is reported if its correlation with the residual of the factors is larger than this."""
 FORMS = ("sum", "average")
@@ -49,7 +51,7 @@ def form_of_effect(found: Explanation, factor: int) -> str:
         return ""
     if found.paired[factor] > found.share[factor] / 2:
         return " (its effect depends on another factor)"
-    return " (its effect is curved)" if found.linear[factor] < 1 / 2 else ""
+    return " (its effect is curved)" if found.linear[factor] < STRAIGHT else ""
 
 
 def words(found: Explanation, form: str | None, factors: list[str], entries: list[str]) -> list[str]:
