@@ -45,7 +45,7 @@ CASES = [
     long("ippo", "lare-rd-shared"),
     long("ippo-teams", "lare-rd"),
     long("ippo-state", "rrdu-next"),
-    ("qmix", "lare-bayes"),
+    long("qmix", "lare-bayes"),
     long("vdn", "ircr"),
 ]
 """Every kind of policy, and every kind of decoder and of what it is given."""

@@ -216,7 +216,8 @@ def test_one_form_is_fitted_where_it_makes_no_difference():
     assert config_of("lare-signs").forms == config_of("dense").forms == (0,)
 
 
-@pytest.mark.parametrize("method", ["lare-bayes", long("lare-rd")])
+@pytest.mark.long
+@pytest.mark.parametrize("method", ["lare-bayes", "lare-rd"])
 def test_seeds_in_lockstep_are_seeds_alone(method):
     """Whose episodes end at other times, so that their turns come at other times."""
     config = config_of(method, "ippo", RIVALS, environments=2, capacity=400)

@@ -123,6 +123,7 @@ def test_updates_of_the_first_fit_draw_an_eighth_of_the_steps_and_at_least_an_ep
     assert with_smaller_updates(config).credit.steps == first
 
 
+@pytest.mark.long
 def test_a_run_that_is_resumed_after_its_first_fit_makes_no_other(small_many, tmp_path):
     task = read_task("CN-6")
     settings = small_many(

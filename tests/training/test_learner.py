@@ -529,7 +529,7 @@ def test_credit_of_the_state_is_measured_against_what_the_team_earned():
     assert float(found["credit/correlation"]) == pytest.approx(1, rel=1e-4)
 
 
-@pytest.mark.parametrize(("env", "score"), [long(ALONE, "sum"), (TOGETHER, "average")])
+@pytest.mark.parametrize(("env", "score"), [(ALONE, "sum"), long(TOGETHER, "average")])
 def test_optimism_adds_deviations_to_what_is_paid_and_to_nothing_else(env, score):
     algorithm = "td3" if env is ALONE else "ippo"
     plain, hopeful = (

@@ -42,7 +42,8 @@ def test_decoders_are_fitted_before_the_first_update_and_then_every_so_often(sma
     assert (fits, done) == ([0, 100], [0, 50, 100, 150])
 
 
-@pytest.mark.parametrize("task", [long("CN-15"), "CompetitivePP-6", long("PP-30"), long("TriangleArea")])
+@pytest.mark.long
+@pytest.mark.parametrize("task", ["CN-15", "CompetitivePP-6", "PP-30", "TriangleArea"])
 def test_every_particle_task_trains_with_its_recorded_functions(task, small_many, tmp_path):
     run = lare.train(task, small_many(steps=100), out=tmp_path / "run", listeners=[])
     teams, lines = [team.name for team in TASKS[task].teams], run.metrics()
@@ -69,9 +70,9 @@ def test_the_return_is_the_mean_over_the_agents_and_the_sum_is_reported_beside_i
 @pytest.mark.parametrize(
     ("task", "algorithm", "method"),
     [
-        ("CompetitivePP-6", "ippo", "lare-linear"),
+        long("CompetitivePP-6", "ippo", "lare-linear"),
         long("echo", "qmix", "lare-rrdu"),
-        long("echo", "ippo", "lare-rd"),
+        ("echo", "ippo", "lare-rd"),
     ],
 )
 def test_a_stopped_run_resumes_bit_for_bit(task, algorithm, method, small_many, echo, tmp_path):
@@ -91,6 +92,7 @@ def test_a_stopped_run_resumes_bit_for_bit(task, algorithm, method, small_many, 
                 np.testing.assert_array_equal(a[name], b[name], err_msg=name)
 
 
+@pytest.mark.long
 def test_what_dies_between_two_checkpoints_is_done_again(small_many, tmp_path):
     class Died(Exception):
         pass
@@ -142,6 +144,7 @@ def test_a_function_that_changed_is_refused(small_many, tmp_path):
         open_run(run.directory)
 
 
+@pytest.mark.long
 def test_factors_of_the_state(small_many, echo, tmp_path):
     """One row a step: the global state, and all actions side by side."""
     task = echo.model_copy(update={"judged_from": "state", "observation_size": 9, "action_size": 9})

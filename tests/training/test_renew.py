@@ -76,6 +76,7 @@ def test_the_factors_of_all_stored_steps_are_computed_again(settings, tmp_path):
         )
 
 
+@pytest.mark.long
 def test_a_run_that_is_stopped_after_a_reflection_goes_on_bit_for_bit(settings, tmp_path):
     whole = trained(settings, Says(RIGHT, WRONG), tmp_path / "whole")
     with pytest.raises(Interrupted):

@@ -133,6 +133,7 @@ def test_nothing_is_learned_before_there_are_episodes_for_a_batch():
     assert (measured["algorithm/updates"].tolist(), after.algorithm.done.tolist()) == ([4], [5])
 
 
+@pytest.mark.long
 def test_how_long_a_batch_is_cut_changes_nothing(monkeypatch):
     config, steps = qmix("lare-rd"), steps_of(TOGETHER, 2, lengths=(5, 3, 2, 6, 4))
     learner = with_steps(untrained(config), config, steps)

@@ -121,6 +121,7 @@ def test_a_function_is_given_by_its_path(small, phi, tmp_path):
     assert run.function.source == phi.source
 
 
+@pytest.mark.long
 def test_the_number_of_candidates_is_a_setting(small, tmp_path):
     """Without self-prompting: the first recorded candidate is the function."""
     settings = small(steps=60, candidates=1)
@@ -201,7 +202,8 @@ def test_an_extended_run_is_a_run_that_was_longer_from_the_start(algorithm, meth
             np.testing.assert_array_equal(a[name], b[name], err_msg=name)
 
 
-@pytest.mark.parametrize("method", ["lare-bayes", long("rrdu")])
+@pytest.mark.long
+@pytest.mark.parametrize("method", ["lare-bayes", "rrdu"])
 def test_a_replay_that_grows_holds_what_it_held(method, small, phi, tmp_path):
     """Programs for arrays of other sizes round otherwise: the same but for that."""
     half, settings = small(method=method, steps=120), small(method=method)
@@ -587,7 +589,8 @@ def test_ppo_must_learn_the_toy(method, phi, tmp_path):
     assert run.metrics()[-1]["evaluation/return"] > -3
 
 
-@pytest.mark.parametrize("method", [long("dense"), "lare-rd"])
+@pytest.mark.long
+@pytest.mark.parametrize("method", ["dense", "lare-rd"])
 def test_ppo_must_learn_to_choose(method, tmp_path):
     """A random policy gets 5 of 20, the best 20."""
     spec = pick_spec()
