@@ -27,7 +27,7 @@ class CreditSettings(Checked):
     """K: steps drawn from an episode by RRD and its variants."""
     steps: Annotated[int, Field(ge=2)] = 256
     """Steps in one update of the decoder: K steps from each of steps / K episodes, or whole episodes with about this many steps in
-    total. If all episodes have the same length T: steps / T episodes, even if only K steps are drawn from each."""
+    total. On particle tasks, whose episodes all have T = 25 steps: steps / T episodes, even if only K steps of each are drawn."""
     episodes: Annotated[int, Field(ge=1)] = 8
     """diaster (single agents): whole episodes in one update of its decoder."""
     score: Literal["auto", "sum", "average"] = "auto"
