@@ -90,7 +90,7 @@ def learned(run: Facts) -> str:
     by_chance = f"random actions get {shown(float(run.random.mean()))} ± {shown(deviation(run.random))} in {episodes}"
     if run.before is not None:
         by_chance += f", the policy before training {shown(run.before)}"
-    if better_than_chance(run) and (run.before is None or run.last > run.before + 2 * noise(run)):
+    if has_learned(run):
         return f"It learned. {reached}; {by_chance}."
     if seeds := successes(run):
         return f"It learned with {seeds} of {len(run.returns)} seeds. {reached}; {by_chance}."
@@ -103,6 +103,11 @@ def successes(run: Facts) -> int:
     """How many seeds end above the return before training, and above random actions by two standard deviations of their returns."""
     bar = float(run.random.mean()) + 2 * max(deviation(run.random), 1e-9)
     return int(np.sum(run.returns[:, -1] > max(bar, -np.inf if run.before is None else run.before)))
+
+
+def has_learned(run: Facts) -> bool:
+    """Whether the mean return is above random actions, and above the policy before training, by two standard errors."""
+    return better_than_chance(run) and (run.before is None or run.last > run.before + 2 * noise(run))
 
 
 def better_than_chance(run: Facts) -> bool:
@@ -185,7 +190,7 @@ def todo(run: Facts) -> list[str]:
             f"Next: it repeats one behaviour: the last {FEW} returns of a seed hardly differ, and those of random actions do. More "
             "`--steps` alone will not change that: another `--algorithm` (`lare algorithms`), or more random steps at first."
         )
-    elif len(run.random) and not better_than_chance(run):
+    elif len(run.random) and not has_learned(run):
         good = (run.return_r2 or 0) > MOSTLY
         what = "returns are predicted well, so it may depend on the algorithm" if good else "it may need more steps"
         found.append(f"Next: {what}: more `--steps`, or another `--algorithm` (`lare algorithms`).")
