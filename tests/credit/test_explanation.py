@@ -19,13 +19,14 @@ def in_float64():
         yield
 
 
-def summed(basis, weight, count=120, seed=0, noise=0.1, form=0):
-    """Sums over episodes of 20 steps that pay `weight` times the inputs, or their average."""
+def summed(basis, reward, count=120, seed=0, noise=0.1, form=0):
+    """Sums over episodes of about 20 steps that pay a function of the inputs, or weights times the inputs; or the average of this."""
     random = np.random.default_rng(seed)
     mood = random.normal(size=(count, basis.inputs))
     length = random.integers(10, 30, size=count)
     u = np.repeat(mood, length, axis=0) + random.normal(size=(length.sum(), basis.inputs))
-    paid, begins = u @ weight + noise * random.normal(size=len(u)), np.append(0, np.cumsum(length)[:-1])
+    paid = (reward(u) if callable(reward) else u @ reward) + noise * random.normal(size=len(u))
+    begins = np.append(0, np.cumsum(length)[:-1])
     means = np.add.reduceat(np.asarray(expand(basis, jnp.asarray(u))), begins) / length[:, None]
     returns = np.add.reduceat(paid, begins) / (length if form else 1)
     given = (jnp.asarray(part) for part in (means, returns, length))
@@ -113,19 +114,11 @@ def test_a_factor_that_offsets_another_has_a_share_below_0():
     np.testing.assert_allclose(found.share, want, rtol=1e-2)
 
 
-def paid(reward, count, seed=0):
-    """Sums over episodes that pay `reward(u)` for two factors, the first of which leans to one side in each episode."""
-    random = np.random.default_rng(seed)
-    u = 0.7 * random.normal(size=(count, 1, 2)) + 0.7 * random.normal(size=(count, 40, 2))
-    features = np.asarray(expand(Basis(2, 0, True), jnp.asarray(u))).mean(axis=1)
-    given = (jnp.asarray(part) for part in (features, reward(u).sum(axis=1), np.full(count, 40)))
-    return explain(evidence.add_episodes(evidence.no_sums(features.shape[1]), *given), 0, Basis(2, 0, True))
-
-
 @pytest.mark.parametrize("count", [30, 100])
 def test_the_slope_is_that_of_the_closest_line_whatever_features_express_it(count):
     """|u| bends the shapes of all factors, and a sine then takes the place of the second factor's line."""
-    found = paid(lambda u: -2 * np.abs(u[..., 0]) + 0.5 * u[..., 1], count)
+    basis = Basis(2, 0, True)
+    found = explain(summed(basis, lambda u: -2 * np.abs(u[:, 0]) + 0.5 * u[:, 1], count), 0, basis)
     np.testing.assert_allclose(found.slope, [0, 0.5], atol=0.1)
     assert float(found.linear[0]) < 0.1
     assert float(found.linear[1]) > 0.9
@@ -133,7 +126,8 @@ def test_the_slope_is_that_of_the_closest_line_whatever_features_express_it(coun
 
 
 def test_the_effect_of_a_pair_is_told_apart():
-    found = paid(lambda u: u[..., 0] * u[..., 1], 100)
+    basis = Basis(2, 0, True)
+    found = explain(summed(basis, lambda u: u[:, 0] * u[:, 1], 100), 0, basis)
     np.testing.assert_allclose(found.paired, found.share, atol=0.1)
     np.testing.assert_allclose(found.slope, 0, atol=0.1)
 

@@ -17,7 +17,6 @@ tell how the reward rises with the factor, because a sine can take the place of 
 is closest to g_i has the slope E[u g_i(u)], and it has the part E[u g_i(u)]^2 / Var g_i(u) of the variance of the effect.
 """
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -25,13 +24,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from lare.credit import evidence
-from lare.credit.basis import FREQUENCIES, HALF_PERIOD, Basis
+from lare.credit.basis import Basis, expand
 from lare.credit.evidence import Posterior, Sums
 
 ROUNDS = 100
 """Maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
-SHAPED = 1 + 2 * FREQUENCIES
-"""The number of features that a factor has alone: itself and its shapes."""
+ONE_FACTOR = Basis(1, 0, extended=True)
+"""The features that a factor has alone: itself and its shapes."""
+SHAPED = ONE_FACTOR.size
 
 
 class Explanation(NamedTuple):
@@ -134,13 +134,10 @@ def effects(
     return slope, jnp.sqrt(deviation), jnp.where(variance > 0, slope**2 / jnp.where(variance > 0, variance, 1), 1)
 
 
-@lru_cache(maxsize=1)
-def covariance_of_effect() -> Float[np.ndarray, "shaped shaped"]:
+def covariance_of_effect() -> Float[Array, "shaped shaped"]:
     """The covariance of the features of one factor, u and its shapes, for a standard normal u. It has Var u = 1 in front."""
-    u = np.linspace(-8, 8, 4001)
-    angle = np.pi / HALF_PERIOD * np.clip(u, -HALF_PERIOD, HALF_PERIOD)
-    waves = [wave(k * angle) / k for k in range(1, FREQUENCIES + 1) for wave in (np.cos, np.sin)]
-    return np.cov(np.stack([u, *waves]), aweights=np.exp(-(u**2) / 2), ddof=0)
+    u = jnp.linspace(-8, 8, 4001)
+    return jnp.cov(expand(ONE_FACTOR, u[:, None]), rowvar=False, aweights=jnp.exp(-(u**2) / 2), ddof=0)
 
 
 def residual(
