@@ -20,7 +20,7 @@ def in_float64():
 
 
 def summed(basis, reward, count=120, seed=0, noise=0.1, form=0):
-    """Sums over episodes of about 20 steps that pay a function of the inputs, or weights times the inputs; or the average of this."""
+    """Sums over episodes of about 20 steps that pay a function of the inputs, or weights times them; or the average of this."""
     random = np.random.default_rng(seed)
     mood = random.normal(size=(count, basis.inputs))
     length = random.integers(10, 30, size=count)
