@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import Var
 
 from lare.credit import closed_form, evidence
 from lare.credit.basis import Basis, expand
@@ -48,6 +49,37 @@ def test_two_numbers_of_float32_keep_one_of_float64():
         assert {leaf.dtype for leaf in held} == {np.dtype(np.float32)}
         for a, b in zip(closed_form.whole(held), sums, strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-14)
+
+
+def without_roundings(function, *arguments):
+    """Evaluate as XLA does on a GPU: a number that is converted to another float and then to a third one is not rounded between."""
+    program = jax.make_jaxpr(function)(*arguments)
+    known = dict(zip(program.jaxpr.invars, jax.tree.leaves(arguments), strict=True))
+    converted = {}
+    for equation in program.jaxpr.eqns:
+        given = [known[one] if isinstance(one, Var) else one.val for one in equation.invars]
+        if equation.primitive.name == "convert_element_type":
+            (result,) = equation.outvars
+            converted[result] = converted.get(equation.invars[0], given[0])
+            known[result] = converted[result].astype(equation.params["new_dtype"])
+        else:
+            found = equation.primitive.bind(*given, **equation.params)
+            known.update(zip(equation.outvars, found if equation.primitive.multiple_results else [found], strict=True))
+    return [known[one] for one in program.jaxpr.outvars]
+
+
+def test_two_numbers_of_float32_keep_one_of_float64_on_a_gpu():
+    with jax.enable_x64(True):
+        numbers = jnp.asarray(np.random.default_rng(0).normal(size=10))
+        sums = evidence.no_sums(8)._replace(mean=numbers)
+        held = evidence.Sums(*without_roundings(closed_form.kept, sums))
+        np.testing.assert_allclose(closed_form.whole(held).mean, numbers, rtol=1e-14)
+
+        def converted(number):
+            return number - number.astype(np.float32).astype(float)
+
+        assert np.all(converted(numbers))
+        assert not np.any(without_roundings(converted, numbers)[0])
 
 
 @pytest.mark.parametrize("seed", range(4))
