@@ -374,14 +374,14 @@ def test_metrics_that_make_no_sense(file, in_this_process):
     path = jobs[0].directory / "metrics.jsonl"
     path.write_text('{"step": 1\n')
     with pytest.raises(LareError, match=r"metrics\.jsonl is damaged: Expecting ',' delimiter: .* in line 1$"):
-        jobs[0].step()
+        _ = jobs[0].done
     for line in ("5", "{}", "null", '{"step": 1}', '{"step": "1", "seed": 0}'):
         path.write_text(f'{{"step": 1, "seed": 0}}\n{line}\n')
         with pytest.raises(LareError, match=r"metrics\.jsonl is damaged: line 2 is no evaluation"):
-            jobs[0].step()
+            _ = jobs[0].done
     path.write_bytes(b"\xff\n")
     with pytest.raises(LareError, match=r"metrics\.jsonl cannot be read: 'utf-8' codec can't decode byte 0xff"):
-        jobs[0].step()
+        _ = jobs[0].done
 
 
 def test_a_damaged_run_does_not_keep_the_others_from_going_on(file, monkeypatch):

@@ -95,7 +95,8 @@ def said(returns, random=CHANCE, **facts):
                 "Its proxy rewards, from factors and raw features, explain nearly all of the score: R² of the last returns, before "
                 "they were learned from, is 0.99.",
                 "Next: it repeats one behaviour: the last 5 returns of a seed hardly differ, and those of random actions do. More "
-                "`--steps` alone will not change that: another `--algorithm` (`lare algorithms`), or more random steps at first.",
+                "`--steps` alone will not change that. Bring observations to about -1 to 1, or try another `--algorithm` "
+                "(`lare algorithms`), or more random steps at first.",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),

@@ -221,7 +221,7 @@ def test_a_replay_that_grows_holds_what_it_held(method, small, phi, tmp_path):
 @pytest.mark.parametrize(
     ("steps", "message"),
     [
-        (48, r"^steps = 48: the run has 60 already, and this number can only be increased$"),
+        (48, r"^steps = 48: the run is planned for 60, and this number can only be increased$"),
         (62, r"^steps = 62 is not a multiple of rollout_steps = 12: take 72$"),
     ],
 )

@@ -105,7 +105,7 @@ TABLE = (
         "ppo",
         Consumes.ROLLOUTS,
         PPO,
-        "clipped policy steps on the newest rollout",
+        "clipped policy steps on the newest rollout; observations are normalised",
         "Schulman et al., 2017; a Gaussian takes the place of LaRe's Beta policy",
     ),
     Algorithm(

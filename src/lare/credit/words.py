@@ -107,8 +107,8 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
         ]
         if any(name.endswith("(before)") for name in factors):
             said.append(
-                "If a factor hardly changes in a step, look only at the sum of its shares, and of its weights, before and after "
-                "the step."
+                "If a factor hardly changes in a step, look only at the sum of its two shares, and at the sum of its two effects: "
+                "before and after the step."
             )
     if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:
         place = int(np.argmax(np.abs(found.left)))

@@ -36,7 +36,9 @@ class Job:
         return f"{self.directory.parent.name}/{self.directory.name}"
 
     def step(self) -> int:
-        """The step of the last evaluation; 0 before the first."""
+        """The step of the checkpoint; without one, of the last evaluation, or 0."""
+        if (saved := saved_host(self.directory / CHECKPOINT)) is not None:
+            return saved["step"]
         lines = read_metrics(self.directory)
         return lines[-1]["step"] if lines else 0
 

@@ -188,7 +188,8 @@ def todo(run: Facts) -> list[str]:
     elif is_stuck(run):
         found.append(
             f"Next: it repeats one behaviour: the last {FEW} returns of a seed hardly differ, and those of random actions do. More "
-            "`--steps` alone will not change that: another `--algorithm` (`lare algorithms`), or more random steps at first."
+            "`--steps` alone will not change that. Bring observations to about -1 to 1, or try another `--algorithm` "
+            "(`lare algorithms`), or more random steps at first."
         )
     elif len(run.random) and not has_learned(run):
         good = (run.return_r2 or 0) > MOSTLY

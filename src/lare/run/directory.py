@@ -214,7 +214,7 @@ class Run:
         config = self.config
         if steps < config.settings.steps:
             raise LareError(
-                f"steps = {steps}: the run has {config.settings.steps} already, and this number can only be increased"
+                f"steps = {steps}: the run is planned for {config.settings.steps}, and this number can only be increased"
             )
         if steps == config.settings.steps:
             return self

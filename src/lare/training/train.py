@@ -20,7 +20,7 @@ from lare.run.directory import Run, as_run, create, default_directory, isolation
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain
 from lare.tasks.load import as_task
 from lare.tasks.spec import TaskSpec
-from lare.training import first_fit
+from lare.training import advice, first_fit
 from lare.training import session as sessions
 from lare.training.collect_host import Diverged
 from lare.training.explain import described
@@ -224,6 +224,7 @@ def finish(
     """Run a session to its end, or until the user stops it."""
     run, settings = session.run, session.settings
     clock, explained = Clock(session.step), False
+    returns: list[np.ndarray] = []
 
     def say(line: str) -> None:
         for listener in told:
@@ -244,6 +245,9 @@ def finish(
                     ) from None
                 for listener in told:
                     listener.stepped(session.step)
+                if session.step - settings.iteration_steps <= settings.warmup < session.step:
+                    for line in advice.of_observations(run, session.learner.replay, session.config):
+                        say(line)
                 if session.step % settings.evaluate_every == 0 or session.step == settings.steps:
                     lines = session.report(clock.rate(session.step))
                     check_losses(session)
@@ -251,6 +255,10 @@ def finish(
                     session.save()
                     for listener in told:
                         listener.evaluated(lines)
+                    if "critic/loss" in lines[0]:
+                        returns.append(np.array([line["evaluation/return"] for line in lines]))
+                        for line in advice.of_returns(returns):
+                            say(line)
                     if session.step == settings.steps or not explained:
                         sentences = explanation(session)
                         for line in sentences:

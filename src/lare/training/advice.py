@@ -1,0 +1,70 @@
+"""Advice about a training that may not get anywhere, in sentences."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from lare.algorithms.settings import PPOSettings
+from lare.credit.words import entry_names
+from lare.data.replay import Replay
+from lare.run.directory import Run
+from lare.training.config import TrainConfig
+
+LARGE = 10.0
+"""The largest root mean square of an entry of the observation that needs no remark."""
+ROWS = 1000
+"""So many stored observations of each environment are looked at."""
+SAME = 5
+"""So many evaluations with equal returns are reported."""
+EQUAL = 1e-3
+"""Returns are equal if they differ by less than this part of their size."""
+
+
+def of_observations(run: Run, held: Replay, config: TrainConfig) -> list[str]:
+    """A remark if an entry of the observations is large and the algorithm does not normalise observations; else nothing.
+
+    A large entry may drive a policy that ends in a tanh to a bound of the actions before its first update. Its gradient is then 0.
+    """
+    algorithm, hyperparameters = run.config.settings.algorithm, run.config.settings.hyperparameters
+    can_normalise = isinstance(hyperparameters, PPOSettings)
+    if (can_normalise and hyperparameters.normalise_observations) or "observation" not in held.columns:
+        return []
+    rows = min(ROWS, int(np.min(np.asarray(held.next_row)[0])))
+    seen = np.asarray(held.columns["observation"][0, :, :rows]).reshape(-1, config.env.observation_size)
+    sizes = np.sqrt(np.mean(np.square(seen), axis=0))
+    largest = int(np.argmax(sizes))
+    if not sizes[largest] > LARGE:
+        return []
+    role = run.config.task.roles[0]
+    name = entry_names(role.observation, "", config.env.observation_size, 0, both=False)[largest]
+    other = f", or set --{algorithm}.normalise-observations True" if can_normalise else ""
+    if config.algorithm.one_agent and config.env.agents == 1:
+        other = ", or use --algorithm ppo, which normalises observations"
+    return [
+        f"Observations are large: the root mean square of {name} is {sizes[largest]:.3g} in the first steps, and {algorithm} does "
+        "not normalise observations. Its actions may stay at their bounds. Let the environment divide each entry by its range, so "
+        f"that it is within about -1 and 1{other}."
+    ]
+
+
+def of_returns(returns: Sequence[Float[np.ndarray, " seeds"]]) -> list[str]:
+    """A remark when the last evaluations of every seed have the same return, and did not have it before; else nothing.
+
+    Args:
+        returns: those of the evaluations since the policy was first updated.
+    """
+    if not are_equal(returns[-SAME:]) or are_equal(returns[-SAME - 1 : -1]):
+        return []
+    return [
+        f"The last {SAME} evaluations of every seed have the same return: the policy does not change what it does. If this return "
+        "is not a good one, the policy is stuck: see docs/bring-your-own-task.md, section 4."
+    ]
+
+
+def are_equal(returns: Sequence[Float[np.ndarray, " seeds"]]) -> bool:
+    """Whether there are enough evaluations, and the returns of each seed differ by nothing or hardly anything."""
+    if len(returns) < SAME:
+        return False
+    each = np.array(returns)
+    return bool(np.all(np.ptp(each, axis=0) <= EQUAL * np.abs(each).max(axis=0)))

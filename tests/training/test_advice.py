@@ -1,0 +1,66 @@
+"""Remarks on large observations, and on a policy that does not change."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+
+import lare
+from lare.training.advice import of_returns
+from toys import Chase, Ear, toy_spec
+
+
+class Bright(Chase):
+    """The second entry of the observation is a light of up to 900 W/m²."""
+
+    observation_space = Box(-1000, 1000, (2,), np.float32)
+
+    def observe(self):
+        return super().observe() * np.array([1, 900], np.float32)
+
+
+gymnasium.register("toys/Bright-v0", entry_point=Bright, max_episode_steps=20)
+
+BRIGHT = {"name": "Bright", "environment": "toys/Bright-v0", "observation": "0: the target\n1: light (W/m²)"}
+
+
+def heard(task, settings, out):
+    ear = Ear()
+    lare.train(task, settings, out=out, listeners=[ear])
+    return [line for line in ear.heard if line.startswith("Observations are large")]
+
+
+def test_large_observations_are_reported_once(small, tmp_path):
+    settings = small(method="dense", algorithm="td3", seeds=2, steps=204)
+    (line,) = heard(toy_spec(**BRIGHT), settings, tmp_path / "bright")
+    head, tail = line.split(" in the first steps, ")
+    assert head.startswith(
+        "Observations are large: the root mean square of entry 1 of the observation (light (W/m²)) is 5"
+    )
+    assert tail == (
+        "and td3 does not normalise observations. Its actions may stay at their bounds. Let the environment divide each entry by "
+        "its range, so that it is within about -1 and 1, or use --algorithm ppo, which normalises observations."
+    )
+
+
+def test_small_observations_and_normalised_ones_are_not(small, tmp_path):
+    assert not heard(toy_spec(), small(method="dense", algorithm="td3", seeds=1, steps=96), tmp_path / "small")
+    assert not heard(
+        toy_spec(**BRIGHT), small(method="dense", algorithm="ppo", seeds=1, steps=96), tmp_path / "normalised"
+    )
+
+
+@pytest.mark.parametrize(
+    ("returns", "said"),
+    [
+        ([[7.5, 8.0]] * 4, False),
+        ([[7.5, 8.0]] * 5, True),
+        ([[7.5, 8.0]] * 6, False),  # it was said before
+        ([[7.5, 8.0]] * 6 + [[9.0, 8.0]] + [[7.5, 8.0]] * 5, True),
+        ([[7.5, float(step)] for step in range(5)], False),
+        ([[0.0]] * 5, True),
+        ([[-7.5], [-7.5001], [-7.5], [-7.5], [-7.5]], True),
+    ],
+)
+def test_a_policy_that_does_not_change(returns, said):
+    assert bool(of_returns([np.array(each) for each in returns])) == said
