@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from lare.llm import bounded, live
+from lare.llm import budget, live
 from lare.llm.budget import Budget, BudgetSpent, most_tokens
 from lare.llm.live import LADDER, LiveModel, ModelFailed
 from servers import (
@@ -168,12 +168,17 @@ def test_nobody_there(served):
 
 @pytest.mark.parametrize("answer", [dribbles, floods, refuses_slowly, refuses_without_end, spells_headers])
 def test_an_answer_without_end_is_cut_off(served, monkeypatch, answer):
-    monkeypatch.setattr(bounded, "TIMEOUT", 0.3)
-    monkeypatch.setattr(live, "TIMEOUT", 0.3)
+    monkeypatch.setattr(budget, "TIMEOUT", 0.3)
+    monkeypatch.setattr(budget, "SHARE", 0)
     monkeypatch.setattr(live, "TRIES", 1)
     _, model, _ = served(answer)
     with pytest.raises(ModelFailed, match=r"was not complete after|has more than 8 MB"):
         model.reply(ASKED, 0)
+
+
+@pytest.mark.parametrize(("seconds", "longest"), [(60.0, 120.0), (900.0, 120.0), (3600.0, 450.0)])
+def test_one_reply_may_take_an_eighth_of_the_time(seconds, longest):
+    assert Budget(seconds=seconds).timeout == longest
 
 
 def test_the_ladder_goes_down_and_stays_down(served):

@@ -44,7 +44,8 @@ def design(
     """Design the latent function of a task: candidates, combine, verify, correct.
 
     Prints the function, or writes it to a file that `lare train --function` takes. A live model needs the extra
-    lare-rl[llm]; its key comes from the environment variable OPENAI_API_KEY, and is never written down.
+    lare-rl[llm]; its key comes from the environment variable OPENAI_API_KEY, and is never written down. A server of your own
+    that asks for no key, such as Ollama, needs none.
 
     Args:
         task: a shipped name (see `lare tasks`), or the path of a task file.
@@ -62,7 +63,8 @@ def design(
             jail, and kept as it is.
         budget: largest number of tokens, in and out together; a request that might exceed it is not sent.
         requests: largest number of requests.
-        minutes: longest time to wait for the model, over all requests and retries.
+        minutes: longest time to wait for the model, over all requests and retries. One reply may take an eighth of it, and at
+            least 120 s: raise it for a slow model of your own.
         price: of a million tokens in and of a million out; the cost is then reported.
         temperature: sampling temperature of the model; the default is the server's.
         record: a file to record every exchange in, for --model FILE; it must not exist, and not be the .json of --out.

@@ -1,4 +1,4 @@
-"""Limits on a server's answers: 120 s for a whole answer, headers included, and 8 MB, whatever its status."""
+"""Limits on a server's answers: the time of a whole answer, headers included, and 8 MB, whatever its status."""
 
 import importlib
 import queue
@@ -7,9 +7,6 @@ import time
 import zlib
 from collections.abc import Callable, Iterator
 from typing import Any
-
-TIMEOUT = 120.0
-"""Seconds for one reply."""
 
 LARGEST_BODY = 8 << 20
 """The largest size in bytes of an answer."""
@@ -35,8 +32,8 @@ def stay(response: Any) -> None:
         )
 
 
-def bound(response: Any) -> None:
-    """Limit the time and the size of an answer's body, whatever its status."""
+def bound(response: Any, limit: float) -> None:
+    """Limit the time (in seconds) and the size of an answer's body, whatever its status."""
     # The HTTP library depends on the client's version, and a stream must be of that library's class.
     library = importlib.import_module(type(response).__module__.partition(".")[0])
 
@@ -45,14 +42,14 @@ def bound(response: Any) -> None:
             self.stream = stream
 
         def __iter__(self) -> Iterator[bytes]:
-            size, deadline = 0, time.monotonic() + TIMEOUT
+            size, deadline = 0, time.monotonic() + limit
             for chunk in self.stream:
                 piece = chunk if unpacked is None else unpacked.decompress(chunk, LARGEST_BODY + 1)
                 size += len(piece)
                 if size > LARGEST_BODY:
                     raise TooMuch(f"the answer has more than {LARGEST_BODY >> 20} MB")
                 if time.monotonic() > deadline:
-                    raise TimeoutError(f"the answer was not complete after {TIMEOUT:.0f} s")
+                    raise TimeoutError(f"the answer was not complete after {limit:.0f} s")
                 yield piece
 
         def close(self) -> None:

@@ -11,6 +11,8 @@ from lare.llm.prompts import Message
 
 MOST_TOKENS = 1 << 40
 """A server that reports more tokens is wrong."""
+TIMEOUT, SHARE = 120.0, 1 / 8
+"""The longest time for one reply: so many seconds, or this part of the time for all replies if that is longer."""
 
 
 class BudgetSpent(LareError):
@@ -48,6 +50,11 @@ class Budget:
         return left
 
     @property
+    def timeout(self) -> float:
+        """The longest time for one reply, in seconds."""
+        return max(TIMEOUT, SHARE * self.seconds)
+
+    @property
     def seconds_left(self) -> float:
         return max(0.0, self.seconds - self.seconds_waited)
 
@@ -69,9 +76,9 @@ class Budget:
         finally:
             self.seconds_waited += time.monotonic() - start
 
-    def patience(self, longest: float) -> str:
-        """How long the next reply is waited for, at most `longest` seconds, in words."""
-        return f"{min(longest, self.seconds_left):.0f} s at most ({minutes(self.seconds_left)} are left for all)"
+    def patience(self) -> str:
+        """How long the next reply is waited for, in words."""
+        return f"{min(self.timeout, self.seconds_left):.0f} s at most ({minutes(self.seconds_left)} are left for all)"
 
     def count(self, usage: Any, messages: Sequence[Message], reply: str) -> None:
         """Add the tokens of a reply, by the server's own count if it gives one."""

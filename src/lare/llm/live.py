@@ -1,6 +1,6 @@
 """A live language model behind any OpenAI-compatible endpoint: OpenAI, vLLM, Ollama, llama.cpp, gateways.
 
-    time-outs    see `bounded`; of all replies together, see `budget`
+    time-outs    see `budget`
     redirects    to another server are refused, because it would receive the request
     retries      408, 409, 429, 5xx and broken connections, with back-off or after the time that the server names
     structure    requested as a JSON schema; as a JSON object if the server has no schemas; else only in words
@@ -15,12 +15,13 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from lare.errors import LareError, pip_install
 from lare.foreign import read_json
 from lare.legible import in_a_line
-from lare.llm.bounded import LARGEST_BODY, TIMEOUT, Elsewhere, TooMuch, bound, in_time, stay
+from lare.llm.bounded import LARGEST_BODY, Elsewhere, TooMuch, bound, in_time, stay
 from lare.llm.budget import Budget, BudgetSpent
 from lare.llm.key import VARIABLE, key, without_key
 from lare.llm.prompts import Message
@@ -110,7 +111,8 @@ class LiveModel:
         """A client that limits the time and the size of answers."""
         import openai
 
-        http = openai.DefaultHttpxClient(event_hooks={"response": [stay, bound]}, timeout=TIMEOUT)
+        limit = self.budget.timeout
+        http = openai.DefaultHttpxClient(event_hooks={"response": [stay, partial(bound, limit=limit)]}, timeout=limit)
         return openai.OpenAI(
             api_key=key() or "none", base_url=self.endpoint, max_retries=0, http_client=http, default_headers=PLAIN
         )
@@ -122,7 +124,7 @@ class LiveModel:
             ModelFailed: there was no reply, after all tries.
             BudgetSpent: the budget does not allow another request, or its time is over.
         """
-        self.said(f"{self.name}: waiting for a reply, {self.budget.patience(TIMEOUT)}")
+        self.said(f"{self.name}: waiting for a reply, {self.budget.patience()}")
         failure, tries = Failure("nothing was tried", again=True), 0
         while failure.again and tries < TRIES:
             try:
@@ -161,7 +163,7 @@ class LiveModel:
 
         try:
             with self.budget.clock():
-                body = in_time(fetch, min(TIMEOUT, self.budget.seconds_left))
+                body = in_time(fetch, min(self.budget.timeout, self.budget.seconds_left))
         except openai.APIStatusError as error:
             return self.refused(error)
         except openai.APIConnectionError as error:
