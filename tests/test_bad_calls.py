@@ -55,6 +55,8 @@ CALLS = {
     "lare.evaluate_run('run', 1.5)": "episodes = 1.5: a whole number, 1 or more",
     "lare.policy_of('none')": "none is not a run: there is no config.json in it",
     "lare.policy_of(run, 7)": "run has no seed 7; its seeds: 0",
+    "lare.stored_episodes('none')": "none is not a run: there is no config.json in it",
+    "lare.stored_episodes(run, 7)": "run has no seed 7; its seeds: 0",
     "policy([1, 2, 3])": f"{POLICY}the shape is (3,)",
     "policy('left')": "an observation is 2 numbers: no array can be made of str",
     "policy(np.zeros((0, 2)))": f"{POLICY}the shape is (0, 2)",

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from lare.tasks.load import load_task as load_task
     from lare.tasks.spec import TaskSpec as TaskSpec
     from lare.training.reflect import reflect as reflect
+    from lare.training.stored import stored_episodes as stored_episodes
     from lare.training.train import resume as resume
     from lare.training.train import train as train
 
@@ -52,6 +53,7 @@ HOMES = {
     "Settings": "lare.run.settings",
     "reflect": "lare.training.reflect",
     "resume": "lare.training.train",
+    "stored_episodes": "lare.training.stored",
     "train": "lare.training.train",
 }
 """The module of each public name. A name is imported on its first use, so that `lare --help`, and the process that

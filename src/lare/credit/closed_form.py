@@ -94,7 +94,7 @@ def kept(sums: Sums) -> Sums:
     """Split each number into two float32 numbers that add up to it, along a new leading axis."""
 
     def two(number: Array) -> Float[Array, "2 *shape"]:
-        # Not number.astype(float32): on a GPU, XLA drops a conversion to float32 and back, and the second number would be 0.
+        # Not number.astype(float32): XLA may leave out a conversion to float32 and back, and the second number would be 0.
         first = jax.lax.reduce_precision(number, exponent_bits=8, mantissa_bits=23)
         return jnp.stack([first, number - first]).astype(jnp.float32)
 

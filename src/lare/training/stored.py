@@ -1,0 +1,81 @@
+"""The episodes that the replay of a run holds, as logs."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int
+
+from lare.data.replay import Replay
+from lare.errors import LareError
+from lare.run.directory import Run, as_run
+from lare.tasks.env import EnvSpec, env_action
+from lare.training.session import load_learner
+
+READ = ("observation", "action", "reward")
+"""The columns of the replay that are needed."""
+
+Episode = Mapping[str, np.ndarray]
+"""The arrays of an episode, by name."""
+
+
+def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Episode]:
+    """The finished episodes in the replay of a run's last checkpoint, in the order of their environments and of time.
+
+    Each is a mapping as `lare.relabel` and `numpy.savez` take it, for an episode of T steps:
+
+        observations    [T + 1 observation]      the last one is that after the last step
+        actions         [T action]               in the units of the environment; [T], integers, if actions are discrete
+        rewards         [T]                      the true ones
+        terminations    [T]                      TD3, DDPG and SAC: whether the episode ended by itself
+        truncations     [T]                      TD3, DDPG and SAC: whether it reached its time limit
+
+    With many agents, the first three have an axis of agents after that of steps. Observations are flattened.
+
+    Args:
+        run: the run, or its directory.
+        seed: one of the run's seeds; the first by default.
+
+    Raises:
+        LareError: there is no checkpoint, it does not hold such episodes, or the run has no such seed.
+    """
+    run = as_run(run)
+    place = run.place_of(seed)
+    config, learner, _, _ = load_learner(run)
+    held: Replay = learner.replay
+    if missing := [name for name in READ if name not in held.columns]:
+        raise LareError(
+            f"{run.directory} does not store the column {missing[0]}: its algorithm and its method do not read it"
+        )
+    found = []
+    for env in range(held.row.shape[1]):
+        row, first = (np.asarray(one[place, env]) for one in (held.row, held.first))
+        columns = {
+            name: np.asarray(values[place, env])
+            for name, values in held.columns.items()
+            if name in (*READ, "terminated")
+        }
+        for episode in range(int(held.oldest[place, env]), int(held.episodes[place, env])):
+            begin, end = first[episode % len(first)], first[(episode + 1) % len(first)]
+            if episode + 1 == held.episodes[place, env] and not held.running[place, env]:  # nothing came after it
+                end = int(held.transitions[place, env])
+            found.append(episode_of(columns, row[np.arange(begin, end) % len(row)], config.env))
+    return found
+
+
+def episode_of(columns: Mapping[str, np.ndarray], rows: Int[np.ndarray, " steps"], env: EnvSpec) -> Episode:
+    """One episode, from the numbers of the rows of its steps."""
+    size = len(columns["observation"])
+    action = env_action(columns["action"][rows % size], env)
+    action = np.argmax(action, axis=-1) if env.discrete else action
+    each = {
+        "observations": columns["observation"][np.append(rows, rows[-1] + 1) % size],
+        "actions": action,
+        "rewards": columns["reward"][rows % size],
+    }
+    alone = {name: values[:, 0] if env.agents == 1 else values for name, values in each.items()}
+    if "terminated" not in columns:
+        return alone
+    terminated = columns["terminated"][rows % size]
+    last = np.arange(len(rows)) == len(rows) - 1
+    return alone | {"terminations": terminated, "truncations": last & ~terminated}
