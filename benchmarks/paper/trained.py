@@ -47,10 +47,6 @@ JUDGED = (
     "Three seeds on one task decide nothing: their p is at least 0.05."
 )
 
-OF_ONE_AGENT = (
-    "Factors judge the observation after the step (the paper: before it). Reacher-v4 is the exception: its own reward looks at the "
-    "observation before the step.",
-)
 ALWAYS = (
     "Running statistics normalise the returns and the inputs of all gradient-trained decoders, also those of the baselines "
     "(the paper normalises nothing).",
@@ -108,8 +104,25 @@ def differences(exhibit: Exhibit, budget: Budget, tasks: int, runs: Sequence[Run
     if budget.settings:
         yield "**Networks of a few units, small batches, two episodes in an evaluation: it runs, and learns nothing.**"
     yield from exhibit.differences
-    yield from OF_ONE_AGENT if one_agent else ()
+    if one_agent:
+        yield from of_one_agent({run.config.task.name: run for run in runs})
     yield from ALWAYS
+
+
+def of_one_agent(runs: Mapping[str, Run]) -> Iterator[str]:
+    """Differences from the paper's protocol for one agent; `runs` has one run of each task."""
+    for task, run in runs.items():
+        drawn, longest = run.config.settings.credit.drawn_steps, env_spec(run.config.task).max_steps
+        if longest < drawn:
+            yield (
+                f"Episodes of fewer than {drawn} steps are taken whole, so that RRD and RRD-unbiased are the same as RD on {task}, "
+                f"whose episodes have {longest} steps (the paper: {drawn} steps)."
+            )
+    before = [task for task, run in runs.items() if run.config.task.judges == "before"]
+    exception = (
+        f" {before[0]} is the exception: its own reward looks at the observation before the step." if before else ""
+    )
+    yield f"Factors judge the observation after the step (the paper: before it).{exception}"
 
 
 def protocol(runs: Sequence[Run]) -> str:

@@ -334,7 +334,10 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
         compared = (values.ravel() for values in (r_hat, true, last, mask))
         found.append(accuracy.metrics(*compared, in_reward_units=config.method.in_reward_units))
         if learner.credit:
-            found[-1]["credit/return_r2"] = prediction.r2(learner.credit[place].predictions)[0]
+            credit = learner.credit[place]
+            found[-1]["credit/return_r2"] = prediction.r2(credit.predictions)[0]
+            if credit.rivals is not None:
+                found[-1]["credit/average"] = credit.average.astype(jnp.float32)
     return by_team(found, config)
 
 
