@@ -22,6 +22,7 @@ MUST_NOT_KNOW = {
     "legible": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
     "files": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
     "compilation": "tasks llm latent data credit networks algorithms run training plugs logs experiments deploy cli",
+    "float64": "tasks llm latent data credit networks algorithms run training plugs logs experiments deploy cli",
     "source": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",
     "networks": "tasks llm latent credit algorithms run training plugs logs experiments deploy cli",
     "normalise": "tasks llm latent credit networks algorithms run training plugs logs experiments deploy cli",

@@ -12,7 +12,7 @@ would be wrong. So they are kept fixed for a while. Whenever the number of steps
 stored episodes are summed again. Each step is summed three times on average, however many steps there are.
 
 The sums need float64: if features are nearly collinear, float32 loses all precision. The stored state holds each number as the
-sum of two float32 numbers. Call functions that take or return `Sums` within `jax.enable_x64(True)`.
+sum of two float32 numbers. Call functions that take or return `Sums` within `float64()`.
 """
 
 import itertools

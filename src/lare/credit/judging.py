@@ -25,6 +25,7 @@ from lare.credit.decomposition import AVERAGE, SUM
 from lare.credit.evidence import Posterior, Sums
 from lare.credit.explanation import Explanation, explain
 from lare.credit.returns import BETTER
+from lare.float64 import float64
 
 FIRST = 10
 """Number of episodes before the first prediction."""
@@ -57,7 +58,7 @@ def judge(
         score: `sum` or `average`, if the form of the score is known.
     """
     length = np.array([len(steps) for steps in rows])
-    with jax.enable_x64(True):
+    with float64():
         means = mean_features(rows, alive, basis)
         forms = (SUM, AVERAGE) if len(set(length)) > 1 else (SUM,)
         forms = {"sum": (SUM,), "average": (AVERAGE,)}.get(score or "", forms)

@@ -12,6 +12,7 @@ from lare.credit.returns import deviation
 from lare.credit.settings import RECENT
 from lare.data import replay
 from lare.experiments.watch import newest_episode
+from lare.float64 import float64
 from lare.run.directory import Run
 from lare.training.config import TrainConfig
 from lare.training.learner import Learner, Paid, features, rewards
@@ -57,9 +58,9 @@ def credit_of(run: Run) -> Credit | None:
     proxy = rewards(steps, Paid(one.credit, one.scale), config)
     uncertainty = None
     if one.credit and config.method.fit is Fit.EVIDENCE and config.judged_rows == 1:
-        with jax.enable_x64(True):
-            known = deviation(one.credit[0], features(steps, config, 0)[:, 0], config.forms)
-        uncertainty = 2 * np.asarray(known) / np.where(one.credit[0].average, steps.length, 1)
+        with float64():
+            known = np.asarray(deviation(one.credit[0], features(steps, config, 0)[:, 0], config.forms))
+        uncertainty = 2 * known / np.where(one.credit[0].average, steps.length, 1)
     factors = np.asarray(steps.before["factors"]) if "factors" in steps.before else np.zeros((len(proxy), 1, 0))
     correlations = factor_correlations(learner, config)
     reward = np.asarray(steps.before["reward"])

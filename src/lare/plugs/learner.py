@@ -13,6 +13,7 @@ from lare.credit import closed_form, decomposition, explanation, prediction, ret
 from lare.credit.decomposition import Decomposition, Episodes
 from lare.credit.methods import Encoder, Fit, Reward
 from lare.credit.words import entry_names, words
+from lare.float64 import float64
 from lare.normalise import Scale, new_scale
 from lare.plugs import compiled, draws
 from lare.plugs.compiled import Flat, on_host, padded, padding
@@ -156,14 +157,14 @@ class Learner:
         new = [kept for group in self.pending if (kept := [one for one in group if one.steps[0] >= oldest])]
         self.pending.clear()
         self.untold = 0
-        with on_host(), jax.enable_x64(True):
+        with on_host(), float64():
             while new:
                 now = new.pop(0)
                 while new and len(now) < self.until_the_next_fit:
                     now += new.pop(0)
                 self.told += len(now)
                 if self.state is not None:
-                    self.state = self.after(self.state, now, list(chain.from_iterable(new)))
+                    self.state = jax.block_until_ready(self.after(self.state, now, list(chain.from_iterable(new))))
 
     def after(self, state: Decomposition, now: Sequence[Episode], later: Sequence[Episode]) -> Decomposition:
         """The state of a decoder that has learned from some new episodes, while others still wait."""
@@ -194,8 +195,9 @@ class Learner:
         if self.state is None or not self.store.episodes:
             return
         if not self.config.method.descends:
-            with on_host(), jax.enable_x64(True):
-                self.state = compiled.fit_in_closed_form(self.state, self.config.method.name, self.config.forms)
+            with on_host(), float64():
+                found = compiled.fit_in_closed_form(self.state, self.config.method.name, self.config.forms)
+                self.state = jax.block_until_ready(found)
             return
         self.owed = 0.0
         for start in range(0, updates, CHUNK):
@@ -239,7 +241,7 @@ class Learner:
         basis = replace(self.config.basis, extended=True)
         if self.state is None or not self.store.episodes or not basis.size:
             return []
-        with on_host(), jax.enable_x64(True):
+        with on_host(), float64():
             judge = self.state._replace(closed=closed_form.init(basis, 1))
             judge = compiled.begin_again(judge)
             for piece in self.pieces(list(self.store.episodes.values())):

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from lare.algorithms.table import Consumes
 from lare.data.trajectory import Trajectory
+from lare.float64 import float64
 from lare.training import episodes, off_policy, on_policy, sequences
 from lare.training import learner as common
 from lare.training.config import TrainConfig
@@ -96,8 +97,8 @@ def compiled(config: TrainConfig) -> Compiled:
     learn = jax.jit(partial(episodes.learn_returns, config=config))
 
     def learn_returns(learner: Learner) -> Learner:
-        with jax.enable_x64(True):
-            credit, counted = learn(learner.credit, learner.replay, learner.counted)
+        with float64():
+            credit, counted = jax.block_until_ready(learn(learner.credit, learner.replay, learner.counted))
         return learner._replace(credit=credit, counted=counted)
 
     return Compiled(

@@ -4,7 +4,7 @@ Every method that predicts returns has this order: predict, then learn. So `cred
 had been fitted to.
 
 The functions are written for all seeds: steps are read in lockstep, and closed-form fits are made one seed after the other, when
-they are due. The functions must be called within `jax.enable_x64(True)`, because `closed_form.py` needs float64.
+they are due. The functions must be called within `float64()`, because `closed_form.py` needs float64.
 """
 
 from collections.abc import Callable

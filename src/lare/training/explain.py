@@ -13,6 +13,7 @@ from lare.credit.explanation import Explanation, explain
 from lare.credit.methods import METHODS, Decoder
 from lare.credit.words import FEWEST, entry_names, words
 from lare.data.replay import Replay
+from lare.float64 import float64
 from lare.run.directory import Run
 from lare.training.config import TrainConfig
 from lare.training.episodes import from_stored
@@ -41,7 +42,7 @@ def explanations(learner: Learner, config: TrainConfig) -> list[Explanation]:
     known = learner.credit and all(basis.size for basis in chosen.bases)
     if not known or np.sum(np.asarray(held.episodes)[0] - np.asarray(held.oldest)[0]) < FEWEST:
         return []
-    with jax.enable_x64(True):
+    with float64():
         found = explaining(chosen)(held, tuple(credit.average for credit in learner.credit))
         return [jax.tree.map(np.asarray, each) for each in found]
 

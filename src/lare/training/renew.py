@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from lare.data.replay import Replay, StoredSteps, oldest_transition, read
 from lare.data.sampling import episodes_since, in_order
+from lare.float64 import float64
 from lare.latent.function import LatentFunction
 from lare.latent.improve import Model, improve
 from lare.run.directory import Run
@@ -123,8 +124,8 @@ def with_functions(run: Run, config: TrainConfig, learner: Learner) -> Learner:
     columns["factors"] = jnp.stack([factors_again(run, config, buffer) for buffer in buffers])
     buffer = learner.replay._replace(columns=columns)
     credit = jax.vmap(partial(untrained, config=config))(learner.credit, seed_keys(jnp.asarray(run.seeds), 0))
-    with jax.enable_x64(True):
-        credit = jax.jit(partial(fitted_to_all, config=config))(credit, buffer)
+    with float64():
+        credit = jax.block_until_ready(jax.jit(partial(fitted_to_all, config=config))(credit, buffer))
     return learner._replace(credit=credit, replay=buffer, counted=jnp.copy(buffer.episodes))
 
 
