@@ -183,9 +183,11 @@ def test_the_sweeps_of_the_benchmarks_can_be_trained(path):
 KILLED = FILE.replace('"dense", ', "").replace("[0, 3]", "[0]").replace("steps = 200", "steps = 100_000")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, long(signal.SIGKILL)])
-def test_a_sweep_that_is_stopped_or_killed_leaves_a_saved_run_and_nobody_behind(number, file, tmp_path):
-    """Ctrl-C reaches the whole group of processes, as in a terminal; the others reach the sweep alone."""
+@pytest.mark.parametrize(("number", "after"), [(signal.SIGINT, 200), long(signal.SIGINT, 0), long(signal.SIGKILL, 200)])
+def test_a_sweep_that_is_stopped_or_killed_leaves_a_saved_run_and_nobody_behind(number, after, file, tmp_path):
+    """Ctrl-C reaches the whole group of processes, as in a terminal; the others reach the sweep alone. After 0 steps, the run is
+    still compiling.
+    """
     file.write_text(KILLED)
     # Where these tests run in the background of a shell, what they start would be deaf to Ctrl-C.
     hearing = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
@@ -193,7 +195,7 @@ def test_a_sweep_that_is_stopped_or_killed_leaves_a_saved_run_and_nobody_behind(
     sweeping = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
     (job,) = read_sweep(file)[1]
     until = time.monotonic() + 120
-    while not job.begun or job.step() < 200:
+    while not job.begun or job.step() < after:
         assert time.monotonic() < until
         time.sleep(0.1)
     (os.killpg if number is signal.SIGINT else os.kill)(sweeping.pid, number)
@@ -211,8 +213,10 @@ def test_a_sweep_that_is_stopped_or_killed_leaves_a_saved_run_and_nobody_behind(
             except OSError:
                 assert time.monotonic() < until
                 time.sleep(0.1)
-    last = job.directory.with_name(job.directory.name + ".log").read_text().splitlines()[-1]
-    assert re.match(r"stopped at step \d+ and saved; to continue: lare train --resume ", last)
+    last = job.directory.with_name(job.directory.name + ".log").read_text().splitlines()[-1:]
+    if not after and not last:
+        return  # it ended before it had anything to save
+    assert re.match(r"stopped at step \d+ and saved; to continue: lare train --resume ", last[0])
 
 
 def test_a_process_that_fails_says_why(file, tmp_path):

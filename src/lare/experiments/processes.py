@@ -146,6 +146,7 @@ def main() -> None:
     It ends when its parent ends, which it sees by the end of standard input. Errors go to standard output. Everything else
     that is printed goes to the log.
     """
+    signal.signal(signal.SIGINT, lambda number, frame: os._exit(130))  # until training begins, there is nothing to save
     answer = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     order = json.loads(sys.stdin.readline())

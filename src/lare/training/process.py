@@ -1,6 +1,7 @@
 """Events that the training process must handle: memory that runs out, and requests to stop."""
 
 import contextlib
+import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -29,7 +30,7 @@ def enough_memory(run: Run) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_requests() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C or SIGTERM sets. The second one ends the process at once."""
+    """An event that the first Ctrl-C or SIGTERM sets, which is said on standard error. The second one ends the process at once."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop  # only the main thread may set signal handlers
@@ -39,6 +40,8 @@ def stop_requests() -> Iterator[threading.Event]:
         if stop.is_set():
             raise KeyboardInterrupt
         stop.set()
+        with contextlib.suppress(OSError):
+            os.write(2, b"\nstopping after this iteration (a second Ctrl-C or SIGTERM ends it at once)\n")
 
     before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -1,5 +1,6 @@
 """Training from the start or from a checkpoint to the end: the outer loop of Algorithm 1 of the LaRe paper."""
 
+import threading
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -79,8 +80,8 @@ def train(
     run = create(Path(out) if out is not None else default_directory(task, resolved), task, resolved, functions)
     in_vain = list(set_in_vain(given, resolved, task).values())
     said = in_vain[:1] if len(in_vain) < 2 else [f"{in_vain[0]} (and {len(in_vain) - 1} more)"]
-    with locked(run), enough_memory(run):
-        return begin(run, model, tensorboard, told, *said)
+    with locked(run), enough_memory(run), stop_requests() as stop:
+        return begin(run, model, tensorboard, told, stop, *said)
 
 
 def chosen_functions(
@@ -164,16 +165,16 @@ def resume(
     if tensorboard:
         summary_writer()
     check_model(run.config.settings, model)
-    with locked(run), enough_memory(run):
+    with locked(run), enough_memory(run), stop_requests() as stop:
         run = run if steps is None else run.extended(steps)
         if not run.has_checkpoint():
             if run.metrics():  # metrics are never removed
                 raise LareError(f"{run.directory} has no checkpoint any more: it cannot be resumed")
-            return begin(run, model, tensorboard, told)
+            return begin(run, model, tensorboard, told, stop)
         prepare(run, told)
         restored, messages = sessions.restore(run)
         run.truncate(restored.metrics_length)
-        return finish(restored, model, tensorboard, told, *messages)
+        return finish(restored, model, tensorboard, told, stop, *messages)
 
 
 def told_by(listeners: Sequence[Listener] | None) -> list[Listener]:
@@ -206,12 +207,14 @@ def prepare(run: Run, told: Sequence[Listener]) -> None:
     compilation.keep()
 
 
-def begin(run: Run, model: Model | None, tensorboard: bool, told: list[Listener], *messages: str) -> Run:
+def begin(
+    run: Run, model: Model | None, tensorboard: bool, told: list[Listener], stop: threading.Event, *messages: str
+) -> Run:
     """Train from the first step on. The untrained learner is saved, so that there is always a checkpoint."""
     prepare(run, told)
     started = sessions.start(run)
     started.save()
-    return finish(started, model, tensorboard, told, *messages)
+    return finish(started, model, tensorboard, told, stop, *messages)
 
 
 def finish(
@@ -219,9 +222,10 @@ def finish(
     model: Model | None,
     tensorboard: bool,
     told: list[Listener],
+    stop: threading.Event,
     *messages: str,
 ) -> Run:
-    """Run a session to its end, or until the user stops it."""
+    """Run a session to its end, or until `stop` is set."""
     run, settings = session.run, session.settings
     clock, explained = Clock(session.step), False
     returns: list[np.ndarray] = []
@@ -235,45 +239,44 @@ def finish(
             told.append(TensorBoard(run.directory / EVENTS, session.step, run.seeds))
         for listener in told:
             introduce(session, listener, messages)
-        with stop_requests() as stop:
-            while session.step < settings.steps:
-                try:
-                    session.advance(stop.is_set)
-                except first_fit.Stopped:
-                    raise Interrupted(
-                        f"stopped during the decoder's first fit; to continue: lare train --resume {run.directory}"
-                    ) from None
+        while session.step < settings.steps:
+            if stop.is_set():
+                check_losses(session)
+                session.save()
+                raise Interrupted(
+                    f"stopped at step {session.step} and saved; to continue: lare train --resume {run.directory}"
+                )
+            try:
+                session.advance(stop.is_set)
+            except first_fit.Stopped:
+                raise Interrupted(
+                    f"stopped during the decoder's first fit; to continue: lare train --resume {run.directory}"
+                ) from None
+            for listener in told:
+                listener.stepped(session.step)
+            if session.step - settings.iteration_steps <= settings.warmup < session.step:
+                for line in advice.of_observations(run, session.learner.replay, session.config):
+                    say(line)
+            if session.step % settings.evaluate_every == 0 or session.step == settings.steps:
+                lines = session.report(clock.rate(session.step))
+                check_losses(session)
+                session.metrics_length = run.append(lines)
+                session.save()
                 for listener in told:
-                    listener.stepped(session.step)
-                if session.step - settings.iteration_steps <= settings.warmup < session.step:
-                    for line in advice.of_observations(run, session.learner.replay, session.config):
+                    listener.evaluated(lines)
+                if "critic/loss" in lines[0]:
+                    returns.append(np.array([line["evaluation/return"] for line in lines]))
+                    for line in advice.of_returns(returns):
                         say(line)
-                if session.step % settings.evaluate_every == 0 or session.step == settings.steps:
-                    lines = session.report(clock.rate(session.step))
-                    check_losses(session)
-                    session.metrics_length = run.append(lines)
-                    session.save()
-                    for listener in told:
-                        listener.evaluated(lines)
-                    if "critic/loss" in lines[0]:
-                        returns.append(np.array([line["evaluation/return"] for line in lines]))
-                        for line in advice.of_returns(returns):
-                            say(line)
-                    if session.step == settings.steps or not explained:
-                        sentences = explanation(session)
-                        for line in sentences:
-                            say(line)
-                        explained = explained or bool(sentences)
-                    if session.step == settings.steps and not settings.untrained and (why := run.untrained):
-                        say(why)
-                if model is not None and due(session.step, settings.reflect_every, settings.steps):
-                    session.reflect(model, say)
-                if stop.is_set() and session.step < settings.steps:
-                    check_losses(session)
-                    session.save()
-                    raise Interrupted(
-                        f"stopped at step {session.step} and saved; to continue: lare train --resume {run.directory}"
-                    )
+                if session.step == settings.steps or not explained:
+                    sentences = explanation(session)
+                    for line in sentences:
+                        say(line)
+                    explained = explained or bool(sentences)
+                if session.step == settings.steps and not settings.untrained and (why := run.untrained):
+                    say(why)
+            if model is not None and due(session.step, settings.reflect_every, settings.steps):
+                session.reflect(model, say)
     finally:
         for listener in told:
             listener.stopped()
