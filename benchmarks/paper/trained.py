@@ -50,7 +50,7 @@ JUDGED = (
 ALWAYS = (
     "Running statistics normalise the returns and the inputs of all gradient-trained decoders, also those of the baselines "
     "(the paper normalises nothing).",
-    "The recorded replies come from a newer language model than the paper's.",
+    "The recorded replies come from Claude (in November 2026); the paper's come from GPT-4o.",
     "The seed of training and the draw of the language model are independent; in the paper they change together.",
 )
 """Differences from the paper's protocol."""

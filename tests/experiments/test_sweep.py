@@ -73,6 +73,18 @@ def test_every_run_that_is_asked_for(file, tmp_path):
     assert not any(job.done or job.begun for job in jobs)
 
 
+def test_a_check_lists_the_runs_and_trains_none(file, command):
+    _, (dense, *_) = read_sweep(file)
+    train_one(as_json(dense))
+    status, out, _ = command("sweep", file, "--check")
+    assert status == 0
+    assert out.splitlines() == [
+        "Reacher-v4/dense-td3: done",
+        "Reacher-v4/lare-linear-td3-draw0: step 0 of 200",
+        "Reacher-v4/lare-linear-td3-draw3: step 0 of 200",
+    ]
+
+
 def test_what_is_done_is_left_alone_and_what_was_begun_goes_on(file, in_this_process):
     wanted, (dense, first, second) = read_sweep(file)
     train_one(as_json(dense))

@@ -173,7 +173,10 @@ def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes:
     if len({one.total for one in episodes}) == 1:
         say(f"All {len(episodes)} episodes have the same return, which says nothing about the factors.")
         if role.environment != "none":
-            say("Does the environment pay, and before its time limit (max_episode_steps)?")
+            say(
+                "Does the environment pay before its time limit (max_episode_steps)? If it does, let its score differ between bad "
+                "episodes too: a grade that is 0 for all random actions teaches nothing."
+            )
         return
     if math.isfinite(found.r2):
         shown = f"{found.r2:.3f}" if found.r2 > 0.99 else f"{found.r2:.2f}"

@@ -22,6 +22,7 @@ Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")]
 def sweep(
     file: Annotated[Positional[Path], tyro.conf.arg(metavar="FILE")],
     ray: Ray = None,
+    check: bool = False,
 ) -> None:
     """Train the runs that a TOML file lists and that are not finished yet. All metrics go to results.csv and .parquet.
 
@@ -29,15 +30,20 @@ def sweep(
         file: lists tasks, methods, algorithms, draws and settings, and how many processes run at a time, on how many cores each
             (docs/sweeps.md).
         ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
+        check: only check the file, list its runs and how far they are, and train nothing.
     """
     from lare.cli.watch import watching
-    from lare.experiments.sweep import read_sweep, run_sweep
+    from lare.experiments.sweep import is_done, read_sweep, run_sweep
     from lare.experiments.tables import rows_of, write_table
 
     wanted, jobs = read_sweep(file)
     for job in jobs:
         if warning := job.resolved.untrained:
             progress(f"{job.name}: {warning}")
+    if check:
+        for job in jobs:
+            say(f"{job.name}: {'done' if is_done(job) else f'step {job.step():,} of {job.resolved.steps:,}'}")
+        return
 
     def tabulate() -> None:
         rows = rows_of(job.directory for job in jobs)

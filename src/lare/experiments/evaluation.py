@@ -73,15 +73,15 @@ def evaluation_of(run: Run, episodes: int, best: bool = False) -> Evaluation:
     return together(parts)
 
 
-def random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
-    """True returns of random actions: up to ten episodes, or as many as begin within some seconds.
+def random_returns(task: TaskSpec, episodes: int = RANDOM_EPISODES) -> Float[np.ndarray, " episodes"]:
+    """True returns of random actions: of so many episodes, or as many as begin within some seconds.
 
     Empty if the environment must not be imported for a report, or does not run.
     """
     found, until = [], time.monotonic() + PATIENCE
     if unknown_module(task) is None:
         with suppress(LareError), closing(make_host_env(task.roles[0])) as env:
-            while len(found) < RANDOM_EPISODES and time.monotonic() < until:
+            while len(found) < episodes and time.monotonic() < until:
                 random = np.random.default_rng(len(found))
                 found.append(episode_of(env, task.roles[0], None, random, len(found)).total)
     return np.array(found)

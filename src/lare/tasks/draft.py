@@ -12,7 +12,7 @@ from lare.tasks.spec import FILL_IN
 JUDGES = (
     'judges = "after" # a step is judged by the observation after it; "before": the one in which the agent acts; "both"'
 )
-SCORE = '# score = "average" # of episodes that differ in length: a mean over the steps, or a grade; "sum": a sum over the steps'
+SCORE = '# score = "average" # only if episodes differ in length. "average": a mean over the steps, or a grade; "sum": a sum'
 
 WANTED = {
     "description": "what is to be solved, and what the goal is; not a word about the reward",

@@ -34,10 +34,20 @@ def draft(environment_id: str) -> Draft:
     try:
         for what, space in (("observation", environment.observation_space), ("action", environment.action_space)):
             if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-                raise LareError(f"the {what} space of {environment_id} is {space}, which is no row of numbers")
+                raise LareError(f"the {what} space of {environment_id} is {space}, which is {instead(what)}")
         return write(environment_id, environment)
     finally:
         environment.close()
+
+
+def instead(what: str) -> str:
+    """The kinds of space that can be used, for a message."""
+    if what == "observation":
+        return "no row of numbers"
+    return (
+        "neither one row of bounded numbers (Box) nor one choice (Discrete): of several choices, make one choice of all their "
+        "combinations, or numbers that the environment rounds"
+    )
 
 
 def write(environment_id: str, environment: gymnasium.Env) -> Draft:
