@@ -140,7 +140,7 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
     """Evaluate the policy of a run by its true return, from initial states that no evaluation of the run has used.
 
     Prints the mean return of the policy with its standard deviation, and the same of as many episodes of random actions, or
-    fewer if they take long. Their initial states are others.
+    fewer if they take long, from other initial states than the policy's.
 
     Args:
         run: a run directory.
