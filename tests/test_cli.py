@@ -403,7 +403,7 @@ def test_from_training_to_report(command, spec_file, phi):
     assert (status, err) == (0, "")
     evaluated, by_chance = out.splitlines()
     assert re.fullmatch(r"seed 0: return -\S+ ± \S+ over 2 episodes", evaluated)
-    assert re.fullmatch(r"random actions: return -\S+ ± \S+ over 2 episodes", by_chance)
+    assert re.fullmatch(r"random actions: return -\S+ ± \S+ over 10 episodes", by_chance)
 
     assert command("report", run) == (0, f"wrote {run / 'report.html'}\n", "")
     assert "f_near" in (run / "report.html").read_text(encoding="utf-8")

@@ -139,8 +139,8 @@ def model_of(model: str | None, base_url: str | None, task: str) -> "Model | Non
 def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: Path | None = None) -> None:
     """Evaluate the policy of a run by its true return, from initial states that no evaluation of the run has used.
 
-    Prints the mean return of the policy with its standard deviation, and the same of as many episodes of random actions, or
-    fewer if they take long, from other initial states than the policy's.
+    Prints the mean return of the policy with its standard deviation, and the same of as many episodes of random actions, at
+    least ten (fewer if they take long), from other initial states than the policy's.
 
     Args:
         run: a run directory.
@@ -148,7 +148,7 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
         best: play the policy of each seed's best evaluation, instead of the last policy.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
-    from lare.experiments.evaluation import evaluation_of, random_returns
+    from lare.experiments.evaluation import RANDOM_EPISODES, evaluation_of, random_returns
     from lare.experiments.statistics import mean_and_deviation, plus_minus
     from lare.experiments.video import check_video, record_video
     from lare.run.directory import open_run
@@ -174,7 +174,7 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
             of_seed = plus_minus(*mean_and_deviation(found.returns[place, :, team]))
             of_best = "" if since is None else f" (the policy of step {since[place]:,})"
             say(f"{named}seed {seed}: return {of_seed} over {counted}{of_best}")
-    if len(roles) == 1 and len(by_chance := random_returns(opened.config.task, episodes)):
+    if len(roles) == 1 and len(by_chance := random_returns(opened.config.task, max(episodes, RANDOM_EPISODES))):
         say(f"random actions: return {plus_minus(*mean_and_deviation(by_chance))} over {len(by_chance)} episodes")
     for name, values in found.measures.items():
         for seed, of_seed in zip(opened.seeds, values, strict=True):

@@ -27,7 +27,7 @@ AT_A_TIME = 20
 """Environments of a seed that are open at the same time."""
 
 RANDOM_EPISODES, PATIENCE = 10, 5.0
-"""The largest number of episodes with random actions, and the seconds within which they begin."""
+"""The usual number of episodes with random actions, and the seconds within which they begin."""
 
 
 def evaluate_run(

@@ -3,13 +3,15 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from lare.data.replay import Replay
+from lare.data.replay import Replay, end_of
 from lare.errors import LareError
 from lare.run.directory import Run, as_run
 from lare.tasks.env import EnvSpec, env_action
+from lare.training.seeds import of_seed
 from lare.training.session import load_learner
 
 READ = ("observation", "action", "reward")
@@ -42,23 +44,20 @@ def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Epis
     run = as_run(run)
     place = run.place_of(seed)
     config, learner, _, _ = load_learner(run)
-    held: Replay = learner.replay
+    held: Replay = of_seed(learner.replay, place)
     if missing := [name for name in READ if name not in held.columns]:
         raise LareError(
             f"{run.directory} does not store the column {missing[0]}: its algorithm and its method do not read it"
         )
     found = []
-    for env in range(held.row.shape[1]):
-        row, first = (np.asarray(one[place, env]) for one in (held.row, held.first))
+    for env in range(len(held.row)):
+        row, first = np.asarray(held.row[env]), np.asarray(held.first[env])
         columns = {
-            name: np.asarray(values[place, env])
-            for name, values in held.columns.items()
-            if name in (*READ, "terminated")
+            name: np.asarray(values[env]) for name, values in held.columns.items() if name in (*READ, "terminated")
         }
-        for episode in range(int(held.oldest[place, env]), int(held.episodes[place, env])):
-            begin, end = first[episode % len(first)], first[(episode + 1) % len(first)]
-            if episode + 1 == held.episodes[place, env] and not held.running[place, env]:  # nothing came after it
-                end = int(held.transitions[place, env])
+        episode = jnp.arange(int(held.oldest[env]), int(held.episodes[env]))
+        ends = np.asarray(end_of(held, jnp.full_like(episode, env), episode))
+        for begin, end in zip(first[episode % len(first)], ends, strict=True):
             found.append(episode_of(columns, row[np.arange(begin, end) % len(row)], config.env))
     return found
 
