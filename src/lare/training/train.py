@@ -4,6 +4,7 @@ import threading
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -230,9 +231,10 @@ def finish(
     clock, explained = Clock(session.step), False
     returns: list[np.ndarray] = []
 
-    def say(line: str) -> None:
-        for listener in told:
-            listener.said(line)
+    def say(*lines: str) -> None:
+        for line in lines:
+            for listener in told:
+                listener.said(line)
 
     try:
         if tensorboard:
@@ -240,40 +242,24 @@ def finish(
         for listener in told:
             introduce(session, listener, messages)
         while session.step < settings.steps:
-            if stop.is_set():
-                check_losses(session)
-                session.save()
-                raise Interrupted(
-                    f"stopped at step {session.step} and saved; to continue: lare train --resume {run.directory}"
-                )
-            try:
-                session.advance(stop.is_set)
-            except first_fit.Stopped:
-                raise Interrupted(
-                    f"stopped during the decoder's first fit; to continue: lare train --resume {run.directory}"
-                ) from None
+            advance(session, stop)
             for listener in told:
                 listener.stepped(session.step)
             if session.step - settings.iteration_steps <= settings.warmup < session.step:
-                for line in advice.of_observations(run, session.learner.replay, session.config):
-                    say(line)
-            if session.step % settings.evaluate_every == 0 or session.step == settings.steps:
-                lines = session.report(clock.rate(session.step))
-                check_losses(session)
-                session.metrics_length = run.append(lines)
-                session.save()
+                say(*advice.of_observations(run, session.learner.replay, session.config))
+            last = session.step == settings.steps
+            if last or session.step % settings.evaluate_every == 0:
+                lines = evaluate(session, clock.rate(session.step))
                 for listener in told:
                     listener.evaluated(lines)
                 if "critic/loss" in lines[0]:
                     returns.append(np.array([line["evaluation/return"] for line in lines]))
-                    for line in advice.of_returns(returns):
-                        say(line)
-                if session.step == settings.steps or not explained:
+                    say(*advice.of_returns(returns))
+                if last or not explained:
                     sentences = explanation(session)
-                    for line in sentences:
-                        say(line)
-                    explained = explained or bool(sentences)
-                if session.step == settings.steps and not settings.untrained and (why := run.untrained):
+                    say(*sentences)
+                    explained = bool(sentences)
+                if last and not settings.untrained and (why := run.untrained):
                     say(why)
             if model is not None and due(session.step, settings.reflect_every, settings.steps):
                 session.reflect(model, say)
@@ -282,6 +268,30 @@ def finish(
             listener.stopped()
         session.close()
     return session.run
+
+
+def advance(session: Session, stop: threading.Event) -> None:
+    """One iteration. Raises `Interrupted` if the user has asked the run to stop; the run is then saved."""
+    directory = session.run.directory
+    if stop.is_set():
+        check_losses(session)
+        session.save()
+        raise Interrupted(f"stopped at step {session.step} and saved; to continue: lare train --resume {directory}")
+    try:
+        session.advance(stop.is_set)
+    except first_fit.Stopped:
+        raise Interrupted(
+            f"stopped during the decoder's first fit; to continue: lare train --resume {directory}"
+        ) from None
+
+
+def evaluate(session: Session, rate: float) -> list[dict[str, Any]]:
+    """Evaluate, and write the metrics and a checkpoint; returns the lines of metrics.jsonl."""
+    lines = session.report(rate)
+    check_losses(session)
+    session.metrics_length = session.run.append(lines)
+    session.save()
+    return lines
 
 
 def due(step: int, every: int | None, last: int) -> bool:
