@@ -8,6 +8,7 @@ import pytest
 
 from lare.credit.basis import Basis
 from lare.credit.judging import FIRST, growing, judge, mean_features, predictions
+from lare.credit.returns import FormFound
 
 BASIS = Basis(2, 3, extended=True)
 
@@ -48,9 +49,9 @@ def test_no_return_is_seen_before_it_is_predicted():
 def test_the_form_is_found_or_given(form):
     rows, alive, returns = played(form)
     found = judge(rows, alive, returns, BASIS)
-    assert found.average == (form == "average")
+    assert found.form == FormFound(form == "average", decided=True)
     given = judge(rows, alive, returns, BASIS, form)
-    assert (given.average, given.r2) == (None, found.r2)
+    assert (given.form, given.r2) == (None, found.r2)
     assert judge(rows, alive, returns, BASIS, {"sum": "average", "average": "sum"}[form]).r2 < found.r2
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lare.credit import closed_form, decomposition, returns
+from lare.credit.returns import FormFound
 from lare.credit.settings import CreditSettings
 from lare.data import replay
 from lare.training import episodes
@@ -171,24 +172,26 @@ def test_the_form_of_the_score_is_found_out(method, score):
     *_, last = in_pieces(config, steps, factors, 6)
     assert bool(last.credit[0].average) == (score == "average")
     assert returns.form_found(untrained(config).credit[0]) is None
-    assert returns.form_found(last.credit[0]) == score
+    assert returns.form_found(last.credit[0]) == FormFound(score == "average", decided=True)
     assert returns.form_found(untrained(config_of(method, credit=CreditSettings(score=score))).credit[0]) is None
 
 
 @pytest.mark.parametrize(
-    ("errors", "form"),
+    ("average", "errors", "decided"),
     [
-        ((1.0, 0.9), "average"),
-        ((0.9, 1.0), "sum"),
-        ((1.0, 0.97), "undecided"),
-        ((0.97, 1.0), "undecided"),
-        ((1.0, 1.0), None),
+        (True, (1.0, 0.9), True),
+        (False, (0.9, 1.0), True),
+        (False, (1.0, 0.97), False),
+        (False, (0.97, 1.0), False),
+        (True, (0.9, 1.0), False),  # the last returns show another form than those before the last fit
+        (False, (1.0, 1.0), None),
     ],
 )
-def test_a_form_is_found_by_its_smaller_error(errors, form, monkeypatch):
+def test_the_form_is_the_decoders_and_decided_by_errors(average, errors, decided, monkeypatch):
     """Equal errors: all episodes have one length, and the form makes no difference."""
     monkeypatch.setattr(returns, "errors_told_apart", lambda _: np.array(errors))
-    assert returns.form_found(untrained(config_of("lare-linear")).credit[0]) == form
+    state = untrained(config_of("lare-linear")).credit[0]._replace(average=np.array(average))
+    assert returns.form_found(state) == (None if decided is None else FormFound(average, decided))
 
 
 @pytest.mark.parametrize("given", ["auto", "sum", "average"])

@@ -6,6 +6,7 @@ import pytest
 
 import lare
 from lare.credit.explanation import Explanation
+from lare.credit.returns import FormFound
 from lare.credit.words import entry_names, words
 from lare.latent.function import verified
 from lare.tasks.load import read_task
@@ -17,6 +18,7 @@ from toys import Ear, toy_spec
 def found(**changes):
     values = {
         "episodes": 40,
+        "varied": np.array([True, True]),
         "by_factors": 0.9,
         "by_all": 0.97,
         "slope": np.array([1.0, 2.0]),
@@ -55,11 +57,11 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
         ),
         (
             found(by_factors=0.05, by_all=0.05, left=np.zeros(2)),
-            "average",
+            FormFound(average=True, decided=True),
             FACTORS,
             ENTRIES,
             [
-                "The score is taken for an average over the steps of an episode: so far, this predicts returns better than a sum. "
+                "The score is treated as an average over the steps of an episode: so far, this predicts returns better than a sum. "
                 'This may change. If you know which of them it is, write `score = "sum"` or `score = "average"` into the task '
                 "file.",
                 "The factors explain 5% of the variation of the returns of 40 episodes.",
@@ -68,11 +70,11 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
         ),
         (
             found(by_factors=0.99, by_all=0.99, share=np.array([0.99, -0.001])),
-            "sum",
+            FormFound(average=False, decided=True),
             FACTORS,
             [],
             [
-                "The score is taken for a sum over the steps of an episode: so far, this predicts returns better than an average. "
+                "The score is treated as a sum over the steps of an episode: so far, this predicts returns better than an average. "
                 'This may change. If you know which of them it is, write `score = "sum"` or `score = "average"` into the task '
                 "file.",
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
@@ -83,12 +85,13 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
         ),
         (
             found(by_factors=0.05, by_all=0.05, left=np.zeros(2)),
-            "undecided",
+            FormFound(average=False, decided=False),
             [],
             [],
             [
                 "The score is treated as a sum over the steps of an episode: so far, an average predicts returns about as well. "
-                'If you know which of them it is, write `score = "sum"` or `score = "average"` into the task file.',
+                'This may change. If you know which of them it is, write `score = "sum"` or `score = "average"` into the task '
+                "file.",
                 "Raw features explain 5% of the variation of the returns of 40 episodes.",
             ],
         ),
@@ -114,6 +117,21 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
                 SHARES,
                 "- cost: 65%, +2 ± 0.1 (its effect is curved)",
                 "- speed: 25%, +1 ± 0.1 (its effect depends on another factor)",
+            ],
+        ),
+        (
+            found(by_factors=0.99, by_all=0.99, varied=np.array([True, False]), share=np.array([0.99, 0.0])),
+            None,
+            ["speed (before)", "busy (before)"],
+            [],
+            [
+                "The factors explain 99% of the variation of the returns of 40 episodes.",
+                SHARES,
+                "- speed (before): 99%, +1 ± 0.1",
+                "- busy (before): it has never varied",
+                "Each factor has two lines: before and after the step. If both ± are as large as the effects, the fit cannot tell "
+                "them apart: add up the two lines. If both ± are small and the effects have opposite signs, the change of the "
+                "factor in a step is paid.",
             ],
         ),
         (found(), None, [], [], ["Raw features explain 97% of the variation of the returns of 40 episodes."]),

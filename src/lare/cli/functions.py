@@ -113,7 +113,7 @@ def verify(
         data: logged episodes; the function is checked on their steps instead of random steps of the environment. A directory, a
             Parquet file, or the id of a local Minari data set.
         fit: number of episodes, 20 or more, whose returns the factors are fitted to: the first of --data, or episodes that are
-            played with random actions.
+            played with random actions, the same in every call.
         policy: a run whose policy plays the episodes for --fit, instead of random actions.
     """
     from lare.cli.design import policy_that_plays

@@ -225,7 +225,7 @@ def export(
         run: a run directory.
         out: the directory to write, which must not exist.
         seed: the seed whose policy and decoder are written; the default is the first.
-        best: write the policy of the seed's best evaluation, instead of the last policy.
+        best: write the policy of the seed's best evaluation, instead of the last policy. Proxy rewards are always the last ones.
     """
     import lare
     from lare.run.directory import open_run

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from lare.credit import evidence
 from lare.credit.basis import Basis, expand
@@ -38,6 +38,8 @@ class Explanation(NamedTuple):
     """The explanation of one team's score."""
 
     episodes: Float[Array, ""]
+    varied: Bool[Array, " factors"]
+    """Whether a factor has differed between steps."""
     by_factors: Float[Array, ""]
     """Share of the returns' variation that the factors explain, with their shapes and pairs; 0 if there are no factors."""
     by_all: Float[Array, ""]
@@ -66,7 +68,7 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     none = jnp.zeros(0)
     if not of_factors.any():
         left = jnp.zeros(basis.used_entries)
-        return Explanation(sums.episodes, jnp.zeros(()), by_all, none, none, none, none, none, left)
+        return Explanation(sums.episodes, none > 0, jnp.zeros(()), by_all, none, none, none, none, none, left)
     alone, numbers = restricted(sums, np.flatnonzero(of_factors)), group[of_factors]
     fitted = evidence.fit(alone, form, numbers, evidence.unknown(len(numbers), int(numbers.max()) + 1), ROUNDS)
     sigma = evidence.covariance(alone, form, numbers, fitted)
@@ -80,6 +82,7 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     steps = jnp.where(form == 1, sums.steps / jnp.maximum(sums.episodes, 1), 1)  # r_hat of an average is divided by T
     return Explanation(
         sums.episodes,
+        jnp.diagonal(given.s)[: basis.factors] > 0,
         by_factors,
         jnp.maximum(by_all, by_factors),
         slope / steps,

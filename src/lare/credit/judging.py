@@ -24,7 +24,7 @@ from lare.credit.closed_form import GROWTH_OF_FIT, ROUNDS, LinearDecoder
 from lare.credit.decomposition import AVERAGE, SUM
 from lare.credit.evidence import Posterior, Sums
 from lare.credit.explanation import Explanation, explain
-from lare.credit.returns import BETTER
+from lare.credit.returns import BETTER, FormFound
 from lare.float64 import float64
 
 FIRST = 10
@@ -36,8 +36,8 @@ class Judgement(NamedTuple):
 
     r2: float
     """NaN if all returns are equal or there are too few."""
-    average: bool | None
-    """Whether the score is treated as an average over steps; None if it makes no difference."""
+    form: FormFound | None
+    """None if it is given or makes no difference, because all episodes have one length."""
     explanation: Explanation
 
 
@@ -69,8 +69,8 @@ def judge(
         explanation = jax.tree.map(np.asarray, explained(sums, form, basis=basis))
     spread = float(np.sum((returns[FIRST:] - returns[FIRST:].mean()) ** 2)) if len(returns) > FIRST else 0.0
     r2 = 1 - errors[form] / spread if spread > 0 else np.nan
-    differs = len(forms) > 1 and min(errors.values()) < BETTER * max(errors.values())
-    return Judgement(r2, form == AVERAGE if differs else None, explanation)
+    decided = min(errors.values()) < BETTER * max(errors.values())
+    return Judgement(r2, FormFound(form == AVERAGE, decided) if len(forms) > 1 else None, explanation)
 
 
 def mean_features(

@@ -4,7 +4,7 @@ Every decoder predicts returns. Sums are only needed for a fit in closed form. S
 the form of the score.
 """
 
-from typing import Literal
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,15 @@ GROWTH = 0.02
 batches."""
 ROUNDING = 1e-6
 """Squared errors below this fraction of the squared returns are treated as equal."""
+
+
+class FormFound(NamedTuple):
+    """The form as which a score is treated where the returns determine it."""
+
+    average: bool
+    """Whether it is an average over the steps, instead of a sum."""
+    decided: bool
+    """Whether it predicts returns clearly better than the other form."""
 
 
 def is_fitted(state: Decomposition) -> Bool[Array, ""]:
@@ -91,19 +100,18 @@ def add_episodes(state: Decomposition, episodes: Episodes, new: Bool[Array, " ep
     return state._replace(closed=state.closed._replace(summed=closed_form.kept(sums)))
 
 
-def form_found(state: Decomposition) -> Literal["sum", "average", "undecided"] | None:
-    """The form that has predicted returns clearly better, if there is one; None if the form is given or makes no difference.
+def form_found(state: Decomposition) -> FormFound | None:
+    """The form that the decoder uses now; None if it is given or makes no difference.
 
     It makes none as long as all episodes have one length.
     """
     if state.rivals is None:
         return None
-    of_sum, of_average = np.asarray(errors_told_apart(state.rivals))
-    if np.isclose(of_sum, of_average, rtol=1e-3):
+    errors = np.asarray(errors_told_apart(state.rivals))
+    if np.isclose(*errors, rtol=1e-3):
         return None
-    if of_average < BETTER * of_sum:
-        return "average"
-    return "sum" if of_sum < BETTER * of_average else "undecided"
+    average = bool(state.average)
+    return FormFound(average, decided=bool(errors[int(average)] < BETTER * errors[1 - int(average)]))
 
 
 def errors_told_apart(rivals: Predictions) -> Float[Array, " forms"]:

@@ -5,6 +5,7 @@ import re
 import numpy as np
 
 from lare.credit.explanation import Explanation
+from lare.credit.returns import FormFound
 
 FEWEST = 20
 """With fewer episodes, there are no sentences."""
@@ -16,9 +17,8 @@ STRAIGHT = 0.8
 """The effect of a factor is curved if the closest line has less than this part of its variance."""
 STRIKING = 0.3
 """A raw entry is reported if its correlation with the residual of the factors is larger than this."""
-FORMS = ("sum", "average")
-"""The names of the forms of a score, by index."""
-WITH_ARTICLE = {"sum": "a sum", "average": "an average"}
+FORMS = ("a sum", "an average")
+"""The forms that a score may have."""
 
 
 def entry_names(observation: str, action: str, entries: int, action_size: int, both: bool) -> list[str]:
@@ -54,13 +54,12 @@ def form_of_effect(found: Explanation, factor: int) -> str:
     return " (its effect is curved)" if found.linear[factor] < STRAIGHT else ""
 
 
-def words(found: Explanation, form: str | None, factors: list[str], entries: list[str]) -> list[str]:
+def words(found: Explanation, form: FormFound | None, factors: list[str], entries: list[str]) -> list[str]:
     """The sentences, one in each string.
 
     Args:
         found: the explanation of one team's score.
-        form: `sum` or `average`, if the returns have determined it; `undecided` if they have not; None if it is given or makes no
-            difference.
+        form: the form as which the score is treated; None if it is given or makes no difference.
         factors: names of the factors; empty for a method without factors.
         entries: names of the raw entries.
     """
@@ -73,17 +72,14 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
             "step."
         ]
     said = []
-    if form == "undecided":
-        said.append(
-            "The score is treated as a sum over the steps of an episode: so far, an average predicts returns about as well. "
-            'If you know which of them it is, write `score = "sum"` or `score = "average"` into the task file.'
+    if form is not None:
+        this, other = FORMS[int(form.average)], FORMS[1 - int(form.average)]
+        why = (
+            f"this predicts returns better than {other}" if form.decided else f"{other} predicts returns about as well"
         )
-    elif form is not None:
-        other = FORMS[1 - FORMS.index(form)]
         said.append(
-            f"The score is taken for {WITH_ARTICLE[form]} over the steps of an episode: so far, this predicts returns better than "
-            f'{WITH_ARTICLE[other]}. This may change. If you know which of them it is, write `score = "sum"` or '
-            '`score = "average"` into the task file.'
+            f"The score is treated as {this} over the steps of an episode: so far, {why}. This may change. If you know which of "
+            'them it is, write `score = "sum"` or `score = "average"` into the task file.'
         )
     if not factors:
         return [*said, f"Raw features explain {found.by_all:.0%} of the variation of the returns of {count} episodes."]
@@ -103,12 +99,15 @@ def words(found: Explanation, form: str | None, factors: list[str], entries: lis
         )
         said += [
             f"- {factors[i]}: {found.share[i]:z.0%}, {found.slope[i]:+.3g} ± {found.deviation[i]:.1g}{form_of_effect(found, i)}"
+            if found.varied[i]
+            else f"- {factors[i]}: it has never varied"
             for i in np.argsort(-np.abs(found.share), kind="stable").tolist()
         ]
         if any(name.endswith("(before)") for name in factors):
             said.append(
-                "If a factor hardly changes in a step, look only at the sum of its two shares, and at the sum of its two effects: "
-                "before and after the step."
+                "Each factor has two lines: before and after the step. If both ± are as large as the effects, the fit cannot tell "
+                "them apart: add up the two lines. If both ± are small and the effects have opposite signs, the change of the "
+                "factor in a step is paid."
             )
     if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:
         place = int(np.argmax(np.abs(found.left)))

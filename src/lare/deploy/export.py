@@ -57,7 +57,7 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
         run: the run, or its directory.
         out: the directory.
         seed: one of the run's seeds; the default is the first.
-        best: write the policy of the seed's best evaluation, instead of the last policy.
+        best: write the policy of the seed's best evaluation, instead of the last policy. Proxy rewards are always the last ones.
 
     Raises:
         LareError: there is no such seed, no checkpoint, or the directory exists or cannot be written.

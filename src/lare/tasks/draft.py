@@ -12,7 +12,10 @@ from lare.tasks.spec import FILL_IN
 JUDGES = (
     'judges = "after" # a step is judged by the observation after it; "before": the one in which the agent acts; "both"'
 )
-SCORE = '# score = "average" # only if episodes differ in length. "average": a mean over the steps, or a grade; "sum": a sum'
+SCORE = (
+    '# score = "average" # only if episodes differ in length. "sum": steps or events add up; '
+    '"average": how good steps were on average'
+)
 
 WANTED = {
     "description": "what is to be solved, and what the goal is; not a word about the reward",

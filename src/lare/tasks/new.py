@@ -85,8 +85,8 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
             []
             if limit
             else [
-                "max_episode_steps = 1000 # the environment has no limit of its own, and longer episodes are cut: at least the "
-                "length of an episode that it ends by itself"
+                "max_episode_steps = 1000 # the environment has no limit of its own: write the length of its longest episode, or "
+                "more (longer episodes are cut)"
             ]
         ),
         *bodies(texts, heads),

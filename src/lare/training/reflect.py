@@ -14,7 +14,7 @@ from jaxtyping import Float
 from lare.credit.basis import Basis
 from lare.credit.judging import Judgement
 from lare.credit.judging import judge as judge_rows
-from lare.credit.words import FEWEST, FORMS, entry_names, words
+from lare.credit.words import FEWEST, entry_names, words
 from lare.errors import LareError
 from lare.latent.function import LatentFunction
 from lare.latent.improve import Evidence, Model, improve
@@ -119,10 +119,9 @@ def factors_of(function: LatentFunction, role: TaskSpec, episode: Episode) -> Fl
 
 def said_of(found: Judgement, names: list[str], role: TaskSpec, basis: Basis) -> list[str]:
     """The explanation in sentences, which the user reads, too."""
-    form = None if found.average is None else FORMS[int(found.average)]
     return words(
         found.explanation,
-        form,
+        found.form,
         names,
         entry_names(role.observation, role.action, basis.used_entries, role.action_size, role.judges == "both"),
     )
