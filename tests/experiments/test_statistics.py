@@ -99,7 +99,16 @@ def test_something_else_than_the_return_is_compared(made):
     without = made("b", [1.0, 3.0], method="rd")
     found, remarks = comparable([run, without], "credit/error")
     assert (found, remarks[-1]) == ([run], f"{without.directory} has no credit/error, and is left out")
-    assert comparable([without], "credit/error")[0] == [without]
+    with pytest.raises(
+        LareError, match=r"^no run has the metric 'credit/error'; they have critic/loss, evaluation/return$"
+    ):
+        comparable([without], "credit/error")
+    lines = [line | {"credit/error": None} for line in without.metrics()]
+    (without.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(
+        LareError, match=r"^no run has a value of credit/error yet: it is null in all of their evaluations$"
+    ):
+        comparable([without], "credit/error")
 
 
 def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):

@@ -282,7 +282,10 @@ def test_how_a_process_ended(file, monkeypatch):
         ),
         (('["Reacher-v4"]', "[]"), "tasks = []: tuple should have at least 1 item after validation, not 0"),
         (("seeds = 2", "seed = -1"), "seed = -1: input should be greater than or equal to 0"),
-        (("steps = 200", "steps = 201"), "steps = 201 is not a multiple of rollout_steps = 50: take 200"),
+        (
+            ("steps = 200", "steps = 201"),
+            "on Reacher-v4, steps = 201 is not a multiple of rollout_steps = 50: take 200",
+        ),
         (('["Reacher-v4"]', '["Reacher-v5"]'), "no task 'Reacher-v5'"),
         (("rollout_steps = 50", 'method = "rd"'), "method is not one of the settings: list methods above them"),
         (
@@ -298,7 +301,10 @@ def test_how_a_process_ended(file, monkeypatch):
             ("[settings]", "[settings]\nsac = { gamma = 0.9 }"),
             "sac.gamma makes no difference to td3 on Reacher-v4; it has td3.gamma",
         ),
-        (("[settings]", "[settings]\ncredit = { sum_form = true }"), "credit.sum_form makes no difference to dense"),
+        (
+            ("[settings]", "[settings]\ncredit = { sum_form = true }"),
+            "credit.sum_form makes no difference to dense, nor to lare-linear",
+        ),
         ((', "lare-linear"', ""), "draws are given, and none of the methods needs a latent function"),
         (
             ("[settings]", '[functions]\nReacher-v4 = ["phi.py"]\n[settings]'),

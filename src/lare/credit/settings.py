@@ -22,7 +22,7 @@ class CreditSettings(Checked):
     normalise: bool = True
     """Normalise features and returns by running statistics. The published form does not."""
     sum_form: bool = False
-    """Fit the return R of an episode (Eq. 6 of the paper), not its mean R/T (the published code)."""
+    """Fit the return R of an episode (Eq. 6 of the paper), not its mean R/T (the published code for one agent)."""
     drawn_steps: Annotated[int, Field(ge=2)] = 64
     """K: steps drawn from an episode by RRD and its variants."""
     steps: Annotated[int, Field(ge=2)] = 256

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
-from lare.errors import LareError
+from lare.errors import LareError, did_you_mean
 from lare.experiments import figures
 from lare.experiments.html import note, table, write_page
 from lare.experiments.own_results import read_results
@@ -82,10 +82,8 @@ def find_runs(places: Sequence[Path]) -> list[Run]:
 def comparable(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], list[str]]:
     """The runs that have the metric, and remarks on the metric and on runs that were not trained to their end.
 
-    If no run has the metric, all runs that have an evaluation are returned.
-
     Raises:
-        LareError: no run has an evaluation.
+        LareError: no run has an evaluation, or none has a value of the metric.
     """
     found, without, remarks, summed = [], [], [], False
     for run in runs:
@@ -103,11 +101,16 @@ def comparable(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], li
             remarks.append(f"{run.directory}: {warning}")
     if not found + without:
         raise LareError(f"{', '.join(str(run.directory) for run in runs)}: no run has an evaluation yet")
-    if found:
-        remarks += [f"{run.directory} has no {metric}, and is left out" for run in without]
+    if not found:
+        known = {name: value for run in without for line in run.metrics() for name, value in line.items()}
+        if metric in known:
+            raise LareError(f"no run has a value of {metric} yet: it is null in all of their evaluations")
+        names = sorted(known.keys() - {"step", "seed"})
+        raise LareError(f"no run has the metric {metric!r}{did_you_mean(metric, names)}; they have {', '.join(names)}")
+    remarks += [f"{run.directory} has no {metric}, and is left out" for run in without]
     if summed and metric == RETURN:
         remarks.append(f"returns are means over the agents; --metric {SUMMED_RETURN} compares their sums")
-    return found or without, remarks
+    return found, remarks
 
 
 def cells(comparison: Comparison) -> list[tuple[str, ...]]:

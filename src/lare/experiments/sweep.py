@@ -89,9 +89,11 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
             raise LareError(f"{path}: {job.name} is asked for twice; two task files need two names")
         check(job)
     in_vain = [set_in_vain(job.settings, job.resolved, job.task) for job in jobs]
-    for name, said in in_vain[0].items():
+    for name in in_vain[0]:
         if all(name in others for others in in_vain):
-            raise LareError(f"{path}: {said}")
+            head = f"{name} makes no difference to "
+            whom = dict.fromkeys(others[name].removeprefix(head) for others in in_vain)
+            raise LareError(f"{path}: {head}{', nor to '.join(whom)}")
     return sweep, jobs
 
 
@@ -116,7 +118,10 @@ def jobs_of(sweep: Sweep, path: Path) -> Iterator[Job]:
         draws = sweep.draws if find_method(method).latent and not functions else (0,)
         for draw in draws:
             settings = Settings(**{**sweep.settings, "method": method, "algorithm": algorithm, "draw": draw})
-            yield job_of(root, task, settings, functions)
+            try:
+                yield job_of(root, task, settings, functions)
+            except LareError as error:
+                raise error if task.name in str(error) else LareError(f"on {task.name}, {error}") from error
 
 
 def is_done(job: Job) -> bool:
