@@ -228,7 +228,7 @@ def test_a_sweep_that_is_stopped_or_killed_leaves_a_saved_run_and_nobody_behind(
     last = job.directory.with_name(job.directory.name + ".log").read_text().splitlines()[-1:]
     if not after and not last:
         return  # it ended before it had anything to save
-    assert re.match(r"stopped at step \d+ and saved; to continue: lare train --resume ", last[0])
+    assert re.match(r"stopped at step \d+ of \d+ and saved; to continue: lare train --resume ", last[0])
 
 
 def test_a_process_that_fails_says_why(file, tmp_path):

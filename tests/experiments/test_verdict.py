@@ -9,6 +9,7 @@ STEPS = np.arange(1, 9) * 1000.0
 RISING = np.array([[0.0, 10, 20, 30, 40, 50, 60, 70]])
 FLAT = np.array([[50.0, 51, 50, 51, 50, 51, 50, 51]])
 FELL = np.array([[0.0, 40, 90, 92, 60, 40, 30, 31]])
+FELL_A_LITTLE = np.array([[0.0, 40, 60, 62, 44, 43, 42, 42.5]])
 CHANCE = np.array([-1.0, 0, 1])
 
 
@@ -66,6 +67,23 @@ def said(returns, random=CHANCE, **facts):
                 "It learned. The return is 31 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "That is no more than training on the return at the end alone gives here (40).",
                 "Next: it was better before, 92 at step 4,000. `lare evaluate runs/x --best` plays the best policy of each seed.",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
+            ],
+        ),
+        (
+            FELL_A_LITTLE,
+            {"of_evaluation": 6.0},
+            [
+                "It learned. The return is 42.5 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
+                "Next: it was better before, 62 at step 4,000. `lare evaluate runs/x --best` plays the best policy of each seed.",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
+            ],
+        ),
+        (
+            FELL_A_LITTLE,
+            {"of_evaluation": 8.0},  # two standard errors of a difference are 22.6, and the end is lower by 19.75
+            [
+                "It learned. The return is 42.5 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),

@@ -94,6 +94,28 @@ gymnasium.register("toys/Told-v0", entry_point=Told, max_episode_steps=20)
 gymnasium.register("toys/Silent-v0", entry_point=Silent, disable_env_checker=True)
 
 
+class Numbered(Told):
+    """Carries parcels.
+
+    ## Observation Space
+
+    3 entries.
+    0: floor
+    1 to 2: waiting people,
+    by floor
+    """
+
+    observation_space = Box(-1, 1, (3,), np.float32)
+
+
+gymnasium.register("toys/Numbered-v0", entry_point=Numbered, max_episode_steps=20)
+
+
+def test_entries_keep_their_lines_and_are_counted_once(tmp_path):
+    task = load(tmp_path, draft("toys/Numbered-v0").toml.replace("FILL IN", "one"))
+    assert task.observation == "3 entries.\n0: floor\n1 to 2: waiting people, by floor"
+
+
 def test_whatever_speaks_of_rewards_is_left_out(tmp_path):
     drafted = draft("toys/Told-v0")
     task = load(tmp_path, drafted.toml)

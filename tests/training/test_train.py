@@ -335,7 +335,8 @@ def test_a_stop_saves_and_goes_on_as_if_nothing_had_been(number, small, phi, tmp
     stop = At(84, lambda: signal.raise_signal(number))
     with pytest.raises(Interrupted) as caught:
         lare.train(toy_spec(), small(), function=phi, out=tmp_path / "run", listeners=[stop])
-    assert str(caught.value) == f"stopped at step 84 and saved; to continue: lare train --resume {tmp_path / 'run'}"
+    said = f"stopped at step 84 of {small().steps} and saved; to continue: lare train --resume {tmp_path / 'run'}"
+    assert str(caught.value) == said
     assert signal.getsignal(number) is handler
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
 

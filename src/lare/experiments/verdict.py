@@ -116,13 +116,14 @@ def better_than_chance(run: Facts) -> bool:
 
 
 def noise(run: Facts) -> float:
-    """The standard error of the difference between the mean return over the seeds and that of random actions.
-
-    The first has two standard errors, from seed to seed and from episode to episode; the larger one counts.
-    """
+    """The standard error of the difference between the mean return over the seeds and that of random actions."""
     of_random = deviation(run.random) / math.sqrt(max(1, len(run.random)))
-    of_run = max(run.of_evaluation, run.spread / math.sqrt(len(run.returns)))
-    return max(math.hypot(of_random, of_run), 1e-9)
+    return max(math.hypot(of_random, error_at_the_end(run)), 1e-9)
+
+
+def error_at_the_end(run: Facts) -> float:
+    """The standard error of the return at the end. It has two, from seed to seed and from episode to episode; the larger counts."""
+    return max(run.of_evaluation, run.spread / math.sqrt(len(run.returns)))
 
 
 def deviation(values: Float[np.ndarray, " episodes"]) -> float:
@@ -229,7 +230,7 @@ def is_stuck(run: Facts) -> bool:
 
 
 def fell_from(run: Facts) -> tuple[int, float] | None:
-    """Step and value of the best evaluation, where the end is lower by more than evaluations vary.
+    """Step and value of the best evaluation, where the end is lower by more than evaluations vary, and by two standard errors.
 
     None if the best evaluation is not better than random actions.
     """
@@ -243,7 +244,7 @@ def fell_from(run: Facts) -> tuple[int, float] | None:
     top = float(mean[best])
     if len(run.random) and top <= start + 2 * noise(run):
         return None
-    fell = top - end > max(0.15 * abs(top - start), 2 * variation)
+    fell = top - end > max(0.15 * abs(top - start), 2 * variation, 2 * math.sqrt(2) * error_at_the_end(run))
     return (int(run.steps[best]), top) if fell else None
 
 

@@ -21,6 +21,8 @@ SENTENCE = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
 FIGURE = re.compile(r"^```\{.*?^```|<[^<>\n]+>", re.MULTILINE | re.DOTALL)
 NOISE = re.compile(r"^!\[|^:?-{3,}|^```|^\s*$")
+NUMBERED = re.compile(r"\d+(\s*(-|to)\s*\d+)?[.:]\s")
+"""The start of a line about an entry or several: `3: ...`, `3 to 5: ...`."""
 ELSEWHERE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.IGNORECASE)
 """References to figures, which are useless outside the original page."""
 
@@ -50,7 +52,7 @@ def plain(text: str) -> list[str]:
                 paragraph = []
             if stripped.startswith("|"):
                 lines.append(row(stripped))
-        elif stripped.startswith(("- ", "* ")) or re.match(r"\d+[.:]\s", stripped):
+        elif stripped.startswith(("- ", "* ")) or NUMBERED.match(stripped):
             if paragraph:
                 lines += SENTENCE.split(" ".join(paragraph))
             paragraph = [stripped]

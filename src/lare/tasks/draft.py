@@ -53,12 +53,13 @@ def warning(left_out: Sequence[str], origin: str = "the documentation of the env
 
 
 def bodies(texts: Mapping[str, str], heads: Mapping[str, str]) -> list[str]:
-    """The texts of a spec. Missing texts are marked."""
-    return [
-        f"\n{key} = "
-        + quoted("\n".join(part for part in (heads.get(key), text or f"{FILL_IN}: {WANTED[key]}") if part))
-        for key, text in texts.items()
-    ]
+    """The texts of a spec. Missing texts are marked. A head is left out if the text begins with it."""
+
+    def body(key: str, text: str) -> str:
+        head = heads.get(key, "")
+        return "\n".join(part for part in ("" if head and text.startswith(head) else head, text) if part)
+
+    return [f"\n{key} = {quoted(body(key, text or f'{FILL_IN}: {WANTED[key]}'))}" for key, text in texts.items()]
 
 
 def entries(number: int) -> str:

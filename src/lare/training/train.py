@@ -276,7 +276,9 @@ def advance(session: Session, stop: threading.Event) -> None:
     if stop.is_set():
         check_losses(session)
         session.save()
-        raise Interrupted(f"stopped at step {session.step} and saved; to continue: lare train --resume {directory}")
+        raise Interrupted(
+            f"stopped at step {session.step} of {session.settings.steps} and saved; to continue: lare train --resume {directory}"
+        )
     try:
         session.advance(stop.is_set)
     except first_fit.Stopped:
