@@ -9,6 +9,7 @@ STEPS = np.arange(1, 9) * 1000.0
 RISING = np.array([[0.0, 10, 20, 30, 40, 50, 60, 70]])
 FLAT = np.array([[50.0, 51, 50, 51, 50, 51, 50, 51]])
 FELL = np.array([[0.0, 40, 90, 92, 60, 40, 30, 31]])
+LEVEL_NOW = np.array([[0.0, 20, 40, 60, 71, 76, 78.6, 78.5]])
 FELL_A_LITTLE = np.array([[0.0, 40, 60, 62, 44, 43, 42, 42.5]])
 CHANCE = np.array([-1.0, 0, 1])
 
@@ -67,6 +68,14 @@ def said(returns, random=CHANCE, **facts):
                 "It learned. The return is 31 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "That is no more than training on the return at the end alone gives here (40).",
                 "Next: it was better before, 92 at step 4,000. `lare evaluate runs/x --best` plays the best policy of each seed.",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
+            ],
+        ),
+        (
+            LEVEL_NOW,
+            {},
+            [
+                "It learned. The return is 78.5 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),

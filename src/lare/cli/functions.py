@@ -68,7 +68,10 @@ def new_task(
     data = f" --data {environment}" if drafted.of_logs else ""
     say(f"read it, then: lare design {path}{data} --model NAME --out phi.py")
     none = "lare relabel without --function" if drafted.of_logs else "--method bayes"
-    say(f"or, without a model: write phi.py yourself, as lare prompt {path} describes it; {none} needs no phi.py")
+    say(
+        "or, without a model: write phi.py yourself, with a function evaluation_func(observation, action) "
+        f"(docs/bring-your-own-task.md, 2.); {none} needs no phi.py"
+    )
 
 
 def draft_of(named: str) -> "Draft":

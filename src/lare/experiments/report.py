@@ -310,7 +310,7 @@ def one_agent_details(run: Run) -> Iterable[str]:
         steps = figures.window(len(credit.reward))
         yield note(
             "The last training episode of the first seed, exploration included, judged by the newest decoder: "
-            f"the curve shows steps {steps.start} to {steps.stop}{', the points all steps' if credit.known else ''}. "
+            f"the curve shows steps {steps.start} to {steps.stop - 1}{', the points all steps' if credit.known else ''}. "
             f"Return {credit.reward.sum():.1f}, sum of the proxy rewards {credit.proxy.sum():.1f}."
             + (
                 ""

@@ -217,9 +217,13 @@ def quarters(run: Facts) -> tuple[float, float, float] | None:
 
 
 def is_rising(run: Facts) -> bool:
-    """Whether the last quarter is higher than the one before by more than evaluations vary."""
+    """Whether the last quarter is higher than the one before by more than evaluations vary, and rises by half of that itself."""
     found = quarters(run)
-    return found is not None and found[1] - found[0] > found[2]
+    if found is None:
+        return False
+    before, end, variation = found
+    last = np.nanmean(run.returns, axis=0)[-max(2, run.returns.shape[1] // 4) :]
+    return end - before > variation and last[-1] - last[0] > variation / 2
 
 
 def is_stuck(run: Facts) -> bool:
