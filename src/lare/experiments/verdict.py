@@ -223,7 +223,7 @@ def is_rising(run: Facts) -> bool:
         return False
     before, end, variation = found
     last = np.nanmean(run.returns, axis=0)[-max(2, run.returns.shape[1] // 4) :]
-    return end - before > variation and last[-1] - last[0] > variation / 2
+    return bool(end - before > variation and last[-1] - last[0] > variation / 2)
 
 
 def is_stuck(run: Facts) -> bool:
