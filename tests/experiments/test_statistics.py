@@ -7,7 +7,7 @@ import pytest
 
 from lare.errors import LareError
 from lare.experiments import statistics
-from lare.experiments.compare import cells, comparable, find_runs, what_scores_are, write_comparison
+from lare.experiments.compare import cells, comparable, find_runs, what_scores_are, write_comparisons
 from lare.experiments.scores import by_label
 from lare.experiments.statistics import too_few
 
@@ -79,12 +79,22 @@ def test_draws_are_told_apart_from_seeds(made):
 
 def test_several_tasks_are_laid_between_fixed_ends(made, tmp_path):
     runs = [made("a", [-44.0, -2.7], "Reacher-v4"), made("b", [4600.0, 4600.0], "Walker2d-v4")]
-    found = write_comparison(by_label(runs), tmp_path / "page.html")
+    (found,) = write_comparisons(by_label(runs), tmp_path / "page.html")
     assert found.normalised
     assert found.rows[0].mean == pytest.approx(np.mean([0, 1, 1, 1]))
     page = (tmp_path / "page.html").read_text()
     assert "Reacher-v4: 0 is -44, 1 is -2.7; Walker2d-v4: 0 is 3.4, 1 is 4600." in page
     assert page.count("<svg") == 2
+
+
+def test_tasks_without_a_common_scale_have_a_table_each(made, tmp_path):
+    runs = [made("a", [1.0, 3.0]), made("b", [2.0, 4.0], method="rd"), made("c", [7.0, 9.0], task="Reacher-v4")]
+    one, other = write_comparisons(by_label(runs), tmp_path / "page.html")
+    assert (one.tasks, [row.label for row in one.rows], one.rows[0].mean) == (("Chase",), ["dense", "rd"], 2.0)
+    assert (other.tasks, [row.label for row in other.rows], other.rows[0].mean) == (("Reacher-v4",), ["dense"], 8.0)
+    page = (tmp_path / "page.html").read_text()
+    assert "<h2>Chase</h2>" in page
+    assert "<h2>Reacher-v4</h2>" in page
 
 
 def test_something_else_than_the_return_is_compared(made):

@@ -75,15 +75,19 @@ def compare(
         metric: the key of metrics.jsonl to compare.
         out: the page to write.
     """
-    from lare.experiments.compare import HEAD, MEANINGS, cells, find_all, what_scores_are, write_comparison
+    from lare.experiments.compare import HEAD, MEANINGS, cells, find_all, what_scores_are, write_comparisons
     from lare.experiments.statistics import too_few
 
     found, remarks = find_all(runs, metric)
     for remark in remarks:
         progress(remark)
-    comparison = write_comparison(found, out, metric)
-    show(HEAD, cells(comparison))
-    say(f"{what_scores_are(comparison)} {MEANINGS} {too_few(comparison)}".rstrip())
+    comparisons = write_comparisons(found, out, metric)
+    for comparison in comparisons:
+        if len(comparisons) > 1:
+            say(f"\n{comparison.tasks[0]}")
+        show(HEAD, cells(comparison))
+        say(f"{what_scores_are(comparison)} {too_few(comparison)}".rstrip())
+    say(MEANINGS)
     say(f"wrote {out}")
 
 

@@ -9,7 +9,7 @@ from lare.experiments import figures
 from lare.experiments.html import note, table, write_page
 from lare.experiments.own_results import read_results
 from lare.experiments.scores import REFERENCES, RETURN, SUMMED_RETURN, Measured, by_label, differing
-from lare.experiments.statistics import REPETITIONS, Band, Comparison, compare, plus_minus, too_few
+from lare.experiments.statistics import REPETITIONS, Comparison, compare, plus_minus, too_few
 from lare.run.directory import CONFIG, Run, read_measured
 
 HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "above baseline [95%]", "p")
@@ -150,31 +150,52 @@ MEANINGS = (
 )
 
 
-def write_comparison(runs: Mapping[str, Sequence[Run | Measured]], out: Path, metric: str = RETURN) -> Comparison:
+def write_comparisons(
+    runs: Mapping[str, Sequence[Run | Measured]], out: Path, metric: str = RETURN
+) -> list[Comparison]:
     """Compare runs by their labels, and write the page.
 
     Raises:
         LareError: the runs cannot be compared, or the file cannot be written.
     """
-    comparison = compare(runs, metric)
-    title = f"{', '.join(comparison.tasks)}: {len(comparison.rows)} contenders"
-    write_page(out, title, "\n".join(body(title, comparison)))
-    return comparison
+    found = comparisons(runs, metric)
+    title = f"{', '.join(task for one in found for task in one.tasks)}: {len(runs)} contenders"
+    write_page(out, title, "\n".join(body(title, found)))
+    return found
 
 
-def body(title: str, comparison: Comparison) -> Iterable[str]:
+def comparisons(runs: Mapping[str, Sequence[Run | Measured]], metric: str = RETURN) -> list[Comparison]:
+    """One comparison over all tasks; one of each task if their scores have no common scale."""
+    tasks = sorted({task_of(one) for of_label in runs.values() for one in of_label})
+    if len(tasks) == 1 or (metric == RETURN and all(task in REFERENCES for task in tasks)):
+        return [compare(runs, metric)]
+    by_task = {
+        task: {label: [one for one in of_label if task_of(one) == task] for label, of_label in runs.items()}
+        for task in tasks
+    }
+    return [compare({label: some for label, some in of_task.items() if some}, metric) for of_task in by_task.values()]
+
+
+def task_of(one: Run | Measured) -> str:
+    return one.task if isinstance(one, Measured) else one.config.task.name
+
+
+def body(title: str, found: Sequence[Comparison]) -> Iterable[str]:
+    level = 2 if len(found) == 1 else 3
     yield f"<h1>{escape(title)}</h1>"
-    yield table(HEAD, cells(comparison), range(1, len(HEAD)))
+    for comparison in found:
+        if len(found) > 1:
+            yield f"<h2>{escape(comparison.tasks[0])}</h2>"
+        yield table(HEAD, cells(comparison), range(1, len(HEAD)))
+        yield note(f"{what_scores_are(comparison)} {too_few(comparison)}".rstrip())
+        score = (
+            "score" if comparison.normalised else "true return" if comparison.metric == RETURN else comparison.metric
+        )
+        yield f"<h{level}>Learning</h{level}>"
+        yield figures.bands(comparison.curves, "environment steps", f"IQM of the {score}", True)
+        yield f"<h{level}>Performance profiles</h{level}>"
+        yield figures.bands(comparison.profiles, f"x ({score})", "share of runs that score more", False)
     yield note(
-        what_scores_are(comparison)
-        + f" {MEANINGS} Intervals: stratified bootstrap over the seeds, {REPETITIONS} repetitions; in the column with draws, over "
-        f"the draws of the language model. {too_few(comparison)}"
+        f"{MEANINGS} Intervals: stratified bootstrap over the seeds, {REPETITIONS} repetitions; in the column with draws, over the "
+        "draws of the language model."
     )
-    score = "score" if comparison.normalised else "true return" if comparison.metric == RETURN else comparison.metric
-    yield from figure("Learning", comparison.curves, "environment steps", f"IQM of the {score}", steps=True)
-    yield from figure("Performance profiles", comparison.profiles, f"x ({score})", "share of runs that score more")
-
-
-def figure(title: str, bands: Mapping[str, Band], across: str, up: str, *, steps: bool = False) -> Iterable[str]:
-    yield f"<h2>{title}</h2>"
-    yield figures.bands(bands, across, up, steps)

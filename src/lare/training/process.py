@@ -4,12 +4,16 @@ import contextlib
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 
 import jax
 
 from lare.errors import LareError
 from lare.run.directory import Run
+
+ONE_REQUEST = 1.0
+"""Signals within so many seconds are one request: a terminal and a parent process may each send one."""
 
 
 @contextlib.contextmanager
@@ -30,15 +34,19 @@ def enough_memory(run: Run) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_requests() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C or SIGTERM sets, which is said on standard error. The second one ends the process at once."""
-    stop = threading.Event()
+    """An event that the first Ctrl-C or SIGTERM sets, which is said on standard error. A later one ends the process at once."""
+    stop, since = threading.Event(), 0.0
     if threading.current_thread() is not threading.main_thread():
         yield stop  # only the main thread may set signal handlers
         return
 
     def handle(number: int, frame: object) -> None:
+        nonlocal since
         if stop.is_set():
-            raise KeyboardInterrupt
+            if time.monotonic() - since > ONE_REQUEST:
+                raise KeyboardInterrupt
+            return
+        since = time.monotonic()
         stop.set()
         with contextlib.suppress(OSError):
             os.write(2, b"\nstopping after this iteration (a second Ctrl-C or SIGTERM ends it at once)\n")
