@@ -14,9 +14,9 @@ FELL_A_LITTLE = np.array([[0.0, 40, 60, 62, 44, 43, 42, 42.5]])
 CHANCE = np.array([-1.0, 0, 1])
 
 
-def said(returns, random=CHANCE, **facts):
+def said(returns, random=CHANCE, task="Toy", **facts):
     return verdict(
-        Facts("lare-bayes", STEPS, np.asarray(returns, float), random, directory="runs/x", task="Toy", **facts)
+        Facts("lare-bayes", STEPS, np.asarray(returns, float), random, directory="runs/x", task=task, **facts)
     )
 
 
@@ -76,6 +76,15 @@ def said(returns, random=CHANCE, **facts):
             {},
             [
                 "It learned. The return is 78.5 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
+            ],
+        ),
+        (
+            LEVEL_NOW,
+            {"task": "TASK.toml"},
+            [
+                "It learned. The return is 78.5 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
+                "Next: better than random actions may be far from good: compare it with a rule of your own.",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),

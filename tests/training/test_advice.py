@@ -6,7 +6,8 @@ import pytest
 from gymnasium.spaces import Box
 
 import lare
-from lare.training.advice import of_returns
+from lare.training import session as sessions
+from lare.training.advice import of_actions, of_returns
 from toys import Chase, Ear, toy_spec
 
 
@@ -64,3 +65,41 @@ def test_small_observations_and_normalised_ones_are_not(small, tmp_path):
 )
 def test_a_policy_that_does_not_change(returns, said):
     assert bool(of_returns([np.array(each) for each in returns])) == said
+
+
+STUCK = np.full((1, 4, 2), [[1.0, -0.995]])
+
+
+@pytest.mark.parametrize(
+    ("actions", "whose"),
+    [
+        (STUCK, "The policy chooses"),
+        (np.concatenate([STUCK * 0.5, STUCK]), "The policy of seed 4 chooses"),
+        (np.concatenate([STUCK, -STUCK, STUCK * 0.5]), "The policy of seeds 3, 4 chooses"),
+        (STUCK * [1.0, 0.9], None),  # one entry is not at a bound
+        (STUCK * [[1.0], [1.0], [-1.0], [1.0]], None),  # from one bound to the other
+    ],
+)
+def test_a_policy_at_its_bounds(actions, whose):
+    said = of_actions(actions, range(3, 3 + len(actions)))
+    assert [line.partition(" the same action")[0] for line in said] == ([] if whose is None else [whose])
+
+
+def test_the_newest_states_are_asked(small, tmp_path):
+    run = lare.train(toy_spec(), small(method="dense", algorithm="td3", seeds=2), out=tmp_path / "run", listeners=[])
+    session, _ = sessions.restore(run)
+    actions = session.actions_now(5)
+    assert actions.shape == (2, 5, 1)
+    held = session.learner.replay
+    newest = int(held.next_row[1, 0]) - np.arange(1, 6)
+    seen = np.asarray(held.columns["observation"][1, 0, newest, 0])
+    np.testing.assert_allclose(2 * actions[1], lare.policy_of(run, seed=run.seeds[1])(seen), rtol=1e-5)
+    session.close()
+
+
+def test_a_policy_that_has_not_been_trained_says_nothing(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(sessions.Session, "actions_now", lambda session, steps: np.ones((1, steps, 1)))
+    for steps, count in ((24, 0), (48, 1)):
+        ear, settings = Ear(), small(method="dense", algorithm="td3", seeds=1, steps=steps, td3={"warmup": 24})
+        lare.train(toy_spec(), settings, out=tmp_path / str(steps), listeners=[ear])
+        assert sum(line.startswith("The policy chooses") for line in ear.heard) == count

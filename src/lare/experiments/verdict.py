@@ -46,7 +46,7 @@ class Facts:
     """The return of the policy before its first update; None if it was not evaluated."""
     directory: str = "RUN"
     task: str = "TASK"
-    """The name of a shipped task, or a placeholder for a task file."""
+    """The name of a shipped task, or a placeholder for a task file, which ends in `.toml`."""
 
     @property
     def last(self) -> float:
@@ -201,6 +201,8 @@ def todo(run: Facts) -> list[str]:
                 f"If state and action have more than {MOST_PAIRED} entries together, a score that depends on products of them, "
                 "such as price times power, needs a phi (`lare prompt`)."
             )
+    if not found and run.task.endswith(".toml") and len(run.random) and has_learned(run):
+        found.append("Next: better than random actions may be far from good: compare it with a rule of your own.")
     if len(run.returns) == 1:
         found.append("One seed says little: another one may reach a different return (`--seeds 3`).")
     return found

@@ -43,11 +43,15 @@ class Draft:
     """Whether the task has only logs and no environment."""
 
 
-def warning(left_out: Sequence[str], origin: str = "the documentation of the environment") -> list[str]:
+def warning(
+    left_out: Sequence[str], origin: str = "the documentation of the environment", unused: Sequence[str] = ()
+) -> list[str]:
+    sections = [f"# Sections that were not used: {', '.join(unused)}."] if unused else []
     return [
         f"# A first draft, from {origin}. Read it before you use it: a language model will",
         "# know only these texts. Left out on purpose: "
         f"{len(left_out)} sentences or rows with words such as reward, cost or score.",
+        *sections,
         "# Take out anything else that reveals the reward. Describe the goal, not how it is rewarded.",
     ]
 

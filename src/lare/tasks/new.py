@@ -73,8 +73,10 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
     full_id = f"{module}{colon}{environment.spec.id}" if environment.spec else environment_id
     name = re.sub(r"[^\w.\-]+", "-", environment_id.rpartition(":")[2])
     limit = environment.spec.max_episode_steps if environment.spec else None
+    used = {*itertools.chain(*TITLES.values()), *ENDINGS}
+    unused = tuple(title for title, body in sections.items() if title not in used and body.strip())
     lines = [
-        *warning(left_out),
+        *warning(left_out, unused=unused),
         f'name = "{name}"',
         f'environment = "{full_id}"',
         f"observation_size = {observation_size}",
@@ -91,8 +93,6 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
         ),
         *bodies(texts, heads),
     ]
-    used = {*itertools.chain(*TITLES.values()), *ENDINGS}
-    unused = tuple(title for title, body in sections.items() if title not in used and body.strip())
     return Draft(name, "\n".join(lines) + "\n", missing, left_out, unused=unused)
 
 

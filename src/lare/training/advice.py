@@ -15,6 +15,8 @@ LARGE = 10.0
 """The largest root mean square of an entry of the observation that needs no remark."""
 ROWS = 1000
 """So many stored observations of each environment are looked at."""
+BOUND = 0.99
+"""An entry of an action is at a bound if it is larger than this part of it."""
 SAME = 5
 """So many evaluations with equal returns are reported."""
 EQUAL = 1e-3
@@ -45,6 +47,29 @@ def of_observations(run: Run, held: Replay, config: TrainConfig) -> list[str]:
         f"Observations are large: the root mean square of {name} is {sizes[largest]:.3g} in the first steps, and {algorithm} does "
         "not normalise observations. Its actions may stay at their bounds. Let the environment divide each entry by its range, so "
         f"that it is within about -1 and 1{other}."
+    ]
+
+
+def of_actions(actions: Float[np.ndarray, "seeds steps action"], seeds: Sequence[int]) -> list[str]:
+    """A remark if a policy chooses the same bounds in all states; else nothing.
+
+    Args:
+        actions: those of each seed's policy, without noise, in some states; between -1 and 1.
+        seeds: the numbers of the seeds.
+    """
+    bound = np.where(np.abs(actions) > BOUND, np.sign(actions), 0)
+    constant = np.all((bound != 0) & (bound == bound[:, :1]), axis=(1, 2))
+    if not constant.any():
+        return []
+    stuck = [str(seed) for seed, alike in zip(seeds, constant, strict=True) if alike]
+    whose = (
+        "The policy"
+        if len(seeds) == 1
+        else f"The policy of {'seed' if len(stuck) == 1 else 'seeds'} {', '.join(stuck)}"
+    )
+    return [
+        f"{whose} chooses the same action in every state, with each entry at a bound. If the task needs more than that, the policy "
+        "is stuck, and more steps seldom help: see docs/bring-your-own-task.md, section 4."
     ]
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import find_method
+from lare.data import replay
 from lare.data.trajectory import Trajectory
 from lare.errors import LareError
 from lare.latent.improve import Model
@@ -132,6 +133,15 @@ class Session:
             self.keep_best(evaluation.returns[..., 0].mean(axis=1))
         measured = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest
         return lines(self.run.seeds, self.step, measured, rate)
+
+    def actions_now(self, steps: int) -> Float[np.ndarray, "seeds steps action"]:
+        """The actions of an off-policy algorithm's policies, without noise, in the newest states of the first environment."""
+        held, seeds = self.learner.replay, np.arange(len(self.run.seeds))[:, None]
+        rows = np.asarray(held.next_row)[:, :1] - 1 - np.arange(min(steps, int(np.min(held.next_row))))
+        seen = held.columns["observation"][seeds, 0, rows % replay.capacity(self.learner.replay)]
+        available = np.ones((*rows.shape, 1, self.config.env.action_size), bool)
+        action, _ = self.functions.act(self.actor, (), seen, available, None, np.zeros(rows.shape, bool))
+        return np.asarray(action)[:, :, 0]
 
     def keep_best(self, score: Float[np.ndarray, " seeds"]) -> None:
         """Save the policies of the seeds whose evaluation is their best so far."""
