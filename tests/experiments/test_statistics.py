@@ -7,8 +7,8 @@ import pytest
 
 from lare.errors import LareError
 from lare.experiments import statistics
-from lare.experiments.compare import cells, comparable, find_runs, what_scores_are, write_comparisons
-from lare.experiments.scores import by_label
+from lare.experiments.compare import cells, comparable, find_all, find_runs, what_scores_are, write_comparisons
+from lare.experiments.scores import RETURN, by_label
 from lare.experiments.statistics import too_few
 
 
@@ -129,6 +129,16 @@ def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):
     assert [run.directory for run in find_runs([tmp_path / "runs" / "Chase"])] == [run.directory for run in found]
     with pytest.raises(LareError, match=r"nothing is not a run, and contains none$"):
         find_runs([tmp_path / "nothing"])
+
+
+def test_the_logs_of_a_sweep_are_no_runs(made):
+    """`runs/study/*/*-td3*` names them too."""
+    run = made("a-td3", [1.0])
+    log = run.directory.with_name("a-td3.log")
+    log.write_text("step 50")
+    assert list(find_all([run.directory, log], RETURN)[0]) == ["dense"]
+    with pytest.raises(LareError, match=r"b\.log is not a run, and contains none; give the directory that it is in$"):
+        find_all([run.directory, log.rename(log.with_name("b.log"))], RETURN)
 
 
 def test_runs_without_an_evaluation_are_left_out_and_unfinished_ones_named(made):

@@ -22,7 +22,8 @@ def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | 
         LareError: there is nothing to compare, or a table cannot be read.
     """
     tables = [place for place in places if place.suffix == ".csv"]
-    directories = [place for place in places if place not in tables]
+    logs = [place for place in places if place.suffix == ".log" and place.with_suffix("").is_dir()]  # of a sweep's runs
+    directories = [place for place in places if place not in tables + logs]
     runs, remarks = comparable(find_runs(directories), metric) if directories or not tables else ([], [])
     found: dict[str, list[Run | Measured]] = {label: list(of_label) for label, of_label in by_label(runs).items()}
     of_tables = [read_results(place, metric) for place in tables]
