@@ -30,7 +30,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
                 "It learned. The return is 71 ± 1.41 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1 in 3 "
                 "episodes.",
                 "That is more than training on the return at the end alone gives here (12).",
-                "Its proxy rewards, from factors and raw features, explain nearly all of the score: R² of the last returns, before "
+                "Its proxy rewards, from factors and raw entries, explain nearly all of the score: R² of the last returns, before "
                 "they were learned from, is 0.97.",
                 "Next: it was still rising. To continue: `lare train --resume runs/x --steps 16000`.",
             ],
@@ -40,7 +40,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             {"return_r2": -3.0, "latent": True},
             [
                 "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
-                "Its proxy rewards, from factors and raw features, explain next to nothing of the score: R² of the last returns, "
+                "Its proxy rewards, from factors and raw entries, explain next to nothing of the score: R² of the last returns, "
                 "before they were learned from, is -3.00.",
                 "Next: the score depends on something else. `lare design Toy --reflect 2 --model NAME` asks for another phi; "
                 "`--method bayes` needs no phi.",
@@ -52,7 +52,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             {"return_r2": 0.9},
             [
                 "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
-                "Its proxy rewards, from raw features, explain nearly all of the score: R² of the last returns, before they were "
+                "Its proxy rewards, from raw entries, explain nearly all of the score: R² of the last returns, before they were "
                 "learned from, is 0.90.",
                 "Next: returns are predicted well, so it may depend on the algorithm: more `--steps`, or another `--algorithm` "
                 "(`lare algorithms`).",
@@ -128,7 +128,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             {"return_r2": 0.99, "latent": True},
             [
                 "It got worse than random actions. The return is -51.5 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
-                "Its proxy rewards, from factors and raw features, explain nearly all of the score: R² of the last returns, before "
+                "Its proxy rewards, from factors and raw entries, explain nearly all of the score: R² of the last returns, before "
                 "they were learned from, is 0.99.",
                 "Next: it repeats one behaviour: the last 5 returns of a seed hardly differ, and those of random actions do. More "
                 "`--steps` alone will not change that. Bring observations to about -1 to 1, or try another `--algorithm` "
@@ -142,7 +142,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             [
                 "It has not learned yet. The return is 1 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1 in 3 "
                 "episodes.",
-                "Its proxy rewards, from factors and raw features, usually explain the score (median R² of returns: 0.98), but not "
+                "Its proxy rewards, from factors and raw entries, usually explain the score (median R² of returns: 0.98), but not "
                 "the last episodes (R² -0.93): the policy has changed, and the decoder has to adapt.",
                 "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
             ],

@@ -26,7 +26,7 @@ def test_a_linear_score_is_found_and_told_from_unseen_returns(folder, tmp_path):
     found = lare.relabel(folder(logged(120)), tmp_path / "new")
     assert (found.method, found.episodes, found.cut, found.held_out) == ("bayes", 120, 0, 12)
     assert found.return_r2 > 0.98
-    assert any("Raw features explain" in line for line in found.explanation)
+    assert any("Raw entries explain" in line for line in found.explanation)
     assert "12 episodes held out, which nothing was fitted to, are predicted with an R² of" in found.words[1]
     for old, new in zip(logged(120), read(tmp_path / "new"), strict=True):
         np.testing.assert_array_equal(new["paid"], old["rewards"])

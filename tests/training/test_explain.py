@@ -47,7 +47,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             FACTORS,
             ENTRIES,
             [
-                "The factors explain 90% of the variation of the returns of 40 episodes, raw features another 7%.",
+                "The factors explain 90% of the variation of the returns of 40 episodes, raw entries another 7%.",
                 SHARES,
                 "- cost: 65%, +2 ± 0.1",
                 "- speed: 25%, +1 ± 0.1",
@@ -92,7 +92,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
                 "The score is treated as a sum over the steps of an episode: so far, an average predicts returns about as well. "
                 'This may change. If you know which of them it is, write `score = "sum"` or `score = "average"` into the task '
                 "file.",
-                "Raw features explain 5% of the variation of the returns of 40 episodes.",
+                "Raw entries explain 5% of the variation of the returns of 40 episodes.",
             ],
         ),
         (
@@ -134,7 +134,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
                 "factor in a step is paid.",
             ],
         ),
-        (found(), None, [], [], ["Raw features explain 97% of the variation of the returns of 40 episodes."]),
+        (found(), None, [], [], ["Raw entries explain 97% of the variation of the returns of 40 episodes."]),
         (found(episodes=19), None, FACTORS, ENTRIES, []),
         (
             found(by_all=np.nan),
@@ -198,5 +198,5 @@ def test_many_agents_are_explained_by_factors_alone(small_many, tmp_path):
     )
     lines = explanation_of(run)
     assert lines
-    assert "raw features" not in " ".join(lines)
+    assert "raw entries" not in " ".join(lines)
     assert jax.config.jax_enable_x64 is False

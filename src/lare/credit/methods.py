@@ -279,7 +279,7 @@ TABLE = (
         Reward.PROXY,
         Encoder.LATENT_AND_JUDGED,
         Fit.EVIDENCE,
-        "regression on latent rewards and, if the returns require them, on functions of them and of raw features",
+        "regression on latent rewards and, if the returns require them, on functions of them and of raw entries",
         BAYES,
         Decoder.ADDITIVE,
     ),

@@ -82,11 +82,11 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
             'them it is, write `score = "sum"` or `score = "average"` into the task file.'
         )
     if not factors:
-        return [*said, f"Raw features explain {found.by_all:.0%} of the variation of the returns of {count} episodes."]
+        return [*said, f"Raw entries explain {found.by_all:.0%} of the variation of the returns of {count} episodes."]
     more = float(found.by_all - found.by_factors)
     said.append(
         f"The factors explain {found.by_factors:.0%} of the variation of the returns of {count} episodes"
-        + (f", raw features another {more:.0%}." if entries and more >= 0.01 else ".")
+        + (f", raw entries another {more:.0%}." if entries and more >= 0.01 else ".")
     )
     if found.by_factors < NEXT_TO_NOTHING:
         said.append(

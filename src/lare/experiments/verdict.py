@@ -143,7 +143,7 @@ def told(run: Facts) -> list[str]:
     """Whether the proxy rewards explain the score."""
     if run.return_r2 is None or not np.isfinite(run.return_r2):
         return []
-    share, by = run.return_r2, "factors and raw features" if run.latent else "raw features"
+    share, by = run.return_r2, "factors and raw entries" if run.latent else "raw entries"
     if not explains_nothing(run) and share < NEXT_TO_NOTHING:
         return [
             f"Its proxy rewards, from {by}, usually explain the score (median R² of returns: {run.usual_r2:.2f}), but not the last "
