@@ -1,4 +1,4 @@
-"""Two groups of kept runs, seed against seed: means, their ratio, won pairs, and the probability of these by chance.
+"""Two groups of kept runs, every run against every run: means, their ratio, won pairs, and the probability of these by chance.
 
     python benchmarks/pairs.py DIRECTORY ... --over DIRECTORY ... [--key KEY] [--late]
 

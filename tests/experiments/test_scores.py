@@ -86,7 +86,7 @@ def test_two_tasks_of_one_name_are_not_compared(made):
         ),
         (
             [("a", "Walker2d-v4", {}), ("a", "Reacher-v4", {}), ("b", "Reacher-v4", {"seed": 2})],
-            "dense on Walker2d-v4 lacks a run with seed 2 and draw 0, which it has elsewhere",
+            "dense on Walker2d-v4 lacks a run with seed 2, which it has on another task: train it, or compare each task by itself",
         ),
         (
             [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": (60, 70)})],

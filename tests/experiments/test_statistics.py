@@ -137,7 +137,10 @@ def test_the_logs_of_a_sweep_are_no_runs(made):
     log = run.directory.with_name("a-td3.log")
     log.write_text("step 50")
     assert list(find_all([run.directory, log], RETURN)[0]) == ["dense"]
-    with pytest.raises(LareError, match=r"b\.log is not a run, and contains none; give the directory that it is in$"):
+    with pytest.raises(
+        LareError,
+        match=r"b\.log is not a run, and contains none; give the directory of a run, or a \.csv file ",
+    ):
         find_all([run.directory, log.rename(log.with_name("b.log"))], RETURN)
 
 
@@ -222,7 +225,8 @@ def test_a_run_that_is_given_twice_counts_once(made):
 def test_a_table_is_not_a_run(tmp_path):
     (tmp_path / "results.csv").touch()
     with pytest.raises(
-        LareError, match=r"results.csv is not a run, and contains none; give the directory that it is in$"
+        LareError,
+        match=r"results.csv is not a run, and contains none; give the directory of a run, or a \.csv file ",
     ):
         find_runs([tmp_path / "results.csv"])
 

@@ -73,7 +73,7 @@ def find_runs(places: Sequence[Path]) -> list[Run]:
         # A name that begins with a dot is the directory of a run that was killed before its directory was complete.
         found = sorted(path.parent for depth in ("", "[!.]*/", "[!.]*/[!.]*/") for path in place.glob(depth + CONFIG))
         if not found:
-            hint = "; give the directory that it is in" if place.is_file() else ""
+            hint = "; give the directory of a run, or a .csv file (docs/sweeps.md)" if place.is_file() else ""
             raise LareError(f"{place} is not a run, and contains none{hint}")
         for directory in found:
             directories.setdefault(directory.resolve(), directory)
@@ -145,7 +145,7 @@ def what_scores_are(comparison: Comparison) -> str:
 MEANINGS = (
     "IQM: interquartile mean over seeds and tasks; of fewer than four scores it is the mean. sd: standard deviation over the "
     "seeds (n - 1). Above baseline: the probability that a run scores more than one of the baseline, the first method; of a "
-    "single seed it is not given, and a probability of 0 or 1 has no interval. If the score is an error or a loss, a low "
+    "single seed it is not given, and one that is 0 or 1 on every task has no interval. If the score is an error or a loss, a low "
     "probability is good. p: the probability of at least so many won pairs of runs by chance or, if fewer than half were won, of "
     "so many lost ones (exact Mann-Whitney test, one-sided: a two-sided p is twice as large)."
 )

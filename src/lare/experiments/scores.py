@@ -200,7 +200,11 @@ def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[
 
     def values(draw: int, seed: int, task: str) -> list[float]:
         if (label, task, draw, seed) not in curves:
-            raise LareError(f"{label} on {task} lacks a run with seed {seed} and draw {draw}, which it has elsewhere")
+            which = f"seed {seed} and draw {draw}" if len(draws) > 1 else f"seed {seed}"
+            raise LareError(
+                f"{label} on {task} lacks a run with {which}, which it has on another task: train it, or compare each task by "
+                "itself"
+            )
         found = curves[label, task, draw, seed][1]
         low, high = REFERENCES[task] if len(tasks) > 1 else (0.0, 1.0)
         return [(found[step] - low) / (high - low) for step in steps]
