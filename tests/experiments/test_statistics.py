@@ -139,7 +139,8 @@ def test_the_logs_of_a_sweep_are_no_runs(made):
     assert list(find_all([run.directory, log], RETURN)[0]) == ["dense"]
     with pytest.raises(
         LareError,
-        match=r"b\.log is not a run, and contains none; give the directory of a run, or a \.csv file ",
+        match=r"b\.log is not a run, and contains none; give the directory of a run, or a \.csv file "
+        r"\(docs/sweeps\.md\)$",
     ):
         find_all([run.directory, log.rename(log.with_name("b.log"))], RETURN)
 
@@ -226,7 +227,8 @@ def test_a_table_is_not_a_run(tmp_path):
     (tmp_path / "results.csv").touch()
     with pytest.raises(
         LareError,
-        match=r"results.csv is not a run, and contains none; give the directory of a run, or a \.csv file ",
+        match=r"results.csv is not a run, and contains none; give the directory of a run, or a \.csv file "
+        r"\(docs/sweeps\.md\)$",
     ):
         find_runs([tmp_path / "results.csv"])
 
