@@ -33,8 +33,15 @@ class Falters(Chase):
             raise LareError("the battery is empty")
         return super().step(action)
 
+    def render(self):
+        return [][0] if self.where == "render" else np.zeros((2, 2, 3), np.uint8)
 
-for where in ("reset", "step", "itself", "window", "reward"):
+    def close(self):
+        if self.where == "close":
+            raise TypeError("'float' object is not callable")
+
+
+for where in ("reset", "step", "itself", "window", "reward", "close", "render"):
     gymnasium.register(f"misfits/{where}-v0", entry_point=Falters, kwargs={"where": where}, max_episode_steps=20)
 
 
@@ -43,6 +50,7 @@ for where in ("reset", "step", "itself", "window", "reward"):
     [
         ("reset", "environment 'misfits/reset-v0' failed in reset: no asset"),
         ("step", "environment 'misfits/step-v0' failed in step: ZeroDivisionError"),
+        ("close", "environment 'misfits/close-v0' failed in close: 'float' object is not callable"),
         ("itself", "the battery is empty"),
         ("window", "environment 'misfits/window-v0' failed in step: 0"),
         ("reward", "environment 'misfits/reward-v0' gave the reward None, which is no number"),
@@ -53,6 +61,13 @@ def test_a_failure_is_one_line(where, message):
     with pytest.raises(LareError) as error:
         random_steps(toy_spec(environment=f"misfits/{where}-v0"), 1)
     assert str(error.value) == message
+
+
+def test_a_failing_film_is_one_line():
+    environment = make("misfits/render-v0")
+    environment.reset(seed=0)
+    with pytest.raises(LareError, match=r"^environment 'misfits/render-v0' failed in render: list index out of range$"):
+        environment.render()
 
 
 def test_gymnasium_can_make_it_again():

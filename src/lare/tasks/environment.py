@@ -26,7 +26,7 @@ class EnvironmentFault(LareError):
 
 
 class Guarded(gymnasium.Wrapper, RecordConstructorArgs):
-    """Turns whatever `reset` and `step` of an environment raise, which is foreign code, into a `LareError` of one line.
+    """Turns whatever the methods of an environment raise, which is foreign code, into a `LareError` of one line.
 
     This includes `sys.exit`, which some programs call when a window is closed. Otherwise an interrupted run would look finished.
     """
@@ -51,6 +51,18 @@ class Guarded(gymnasium.Wrapper, RecordConstructorArgs):
             raise fault(f"environment {self.name!r} failed in step", error) from error
         paid = number(reward, f"environment {self.name!r} gave the reward")
         return observation, paid, terminated, truncated, self.told(info)
+
+    def render(self) -> Any:
+        try:
+            return self.env.render()
+        except (Exception, SystemExit) as error:
+            raise fault(f"environment {self.name!r} failed in render", error) from error
+
+    def close(self) -> None:
+        try:
+            self.env.close()
+        except (Exception, SystemExit) as error:
+            raise fault(f"environment {self.name!r} failed in close", error) from error
 
     def told(self, info: Any) -> dict[str, Any]:
         if not isinstance(info, dict):
