@@ -198,7 +198,7 @@ TABLE = (
         Encoder.NEXT,
         Fit.DRAWN_STEPS_UNBIASED,
         "rrdu on the next state and the action",
-        RRD,
+        f"{RRD}; these inputs: this package",
     ),
     Method(
         "rd-linear",
@@ -271,7 +271,7 @@ TABLE = (
         Encoder.LATENT,
         Fit.EVIDENCE,
         "linear regression on latent rewards",
-        BAYES,
+        f"LaRe, appendix B; the fit: {BAYES}",
         Decoder.LINEAR,
     ),
     Method(
