@@ -6,7 +6,7 @@
 
 Every experiment is a run directory RUNS/TASK/LABEL; its settings and metrics are kept unchanged. The curve of SBX's TD3
 (`sbx_learning.py RUNS/TASK/sbx-dense`) is one of them. Two processes with one core each train 1.1 times as fast as one process
-with two cores. The pictures use the newer runs of `sweeps/closed-form.toml` if they exist, which have the same settings.
+with two cores. The pictures also use the runs of `sweeps/closed-form.toml`, which have the same settings.
 """
 
 import json
@@ -121,17 +121,18 @@ def curve(directory: Path) -> figures.Curve:
     return np.asarray(steps, float), np.asarray([[returns[seed, step] for step in steps] for seed in seeds], float)
 
 
-def pictured(task: str, label: str) -> Path | None:
-    """The newer of the kept runs of a method, if there is one."""
+def pictured(task: str, label: str) -> figures.Curve | None:
+    """The curves of all kept runs of a method, if there is one."""
     places = [*(SWEPT / task / f"{label}-td3{ending}" for ending in ("", "-draw0")), KEPT / task / label]
-    return next((place for place in places if place.exists()), None)
+    found = [curve(place) for place in places if place.exists()]
+    return (found[0][0], np.concatenate([returns for _, returns in found])) if found else None
 
 
 def table() -> None:
     found = {f"{directory.parent.name}/{directory.name}": row(directory) for directory in sorted(KEPT.glob("*/*"))}
     (KEPT.parent / "learning.json").write_text(json.dumps(found, indent=1) + "\n")
     for task in EXPERIMENTS:
-        curves = {label: curve(place) for label in PICTURED if (place := pictured(task, label))}
+        curves = {label: of_label for label in PICTURED if (of_label := pictured(task, label))}
         if curves:
             picture = Path(__file__).parents[1] / "docs" / "pictures" / f"{task}.svg"
             picture.parent.mkdir(exist_ok=True)

@@ -85,6 +85,16 @@ def test_a_check_lists_the_runs_and_trains_none(file, command):
     ]
 
 
+def test_a_check_says_what_this_machine_lacks(file, command):
+    """The sweep may be meant for another machine."""
+    file.write_text(file.read_text().replace("[settings]", "cores = 1000\n[settings]"))
+    status, out, error = command("sweep", file, "--check")
+    assert (status, len(out.splitlines())) == (0, 3)
+    assert re.search(
+        r"^processes = \d with cores = 1000 each need \d+ cores, and \d+ are usable here$", error, re.MULTILINE
+    )
+
+
 def test_what_is_done_is_left_alone_and_what_was_begun_goes_on(file, in_this_process):
     wanted, (dense, first, second) = read_sweep(file)
     train_one(as_json(dense))

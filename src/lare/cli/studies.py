@@ -33,6 +33,7 @@ def sweep(
         check: only check the file, list its runs and how far they are, and train nothing.
     """
     from lare.cli.watch import watching
+    from lare.experiments.processes import shares
     from lare.experiments.sweep import is_done, read_sweep, run_sweep
     from lare.experiments.tables import rows_of, write_table
 
@@ -41,6 +42,11 @@ def sweep(
         if warning := job.resolved.untrained:
             progress(f"{job.name}: {warning}")
     if check:
+        if ray is None:
+            try:
+                shares(wanted.processes, wanted.cores)
+            except LareError as error:  # the sweep may be meant for another machine
+                progress(str(error))
         for job in jobs:
             say(f"{job.name}: {'done' if is_done(job) else f'step {job.step():,} of {job.resolved.steps:,}'}")
         return
