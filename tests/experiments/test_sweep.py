@@ -90,9 +90,8 @@ def test_a_check_says_what_this_machine_lacks(file, command):
     file.write_text(file.read_text().replace("[settings]", "cores = 1000\n[settings]"))
     status, out, error = command("sweep", file, "--check")
     assert (status, len(out.splitlines())) == (0, 3)
-    assert re.search(
-        r"^processes = \d with cores = 1000 each need \d+ cores, and \d+ are usable here$", error, re.MULTILINE
-    )
+    need = r"^processes = \d with cores = 1000 each need \d+ cores, and \d+ are usable here"
+    assert re.search(f"{need}: the sweep would not begin on this machine$", error, re.MULTILINE)
 
 
 def test_what_is_done_is_left_alone_and_what_was_begun_goes_on(file, in_this_process):

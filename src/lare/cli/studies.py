@@ -46,7 +46,7 @@ def sweep(
             try:
                 shares(wanted.processes, wanted.cores)
             except LareError as error:  # the sweep may be meant for another machine
-                progress(str(error))
+                progress(f"{error}: the sweep would not begin on this machine")
         for job in jobs:
             say(f"{job.name}: {'done' if is_done(job) else f'step {job.step():,} of {job.resolved.steps:,}'}")
         return
