@@ -167,14 +167,13 @@ def write_comparisons(
 
 def comparisons(runs: Mapping[str, Sequence[Run | Measured]], metric: str = RETURN) -> list[Comparison]:
     """One comparison over all tasks; one of each task if their scores have no common scale."""
-    tasks = sorted({task_of(one) for of_label in runs.values() for one in of_label})
-    if len(tasks) == 1 or (metric == RETURN and all(task in REFERENCES for task in tasks)):
+    by_task: dict[str, dict[str, list[Run | Measured]]] = {}
+    for label, of_label in runs.items():
+        for one in of_label:
+            by_task.setdefault(task_of(one), {}).setdefault(label, []).append(one)
+    if len(by_task) == 1 or (metric == RETURN and all(task in REFERENCES for task in by_task)):
         return [compare(runs, metric)]
-    by_task = {
-        task: {label: [one for one in of_label if task_of(one) == task] for label, of_label in runs.items()}
-        for task in tasks
-    }
-    return [compare({label: some for label, some in of_task.items() if some}, metric) for of_task in by_task.values()]
+    return [compare(by_task[task], metric) for task in sorted(by_task)]
 
 
 def task_of(one: Run | Measured) -> str:

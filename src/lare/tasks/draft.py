@@ -61,7 +61,7 @@ def bodies(texts: Mapping[str, str], heads: Mapping[str, str]) -> list[str]:
 
     def body(key: str, text: str) -> str:
         head = heads.get(key, "")
-        return "\n".join(part for part in ("" if head and text.startswith(head) else head, text) if part)
+        return text if text.startswith(head) else f"{head}\n{text}"
 
     return [f"\n{key} = {quoted(body(key, text or f'{FILL_IN}: {WANTED[key]}'))}" for key, text in texts.items()]
 

@@ -138,7 +138,7 @@ class Session:
         """The actions of an off-policy algorithm's policies, without noise, in the newest states of the first environment."""
         held, seeds = self.learner.replay, np.arange(len(self.run.seeds))[:, None]
         rows = np.asarray(held.next_row)[:, :1] - 1 - np.arange(min(steps, int(np.min(held.next_row))))
-        seen = held.columns["observation"][seeds, 0, rows % replay.capacity(self.learner.replay)]
+        seen = held.columns["observation"][seeds, 0, rows % replay.capacity(held)]
         available = np.ones((*rows.shape, 1, self.config.env.action_size), bool)
         action, _ = self.functions.act(self.actor, (), seen, available, None, np.zeros(rows.shape, bool))
         return np.asarray(action)[:, :, 0]
