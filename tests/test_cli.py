@@ -1,5 +1,6 @@
 """The command line, in this process: what it prints, and that a mistake is one line and exit status 2."""
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -192,6 +193,17 @@ def test_verify_prints_every_error(command, spec_file, tmp_path):
         "        E-CALL line 3: open is not a function that is available",
         "        E-NUMPY line 3: np.clamp is not available: there is no such function; write np.clip",
     ]
+
+
+def test_verify_says_how_a_reply_from_a_chat_is_corrected(command, spec_file, tmp_path):
+    source = "def evaluation_func(o, a):\n    return [a[:, 0]]"
+    (tmp_path / "reply.json").write_text(json.dumps({"Understand": "", "Analyze": "", "Functions": source}))
+    status, out, err = command("verify", "reply.json", "--task", spec_file())
+    assert (status, err) == (1, "")
+    assert "        E-FORM: factor 1 must be an array of shape (batch_size, 1) = (256, 1), " in out
+    assert out.endswith(
+        "Paste the lines after FAILED into the same chat, and ask for the whole reply again, corrected.\n"
+    )
 
 
 def test_verify_gives_advice(command, spec_file, tmp_path):

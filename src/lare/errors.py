@@ -69,6 +69,9 @@ class Checked(BaseModel):
         except ValidationError as error:
             raise LareError(problems_of(error, keys_of(type(self)))) from None
 
+    # Pydantic shall not call it for settings within settings: then the outermost settings report the error, with its whole place.
+    __init__.__pydantic_base_init__ = True  # pyright: ignore[reportFunctionMemberAccess]
+
 
 def keys_of(settings: type[Checked]) -> Iterator[str]:
     """The keys of settings, and of the settings within them as `td3.gamma`."""
@@ -128,11 +131,13 @@ def place_of(problem: Mapping[str, Any]) -> str:
 def in_words(problem: Mapping[str, Any], names: Sequence[str]) -> str:
     """A problem that pydantic found."""
     where, said = place_of(problem), problem["msg"].removeprefix("Value error, ")
+    table, _, key = where.rpartition(".")
     if problem["type"] == "extra_forbidden" and where in names:
-        table, _, key = where.rpartition(".")
         return f"there is no key {where!r}: write {table}={{{key!r}: ...}}"
     if problem["type"] == "extra_forbidden":
-        return f"there is no key {where!r}{did_you_mean(where, names)}"
+        beside = [name.removeprefix(f"{table}.") for name in names if table and name.startswith(f"{table}.")]
+        others = f"; the keys of {table} are {', '.join(beside)}" if beside else ""
+        return f"there is no key {where!r}{did_you_mean(key, beside or names) or others}"
     if problem["type"] == "model_type":
         said = "should be a table of settings, such as {'KEY': VALUE}"
     if problem["type"] == "tuple_type":

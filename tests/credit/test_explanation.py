@@ -42,12 +42,20 @@ def test_factors_that_tell_all(extended, form):
     found = explain(sums, form, basis)
     steps = float(sums.steps / sums.episodes) if form else 1  # a step of an average has a T-th of it
     assert float(found.episodes) == 120
+    assert bool(found.of_steps) == (form == 0)
     assert float(found.by_factors) > 0.98
     np.testing.assert_allclose(found.share, [0.8, 0.2, 0], atol=0.1)
     weight, deviation = np.asarray(found.slope) * steps, np.asarray(found.deviation) * steps
     np.testing.assert_allclose(weight, [2, -1, 0], atol=0.15)
     assert (deviation > 0).all()
     assert (np.abs(weight - [2, -1, 0]) < 4 * deviation + 0.02).all()
+
+
+def test_episodes_of_one_length_are_explained_by_their_returns():
+    basis, random = Basis(2, 0, extended=False), np.random.default_rng(0)
+    means, length = random.normal(size=(30, 2)), np.full(30, 7)
+    given = (jnp.asarray(part) for part in (means, 7 * means @ [2.0, -1.0], length))
+    assert not explain(evidence.add_episodes(evidence.no_sums(2), *given), 0, basis).of_steps
 
 
 def test_what_the_factors_leave_goes_with_the_entry_that_is_missing():

@@ -55,6 +55,19 @@ def test_the_form_is_found_or_given(form):
     assert judge(rows, alive, returns, BASIS, {"sum": "average", "average": "sum"}[form]).r2 < found.r2
 
 
+def test_lengths_alone_predict_the_score_of_equal_steps():
+    rows, alive, _ = played()
+    length = np.array([len(one) for one in rows])
+    found = judge(rows, alive, 3.0 * length, BASIS, "sum")
+    assert found.r2_of_lengths == pytest.approx(1)
+    assert found.r2 > 0.99
+    zero_mean = judge(*played(), BASIS)
+    assert zero_mean.r2_of_lengths < zero_mean.r2 - 0.3
+    assert judge(*played("average"), BASIS).r2_of_lengths is None
+    equal = judge([one[:5] for one in rows], [one[:5] for one in alive], 3.0 * length, BASIS)
+    assert equal.r2_of_lengths is None
+
+
 def test_agents_who_have_left_do_not_count():
     rows, alive, _ = played(agents=2)
     changed = [np.concatenate([one, np.full_like(one[:, :1], 9.0)], axis=1) for one in rows]

@@ -31,6 +31,15 @@ def test_runs_of_one_method_are_told_apart_by_their_settings(made):
     assert list(by_label(runs))[1:] == ["rd, td3, credit.learning_rate 0.0001", "dense, td3", "dense, ddpg"]
 
 
+def test_settings_that_differ_from_task_to_task_make_one_method_all_the_same(made):
+    """Unless they also differ on one task: then every run is named after them."""
+    runs = [made("a", [1.0], td3={"warmup": 10}), made("a", [2.0], "Depot", td3={"warmup": 20})]
+    assert list(by_label(runs)) == ["dense"]
+    runs.append(made("b", [3.0], td3={"warmup": 20}))
+    found = {label: [run.config.task.name for run in some] for label, some in by_label(runs).items()}
+    assert found == {"dense, td3.warmup 10": ["Chase"], "dense, td3.warmup 20": ["Depot", "Chase"]}
+
+
 def with_function(run, *digests):
     return Run(run.directory, run.config.model_copy(update={"function_sha256": digests}), ())
 

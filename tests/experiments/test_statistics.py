@@ -7,9 +7,17 @@ import pytest
 
 from lare.errors import LareError
 from lare.experiments import statistics
-from lare.experiments.compare import cells, comparable, find_all, find_runs, what_scores_are, write_comparisons
+from lare.experiments.compare import (
+    cells,
+    cells_of_all,
+    comparable,
+    find_all,
+    find_runs,
+    what_scores_are,
+    write_comparisons,
+)
 from lare.experiments.scores import RETURN, by_label
-from lare.experiments.statistics import too_few
+from lare.experiments.statistics import over_all, too_few
 
 
 @pytest.fixture(autouse=True)
@@ -95,6 +103,27 @@ def test_tasks_without_a_common_scale_have_a_table_each(made, tmp_path):
     page = (tmp_path / "page.html").read_text()
     assert "<h2>Chase</h2>" in page
     assert "<h2>Reacher-v4</h2>" in page
+
+
+def test_tasks_without_a_common_scale_are_compared_together_by_the_order_of_their_runs(made, tmp_path):
+    low, high = [1.0, 2, 3], [4.0, 5, 6]
+    runs = [made("a", low), made("b", high, method="rd"), made("c", high, method="rrd")]
+    runs += [
+        made("a", [100 * one for one in low], "Depot"),
+        made("b", [100 * one for one in high], "Depot", method="rd"),
+    ]
+    runs += [made("c", high[:2], "Depot", method="rrd")]
+    found = write_comparisons(by_label(runs), tmp_path / "page.html")
+    first, second = over_all(found)  # without rrd, which has fewer seeds on one of the tasks
+    assert (first.label, first.better, first.p) == ("dense", None, None)
+    assert (second.label, second.seeds, second.better.value) == ("rd", 3, 1)
+    assert second.p == pytest.approx(1 / 400)
+    assert cells_of_all(found) == [("dense (baseline)", "3", "-", "-"), ("rd", "3", "1.000", "0.0025")]
+    assert "<h2>All tasks</h2>" in (tmp_path / "page.html").read_text()
+    other = write_comparisons(by_label(runs[:2] + runs[4:]), tmp_path / "page.html")
+    assert over_all(other) == []  # no dense on Depot
+    assert over_all(found[:1]) == []
+    assert "All tasks" not in (tmp_path / "page.html").read_text()
 
 
 def test_something_else_than_the_return_is_compared(made):

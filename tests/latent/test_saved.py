@@ -88,6 +88,23 @@ def test_a_source_is_read_without_a_look_into_it(function, tmp_path):
         read_source(tmp_path / "book.py")
 
 
+def test_a_reply_to_a_pasted_request_is_read_as_it_is(chase, sound, tmp_path, trusting):
+    """With anything around the object, as a chat shows it."""
+    reply = json.dumps({"Understand": "", "Analyze": "", "Functions": PHI})
+    path = tmp_path / "reply.json"
+    path.write_text(f"Here it is:\n```json\n{reply}\n```\n")
+    assert read_source(path) == (SOURCE, False, None)
+    loaded = load(path, chase)
+    assert (loaded.source, loaded.model) == (SOURCE, "a model that is not named")
+    loaded.save(tmp_path / "phi.py")
+    assert load(tmp_path / "phi.py", chase).model == "a model that is not named"
+    path.write_text('{"Understand": ""}')
+    with pytest.raises(
+        LareError, match=r"reply\.py does not exist, and .*reply\.json is not a model's reply: .*'Functions'"
+    ):
+        read_source(path)
+
+
 def test_the_hash_says_whether_a_source_was_changed(function, chase, tmp_path):
     """With the record beside it, and without."""
     path = tmp_path / "phi.py"

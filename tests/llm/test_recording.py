@@ -96,16 +96,21 @@ def test_an_unknown_draw_is_refused(kind, draw, message):
             "{}",
             "recording X.json: the keys 'task', 'kind', 'draw', 'model', 'recorded', 'temperature', 'exchanges' are missing",
         ),
+        (
+            {"Understand": "", "Analyze": "", "Functions": ""},
+            "X.json is a single reply, not a recording of requests and their replies: lare verify X.json --task TASK reads the "
+            "function in it",
+        ),
         (RECORDING | {"note": "mine"}, "recording X.json: there is no key 'note'"),
         (RECORDING | {"kind": "poems"}, "recording X.json: kind = 'poems': input should be 'factors' or 'reward'"),
         (RECORDING | {"exchanges": 3}, "recording X.json: exchanges = 3: input should be a valid list"),
         (
             RECORDING | {"exchanges": [EXCHANGE | {"stage": "chat"}]},
-            "recording X.json: stage = 'chat': input should be 'candidate', 'combine', 'correct' or 'reflect'",
+            "recording X.json: exchanges.0.stage = 'chat': input should be 'candidate', 'combine', 'correct' or 'reflect'",
         ),
         (
             RECORDING | {"exchanges": [EXCHANGE | {"replies": [None]}]},
-            "recording X.json: replies.0 = None: input should be a valid string",
+            "recording X.json: exchanges.0.replies.0 = None: input should be a valid string",
         ),
     ],
 )

@@ -30,8 +30,9 @@ def test_what_is_left_open_has_the_default_of_its_place(name):
 @pytest.mark.parametrize(
     ("credit", "message"),
     [
-        ({"step": 800}, "there is no key 'step'"),
-        ({"drawn_steps": 1}, "drawn_steps = 1: input should be"),
+        ({"step": 800}, r"^there is no key 'credit.step' \(did you mean 'steps'\?\)$"),
+        ({"fit": 3}, "^there is no key 'credit.fit'; the keys of credit are hidden, learning_rate, "),
+        ({"drawn_steps": 1}, "^credit.drawn_steps = 1: input should be"),
         ({"hidden": (0,)}, "hidden"),
     ],
 )

@@ -18,6 +18,7 @@ from toys import Ear, toy_spec
 def found(**changes):
     values = {
         "episodes": 40,
+        "of_steps": False,
         "varied": np.array([True, True]),
         "by_factors": 0.9,
         "by_all": 0.97,
@@ -133,6 +134,13 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
                 "them apart: add up the two lines. If both ± are small and the effects have opposite signs, the change of the "
                 "factor in a step is paid.",
             ],
+        ),
+        (
+            found(of_steps=True),
+            None,
+            [],
+            [],
+            ["Raw entries explain 97% of the variation of the mean reward of a step in 40 episodes."],
         ),
         (found(), None, [], [], ["Raw entries explain 97% of the variation of the returns of 40 episodes."]),
         (found(episodes=19), None, FACTORS, ENTRIES, []),

@@ -69,8 +69,8 @@ def new_task(
     say(f"read it, then: lare design {path}{data} --model NAME --out phi.py")
     none = "lare relabel without --function" if drafted.of_logs else "--method bayes"
     say(
-        "or, without a model: write phi.py yourself, with a function evaluation_func(observation, action) "
-        f"(docs/bring-your-own-task.md, 2.); {none} needs no phi.py"
+        f"or, without a model: paste the output of lare prompt {path} into a chat, or write phi.py yourself, with a function "
+        f"evaluation_func(observation, action) (docs/bring-your-own-task.md, 2.); {none} needs no phi.py"
     )
 
 
@@ -110,7 +110,7 @@ def verify(
     Exit status 0: it passes. 1: it does not, and every reason is printed. 2: it could not be checked.
 
     Args:
-        file: Python source, or a function that `lare design` saved.
+        file: Python source, a function that `lare design` saved, or a model's reply to the request of `lare prompt` (.json).
         task: a shipped name (see `lare tasks`), or the path of a task file.
         kind: what the function returns: several factors, or one reward.
         data: logged episodes; the function is checked on their steps instead of random steps of the environment. A directory, a
@@ -150,6 +150,8 @@ def verify(
     if verdict.isolation:
         say(f"It ran in {verdict.isolation}.")
     if not verdict.passed:
+        if file.suffix == ".json":
+            say("Paste the lines after FAILED into the same chat, and ask for the whole reply again, corrected.")
         sys.exit(1)
     if fit:
         function = of_verdict(source, role, kind, verdict)
@@ -182,10 +184,18 @@ def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes:
             )
         return
     if math.isfinite(found.r2):
-        shown = f"{found.r2:.3f}" if found.r2 > 0.99 else f"{found.r2:.2f}"
         say(
-            f"Returns of episodes not seen yet, predicted by the factors: R² = {shown} (1: exactly; 0: no better than their mean)."
+            f"Returns of episodes not seen yet, predicted by the factors: R² = {r2_shown(found.r2)} (1: exactly; 0: no better than "
+            "their mean)."
         )
+        if found.r2_of_lengths is not None:
+            say(
+                f"Predicted by the lengths of these episodes alone, without a factor: R² = {r2_shown(found.r2_of_lengths)}."
+            )
         say(f"Fitted to all {len(episodes)} episodes:")
     for line in found.sentences:
         say(line)
+
+
+def r2_shown(value: float) -> str:
+    return f"{value:.3f}" if value > 0.99 else f"{value:.2f}"

@@ -179,7 +179,9 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
     for name, values in found.measures.items():
         for seed, of_seed in zip(opened.seeds, values, strict=True):
             say(f"seed {seed}: {name} {plus_minus(*mean_and_deviation(of_seed))}")
-    for line in explanation_of(opened):
+    if told := explanation_of(opened):
+        say(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
+    for line in told:
         say(line)
 
 

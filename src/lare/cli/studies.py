@@ -81,19 +81,22 @@ def compare(
         metric: the key of metrics.jsonl to compare.
         out: the page to write.
     """
-    from lare.experiments.compare import HEAD, MEANINGS, cells, find_all, what_scores_are, write_comparisons
+    from lare.experiments import compare as page
     from lare.experiments.statistics import too_few
 
-    found, remarks = find_all(runs, metric)
+    found, remarks = page.find_all(runs, metric)
     for remark in remarks:
         progress(remark)
-    comparisons = write_comparisons(found, out, metric)
+    comparisons = page.write_comparisons(found, out, metric)
     for comparison in comparisons:
         if len(comparisons) > 1:
             say(f"\n{comparison.tasks[0]}")
-        show(HEAD, cells(comparison))
-        say(f"{what_scores_are(comparison)} {too_few(comparison)}".rstrip())
-    say(MEANINGS)
+        show(page.HEAD, page.cells(comparison))
+        say(f"{page.what_scores_are(comparison)} {too_few(comparison)}".rstrip())
+    if rows := page.cells_of_all(comparisons):
+        say("\nAll tasks: each run is compared with the runs on the same task.")
+        show(page.HEAD_OF_ALL, rows)
+    say(page.MEANINGS)
     say(f"wrote {out}")
 
 

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare.credit import evidence
 from lare.credit.basis import Basis, expand
+from lare.credit.decomposition import AVERAGE, SUM
 from lare.credit.evidence import Posterior, Sums
 
 ROUNDS = 100
@@ -38,6 +39,8 @@ class Explanation(NamedTuple):
     """The explanation of one team's score."""
 
     episodes: Float[Array, ""]
+    of_steps: Bool[Array, ""]
+    """Whether the shares are of the variation of R/T, not of R: the score is a sum, and episodes differ in length."""
     varied: Bool[Array, " factors"]
     """Whether a factor has differed between steps."""
     by_factors: Float[Array, ""]
@@ -65,10 +68,10 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     group, of_factors = basis.group, basis.of_factors
     whole = evidence.fit(sums, form, group, evidence.unknown(basis.size, len(basis.sizes)), ROUNDS)
     by_all = explained(sums, form, group, whole)
-    none = jnp.zeros(0)
+    of_steps, none = (form == SUM) & lengths_differ(sums), jnp.zeros(0)
     if not of_factors.any():
         left = jnp.zeros(basis.used_entries)
-        return Explanation(sums.episodes, none > 0, jnp.zeros(()), by_all, none, none, none, none, none, left)
+        return Explanation(sums.episodes, of_steps, none > 0, jnp.zeros(()), by_all, none, none, none, none, none, left)
     alone, numbers = restricted(sums, np.flatnonzero(of_factors)), group[of_factors]
     fitted = evidence.fit(alone, form, numbers, evidence.unknown(len(numbers), int(numbers.max()) + 1), ROUNDS)
     sigma = evidence.covariance(alone, form, numbers, fitted)
@@ -79,9 +82,12 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     own, paired = of_each(part, basis)
     scale = by_factors / jnp.where(jnp.sum(part) > 0, jnp.sum(part), 1)
     slope, deviation, linear = effects(fitted.weight, sigma, basis)
-    steps = jnp.where(form == 1, sums.steps / jnp.maximum(sums.episodes, 1), 1)  # r_hat of an average is divided by T
+    steps = jnp.where(
+        form == AVERAGE, sums.steps / jnp.maximum(sums.episodes, 1), 1
+    )  # r_hat of an average is divided by T
     return Explanation(
         sums.episodes,
+        of_steps,
         jnp.diagonal(given.s)[: basis.factors] > 0,
         by_factors,
         jnp.maximum(by_all, by_factors),
@@ -92,6 +98,13 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
         scale * paired,
         residual(sums, form, basis, fitted, of_factors),
     )
+
+
+def lengths_differ(sums: Sums) -> Bool[Array, ""]:
+    """Whether R is more than the same multiple of R/T in all episodes, which it is if all of them have one length."""
+    length = sums.steps / jnp.maximum(sums.episodes, 1)
+    (yy, yr), (_, rr) = sums.products[-2:, -2:]
+    return rr - 2 * length * yr + length**2 * yy > 1e-6 * rr
 
 
 def restricted(sums: Sums, features: Int[np.ndarray, " some"]) -> Sums:

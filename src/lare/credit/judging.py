@@ -36,6 +36,8 @@ class Judgement(NamedTuple):
 
     r2: float
     """NaN if all returns are equal or there are too few."""
+    r2_of_lengths: float | None
+    """R^2 of predictions from the lengths of the episodes alone; None if they do not differ, or the score is an average."""
     form: FormFound | None
     """None if it is given or makes no difference, because all episodes have one length."""
     explanation: Explanation
@@ -65,12 +67,27 @@ def judge(
         told = {form: predictions(means[:, basis.of_factors], returns, length, basis, form) for form in forms}
         errors = {form: float(np.sum((returns[FIRST:] - one) ** 2)) for form, one in told.items()}
         form = AVERAGE if errors.get(AVERAGE, np.inf) < BETTER * errors.get(SUM, np.inf) else SUM
+        if form == SUM and len(set(length)) > 1:
+            no_factors = np.zeros_like(means)[:, basis.of_factors]
+            lengths = predictions(no_factors, returns, length, basis, SUM)
+        else:
+            lengths = None
         sums = evidence.add_episodes(evidence.no_sums(basis.size), *map(jnp.asarray, (means, returns, length)))
         explanation = jax.tree.map(np.asarray, explained(sums, form, basis=basis))
-    spread = float(np.sum((returns[FIRST:] - returns[FIRST:].mean()) ** 2)) if len(returns) > FIRST else 0.0
-    r2 = 1 - errors[form] / spread if spread > 0 else np.nan
     decided = min(errors.values()) < BETTER * max(errors.values())
-    return Judgement(r2, FormFound(form == AVERAGE, decided) if len(forms) > 1 else None, explanation)
+    return Judgement(
+        r2(returns, told[form]),
+        None if lengths is None else r2(returns, lengths),
+        FormFound(form == AVERAGE, decided) if len(forms) > 1 else None,
+        explanation,
+    )
+
+
+def r2(returns: Float[np.ndarray, " episodes"], predicted: Float[np.ndarray, " later_episodes"]) -> float:
+    """R^2 of all episodes but the first `FIRST`; NaN if their returns are equal or there are none."""
+    later = returns[FIRST:]
+    spread = float(np.sum((later - later.mean()) ** 2)) if len(later) else 0.0
+    return 1 - float(np.sum((later - predicted) ** 2)) / spread if spread > 0 else np.nan
 
 
 def mean_features(

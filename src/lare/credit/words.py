@@ -81,11 +81,12 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
             f"The score is treated as {this} over the steps of an episode: so far, {why}. This may change. If you know which of "
             'them it is, write `score = "sum"` or `score = "average"` into the task file.'
         )
+    what = f"the mean reward of a step in {count} episodes" if found.of_steps else f"the returns of {count} episodes"
     if not factors:
-        return [*said, f"Raw entries explain {found.by_all:.0%} of the variation of the returns of {count} episodes."]
+        return [*said, f"Raw entries explain {found.by_all:.0%} of the variation of {what}."]
     more = float(found.by_all - found.by_factors)
     said.append(
-        f"The factors explain {found.by_factors:.0%} of the variation of the returns of {count} episodes"
+        f"The factors explain {found.by_factors:.0%} of the variation of {what}"
         + (f", raw entries another {more:.0%}." if entries and more >= 0.01 else ".")
     )
     if found.by_factors < NEXT_TO_NOTHING:

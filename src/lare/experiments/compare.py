@@ -9,10 +9,11 @@ from lare.experiments import figures
 from lare.experiments.html import note, table, write_page
 from lare.experiments.own_results import read_results
 from lare.experiments.scores import REFERENCES, RETURN, SUMMED_RETURN, Measured, by_label, differing
-from lare.experiments.statistics import REPETITIONS, Comparison, compare, plus_minus, too_few
+from lare.experiments.statistics import REPETITIONS, Comparison, Estimate, compare, over_all, plus_minus, too_few
 from lare.run.directory import CONFIG, Run, read_measured
 
 HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "above baseline [95%]", "p")
+HEAD_OF_ALL = ("all tasks", "seeds", "above baseline [95%]", "p")
 
 
 def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | Measured]], list[str]]:
@@ -118,17 +119,32 @@ def cells(comparison: Comparison) -> list[tuple[str, ...]]:
     """The table, as text."""
     return [
         (
-            row.label if place else f"{row.label} (baseline)",
+            named(row.label, place),
             str(row.seeds),
             str(row.draws),
             str(row.iqm),
             plus_minus(row.mean, row.deviation),
             "-" if row.over_draws is None else str(row.over_draws),
-            "-" if row.better is None else str(row.better),
-            "-" if row.p is None else f"{row.p:.2g}",
+            *shown(row.better, row.p),
         )
         for place, row in enumerate(comparison.rows)
     ]
+
+
+def cells_of_all(found: Sequence[Comparison]) -> list[tuple[str, ...]]:
+    """The table over all tasks of several comparisons, as text; without rows if there is nothing to compare."""
+    return [
+        (named(row.label, place), str(row.seeds), *shown(row.better, row.p))
+        for place, row in enumerate(over_all(found))
+    ]
+
+
+def named(label: str, place: int) -> str:
+    return label if place else f"{label} (baseline)"
+
+
+def shown(better: Estimate | None, p: float | None) -> tuple[str, str]:
+    return "-" if better is None else str(better), "-" if p is None else f"{p:.2g}"
 
 
 def what_scores_are(comparison: Comparison) -> str:
@@ -195,6 +211,9 @@ def body(title: str, found: Sequence[Comparison]) -> Iterable[str]:
         yield figures.bands(comparison.curves, "environment steps", f"IQM of the {score}", True)
         yield f"<h{level}>Performance profiles</h{level}>"
         yield figures.bands(comparison.profiles, f"x ({score})", "share of runs that score more", False)
+    if rows := cells_of_all(found):
+        yield "<h2>All tasks</h2>"
+        yield table(HEAD_OF_ALL, rows, range(1, len(HEAD_OF_ALL)))
     yield note(
         f"{MEANINGS} Intervals: stratified bootstrap over the seeds, {REPETITIONS} repetitions; in the column with draws, over the "
         "draws of the language model."

@@ -68,5 +68,5 @@ def note(text: str) -> str:
 
 def function_text(model: str, digest: str, source: str) -> str:
     """The source of a latent function, and who wrote it."""
-    by = "Written by hand" if model.startswith("none: written by hand") else f"By {model}"
+    by = "Its file names no model" if model.startswith("none: written by hand") else f"By {model}"
     return note(f"{by}. SHA-256 {digest}.") + f"<pre>{escape(source)}</pre>"

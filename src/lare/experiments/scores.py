@@ -75,19 +75,23 @@ class Group:
 
 
 def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """The runs by label: the method, the algorithm if there are several, and the settings in which runs of a method differ.
+    """The runs by label: the method, the algorithm if there are several, and the settings in which runs of a method differ on a
+    task.
 
     Runs with equal labels are told apart by their functions and, if a seed is in two of them, by their directories.
     """
     plans = [run.config.settings.in_force(run.config.task) for run in runs]
     several = len({plan["algorithm"] for plan in plans}) > 1
+    values: dict[tuple[str, str, str, str], set[str]] = {}  # by method, algorithm, setting and task
+    for run, plan in zip(runs, plans, strict=True):
+        for name in plan.keys() - ignored(plan):
+            key = plan["method"], plan["algorithm"], name, run.config.task.name
+            values.setdefault(key, set()).add(str(plan[name]))
+    differ = {key[:3] for key, some in values.items() if len(some) > 1}
     found: dict[str, list[Run]] = {}
     for run, plan in zip(runs, plans, strict=True):
-        alike = [other for other in plans if all(other[name] == plan[name] for name in ("method", "algorithm"))]
-        told = (
-            name for name in plan if name not in ignored(plan) and any(other[name] != plan[name] for other in alike)
-        )
-        parts = [plan["method"], *([plan["algorithm"]] if several else []), *(f"{name} {plan[name]}" for name in told)]
+        told = [f"{name} {plan[name]}" for name in plan if (plan["method"], plan["algorithm"], name) in differ]
+        parts = [plan["method"], *([plan["algorithm"]] if several else []), *told]
         found.setdefault(", ".join(parts), []).append(run)
     functions = {name: some for label, of_label in found.items() for name, some in by_function(label, of_label).items()}
     return {name: some for label, of_label in functions.items() for name, some in by_directory(label, of_label).items()}

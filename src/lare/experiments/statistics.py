@@ -31,6 +31,8 @@ FEW = {2: ("two", "one of two"), 3: ("three", "three of four")}
 which is more than 2.5% of the samples."""
 
 Scores = Float[np.ndarray, "runs tasks *steps"]
+Others = Float[np.ndarray, "others tasks"]
+"""The scores of another method, perhaps of another number of runs."""
 
 
 @dataclass(frozen=True)
@@ -167,13 +169,52 @@ def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:
     over_draws = better = p = None
     if len(group.draws) > 1:
         (over_draws,) = estimates(group.scores[..., -1].mean(axis=1), lambda scores: np.array([np.mean(scores)]))
-    if group.label != first and min(len(mine), len(last[first])) > 1:
-        (better,) = estimates((mine, last[first]), lambda *both: np.array([metrics.probability_of_improvement(*both)]))
-        if math.comb(len(mine) + len(last[first]), len(mine)) <= MOST_SPLITS:
-            pairs = list(zip(mine.T, last[first].T, strict=True))
-            p = min(mann_whitney(pairs))
+    if group.label != first:
+        better, p = improvement(mine, last[first])
     mean, deviation = mean_and_deviation(mine.mean(axis=1))
     return Row(group.label, len(group.seeds), len(group.draws), iqm, mean, deviation, over_draws, better, p)
+
+
+def improvement(mine: Scores, first: Others) -> tuple[Estimate | None, float | None]:
+    """How often a run scores more than a run of the first method on the same task, and its p: `Row.better` and `Row.p`."""
+    if min(len(mine), len(first)) < 2:
+        return None, None
+    metrics = rliable()[1]
+    (better,) = estimates((mine, first), lambda *both: np.array([metrics.probability_of_improvement(*both)]))
+    few = math.comb(len(mine) + len(first), len(mine)) <= MOST_SPLITS
+    return better, min(mann_whitney(list(zip(mine.T, first.T, strict=True)))) if few else None
+
+
+class OverAll(NamedTuple):
+    """One method compared with the first one over tasks whose scores have no common scale."""
+
+    label: str
+    seeds: int
+    better: Estimate | None
+    """As in `Row`; None for the first method."""
+    p: float | None
+
+
+def over_all(found: Sequence[Comparison]) -> list[OverAll]:
+    """The first method and the others over the tasks of several comparisons. Empty if two of them are not on all tasks.
+
+    Runs are compared with runs on the same task, by their order alone, so the tasks need no common scale. Each task has the same
+    weight. Only methods are compared that are on every task with equally many seeds.
+    """
+    last: dict[str, Scores] = {}
+    for label in found[0].groups if len(found) > 1 else ():
+        groups = [one.groups.get(label) for one in found]
+        scores = [group.scores[..., -1].mean(axis=0) for group in groups if group is not None]
+        if len(scores) == len(found) and len(set(map(len, scores))) == 1:
+            last[label] = np.concatenate(scores, axis=1)
+    firsts = {one.rows[0].label for one in found}
+    if len(firsts) != 1 or not last.keys() > firsts:
+        return []
+    (first,) = firsts
+    return [
+        OverAll(label, len(mine), *((None, None) if label == first else improvement(mine, last[first])))
+        for label, mine in last.items()
+    ]
 
 
 def mann_whitney(
@@ -219,7 +260,7 @@ def band(x: Float[np.ndarray, " points"], scores: Scores, function: Callable[...
     return Band(x, *(np.array([getattr(one, part) for one in found]) for part in ("value", "low", "high")))
 
 
-def estimates(scores: Scores | tuple[Scores, Scores], function: Callable[..., np.ndarray]) -> list[Estimate]:
+def estimates(scores: Scores | tuple[Scores, Others], function: Callable[..., np.ndarray]) -> list[Estimate]:
     """The values of `function`, with intervals by stratified bootstrap, always with the same random numbers."""
     library, _ = rliable()
     with warnings.catch_warnings(), random_numbers(0):

@@ -13,19 +13,25 @@ from lare.latent.function import CHANGED, HEADER, LatentFunction, normal, sha256
 from lare.latent.verification.verify import Steps
 from lare.llm.prompts import Kind
 from lare.llm.recording import Exchange
+from lare.llm.reply import MalformedReply, parse
 from lare.tasks.load import as_task
 from lare.tasks.spec import TaskSpec
 
 LARGEST_FILE = 1 << 20
 """The largest size of a function file, in bytes."""
 
+UNNAMED = "a model that is not named"
+"""The model of a function that was read from a reply."""
+
 
 def source_file(path: str | Path) -> Path:
-    """The Python file of a saved function. Raises `LareError` if there is none."""
+    """The Python file of a saved function, or the file of a model's reply. Raises `LareError` if there is none."""
     if not isinstance(path, (str, Path)):
         raise LareError(f"a latent function is read from the path of a file, not from {shortened(path)}")
     path = Path(path)
     source_path = path.with_suffix(".py") if path.suffix == ".json" else path
+    if not source_path.is_file() and path.is_file():
+        source_path = path
     if not source_path.is_file():
         what = "is not a file" if source_path.exists() else "does not exist"
         raise LareError(f"the function file {source_path} {what}")
@@ -34,6 +40,18 @@ def source_file(path: str | Path) -> Path:
             f"the function file {source_path} is larger than {LARGEST_FILE >> 20} MB, which is too large for a function"
         )
     return source_path
+
+
+def text_of(source_path: Path) -> str:
+    """The text of a Python file, or the function within a model's reply. Raises `LareError` if the file holds neither."""
+    text = read_text(source_path)
+    if source_path.suffix != ".json":
+        return text
+    try:
+        return parse(text).functions
+    except MalformedReply as error:
+        python = source_path.with_suffix(".py")
+        raise LareError(f"{python} does not exist, and {source_path} is not a model's reply: {error}") from error
 
 
 def split_header(text: str) -> tuple[list[str], str]:
@@ -60,7 +78,7 @@ class SavedSource(NamedTuple):
 
 def read_source(path: str | Path) -> SavedSource:
     """The source of a function file. Raises `LareError` if it cannot be read."""
-    header, source = split_header(read_text(source_file(path)))
+    header, source = split_header(text_of(source_file(path)))
     return SavedSource(normal(source), was_changed(header, source), said_of("task", header))
 
 
@@ -68,7 +86,8 @@ def load(path: str | Path, task: TaskSpec | str | Path, steps: Steps | None = No
     """Read a function from a file, and verify it. Files that `save` wrote are verified again too.
 
     Args:
-        path: the path of the function, .py or .json.
+        path: a Python file, the .json that `save` wrote beside one, or the whole reply of a model to `lare prompt` (.json, without
+            a .py beside it).
         task: the task of the function: a name, a path, or a spec.
         steps: observations (n, observation size) and actions (n, action size) that it is tried on if there is no environment.
 
@@ -76,7 +95,7 @@ def load(path: str | Path, task: TaskSpec | str | Path, steps: Steps | None = No
         LareError: the file cannot be read, or the function does not pass for this task.
     """
     source_path, task = source_file(path), as_task(task, playable=steps is None)
-    header, source = split_header(read_text(source_path))
+    header, source = split_header(text_of(source_path))
     written_for = said_of("task", header)
     if written_for not in (None, task.name):
         raise LareError(
@@ -85,6 +104,8 @@ def load(path: str | Path, task: TaskSpec | str | Path, steps: Steps | None = No
         )
     kind: Kind = "reward" if said_of("kind", header) == "reward" else "factors"
     function = verified(source, task, kind, steps, source_path)
+    if source_path.suffix == ".json":
+        return replace(function, model=UNNAMED)
     function = replace(function, model=said_of("model", header) or function.model)
     function = with_provenance(function, source_path.with_suffix(".json"))
     if was_changed(header, source) and not function.changed:

@@ -62,6 +62,11 @@ def read_recording(text: str, name: str) -> Recording:
         raise LareError(f"recording {name} is not JSON: {error}") from error
     if not isinstance(values, dict):
         raise LareError(f"recording {name} is JSON, but not an object")
+    if "Functions" in values:
+        raise LareError(
+            f"{name} is a single reply, not a recording of requests and their replies: lare verify {name} --task TASK reads the "
+            "function in it"
+        )
     try:
         return Recording(**values)
     except LareError as error:

@@ -139,7 +139,7 @@ class ResolvedSettings(Checked):
     capacity: Annotated[int, Field(ge=4)]
     scale_rewards: bool
     reflect_every: Count | None = None
-    first_fit: Literal["held-out", "published"] = "published"
+    first_fit: Literal["held-out", "published"] | None = None
     hyperparameters: AlgorithmSettings
     """The hyperparameters of the algorithm."""
     credit: CreditSettings

@@ -95,6 +95,7 @@ def test_runs():
 
 
 WANTED = "factor {} must be an array of shape (batch_size, 1) = (256, 1), but is {}"
+ONE_DIMENSION = ": write [:, i:i + 1] for the column of entry i, because [:, i] has only one dimension"
 
 
 @pytest.mark.parametrize(
@@ -111,7 +112,7 @@ WANTED = "factor {} must be an array of shape (batch_size, 1) = (256, 1), but is
         (lambda o, a: [a, 1.5], WANTED.format(2, "a float")),
         (lambda o, a: [a, np.float32(1)], WANTED.format(2, "a float32")),
         (lambda o, a: [[a]], WANTED.format(1, "a list")),
-        (lambda o, a: [a[:, 0]], WANTED.format(1, "an array of shape (256,) and type float32")),
+        (lambda o, a: [a[:, 0]], WANTED.format(1, f"an array of shape (256,) and type float32{ONE_DIMENSION}")),
         (lambda o, a: [a, o], WANTED.format(2, "an array of shape (256, 2) and type float32")),
         (lambda o, a: [a.T], WANTED.format(1, "an array of shape (1, 256) and type float32")),
         (
@@ -443,7 +444,7 @@ FIRST_MESSAGE = {
         "E-FINITE line 3: factor 1 is nan for 129 of 256 recorded steps (invalid value encountered in log)"
     ),
     "inf_exp": "E-FINITE line 3: factor 1 is inf for 48 of 256 recorded steps (overflow encountered in exp)",
-    "shape_1d": f"E-FORM: {FORM} an array of shape (256,) and type float32",
+    "shape_1d": f"E-FORM: {FORM} an array of shape (256,) and type float32{ONE_DIMENSION}",
     "shape_row": f"E-FORM: {FORM} an array of shape (1, 256) and type float32",
     "returns_array": (
         "E-FORM: evaluation_func must return a list of arrays, but returned an array of shape (256, 1) and type float32"

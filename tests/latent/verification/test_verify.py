@@ -61,7 +61,8 @@ ORDER = ["gate", *CHECKS]
             ["gate", "runs", "form"],
             [
                 "E-FORM: factor 1 must be an array of shape (batch_size, 1) = (256, 1), "
-                "but is an array of shape (256,) and type float32"
+                "but is an array of shape (256,) and type float32: write [:, i:i + 1] for the column of entry i, because "
+                "[:, i] has only one dimension"
             ],
         ),
         (

@@ -55,6 +55,13 @@ class Check:
     message: str
 
 
+NOT_COLUMNS = {
+    (): ": write [:, i:i + 1] for the column of entry i, because [:, i] has only one dimension",
+    (0,): ": a slice beyond the last column is empty",
+}
+"""What to say of arrays of shape (batch_size, ...) that are not columns."""
+
+
 class Failed(Exception):
     """A check failed. The message says what was expected, what happened, and where."""
 
@@ -126,8 +133,8 @@ def factors_of(returned: Returned, rows: int, kind: str) -> Float[np.ndarray, "r
     for number, value in enumerate(returned.values, start=1):
         if value[0] != "array" or value[1] != (rows, 1):
             wanted = f"an array of shape (batch_size, 1) = ({rows}, 1)"
-            empty = ": a slice beyond the last column is empty" if value[1:2] == ((rows, 0),) else ""
-            raise failed("E-FORM", f"factor {number} must be {wanted}, but is {shown(value)}{empty}")
+            hint = NOT_COLUMNS.get(value[1][1:], "") if value[0] == "array" and value[1][:1] == (rows,) else ""
+            raise failed("E-FORM", f"factor {number} must be {wanted}, but is {shown(value)}{hint}")
         if value[2] not in REAL:
             raise failed("E-FORM", f"factor {number} must hold real numbers, but is {shown(value)}")
     if returned.factors is None:
