@@ -114,11 +114,13 @@ def untrained(config, seed=0):
     return common.init(jax.random.key(seed), config, lambda key: module_of(config).init(key, config))
 
 
-def with_steps(learner, config, steps, factors=None):
-    """A learner that has met these steps too, and been told of the episodes that have finished."""
+def with_steps(learner, config, steps, factors=None, tell=False):
+    """A learner that has met these steps too. Fits in closed form have been told of the episodes that have finished, and all others
+    with `tell`: they would only learn the form of the score from it, and compiling this takes a second.
+    """
     factors = factors_for(config, steps) if factors is None else factors
     learner = jitted(common.store, config)(learner, steps, factors)
-    return told(learner, config) if learner.credit else learner
+    return told(learner, config) if learner.credit and (tell or not config.method.descends) else learner
 
 
 COMPILED = {}

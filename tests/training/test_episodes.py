@@ -49,7 +49,8 @@ def in_pieces(config, steps, factors, pieces):
     """A learner that has met steps in so many pieces; what it was after each."""
     learner = untrained(config)
     for rows in np.array_split(np.arange(len(steps.ended)), pieces):
-        learner = with_steps(learner, config, jax.tree.map(lambda leaf, rows=rows: leaf[rows], steps), factors[rows])
+        rows_of = jax.tree.map(lambda leaf, rows=rows: leaf[rows], steps)
+        learner = with_steps(learner, config, rows_of, factors[rows], tell=True)
         yield learner
 
 
@@ -134,7 +135,7 @@ def test_returns_are_predicted_before_they_are_learned_from(method):
     for begin, end in zip([0, *ends], ends, strict=False):
         rows = jax.tree.map(lambda leaf, begin=begin, end=end: leaf[begin:end], steps)
         before = learner.credit[0]
-        learner = with_steps(learner, config, rows, factors[begin:end])
+        learner = with_steps(learner, config, rows, factors[begin:end], tell=True)
         known = learner.credit[0].predictions
         if int(known.episodes) > int(before.predictions.episodes):
             place = int(known.episodes) - 1
@@ -227,7 +228,7 @@ def test_seeds_in_lockstep_are_seeds_alone(method):
     learners, told = [], []
     for seed, lengths in enumerate((LENGTHS * 3, (12, 12, 12, 5) * 3)):
         steps = steps_of(RIVALS, 2, seed, lengths)
-        learners.append(with_steps(untrained(config, seed), config, steps))
+        learners.append(with_steps(untrained(config, seed), config, steps, tell=True))
         told.append(learners[-1].counted.tolist())
     fresh = [one._replace(counted=0 * one.counted) for one in learners]
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[(x.credit, x.replay, x.counted) for x in fresh])

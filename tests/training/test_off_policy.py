@@ -81,7 +81,7 @@ def test_seeds_in_lockstep_are_seeds_alone():
     )
     alone = jax.tree.map(lambda leaf: np.asarray(leaf)[1], start)
     together, _ = functions.improve(functions.learn_returns(functions.store(start, many, factors)), many, keys, 0)
-    alone = with_steps(alone, config, steps)
+    alone = with_steps(alone, config, steps, tell=True)
     alone, _ = jax.jit(partial(off_policy.improve_one, config=config))(alone, steps, keys[1], jnp.array(0))
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
         np.testing.assert_allclose(np.asarray(a)[1], b, rtol=1e-4, atol=1e-5)

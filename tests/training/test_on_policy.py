@@ -214,7 +214,7 @@ def test_seeds_in_lockstep_are_seeds_alone(algorithm, env):
     alone = jax.tree.map(lambda leaf: np.asarray(leaf)[1], start)
     together, _ = functions.fit(functions.learn_returns(functions.store(start, many, factors)), keys)
     together, _ = functions.improve(together, many, keys, 40)
-    alone = with_steps(alone, config, steps)
+    alone = with_steps(alone, config, steps, tell=True)
     alone = alone._replace(credit=jax.jit(partial(common.fit_often, config=config))(alone, keys[1])[0])
     alone, _ = jax.jit(partial(on_policy.improve_one, config=config))(alone, steps, keys[1], jnp.array(40))
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):

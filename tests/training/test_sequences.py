@@ -164,7 +164,7 @@ def test_seeds_in_lockstep_are_seeds_alone():
     assert measured["algorithm/updates"].tolist() == [5, 3]
     improve = jax.jit(partial(sequences.improve, config=config))
     for seed in (0, 1):
-        learner = one_seed(with_steps(alone[seed], config, of_each[seed], factors[seed]))
+        learner = one_seed(with_steps(alone[seed], config, of_each[seed], factors[seed], tell=True))
         found, _ = improve(learner, one_seed(of_each[seed]), keys[seed][None], jnp.array(0))
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(found), strict=True):
             np.testing.assert_allclose(np.asarray(a)[seed], np.asarray(b)[0], rtol=1e-3, atol=1e-5)
