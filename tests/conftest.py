@@ -71,7 +71,7 @@ def pytest_collection_finish():
     gc.set_threshold(50_000, 20, 20)
 
 
-MODULES_UNTIL_FORGOTTEN = itertools.cycle([False] * 7 + [True])
+MODULES_UNTIL_FORGOTTEN = itertools.cycle([False] * 3 + [True])
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from lare.credit import evidence
-from lare.credit.basis import Basis, expand, shapes
-from lare.credit.explanation import covariance_of_effect
+from lare.credit.basis import Basis, expand
 from lare.credit.explanation import explain as explain_sums
 
 explain = jax.jit(explain_sums, static_argnames="basis")
@@ -21,14 +20,26 @@ def in_float64():
 
 def summed(basis, reward, count=120, seed=0, noise=0.1, form=0):
     """Sums over episodes of about 20 steps that pay a function of the inputs, or weights times them; or the average of this."""
+    u, length = moody(basis.inputs, count, seed)
+    paid = reward(u) if callable(reward) else u @ reward
+    return summed_over(basis, u, length, paid + noise * np.random.default_rng([seed, 1]).normal(size=len(u)), form)
+
+
+def moody(inputs, count, seed=0):
+    """Steps whose inputs vary within episodes and between them, and the lengths of the episodes."""
     random = np.random.default_rng(seed)
-    mood = random.normal(size=(count, basis.inputs))
+    mood = random.normal(size=(count, inputs))
     length = random.integers(10, 30, size=count)
-    u = np.repeat(mood, length, axis=0) + random.normal(size=(length.sum(), basis.inputs))
-    paid = (reward(u) if callable(reward) else u @ reward) + noise * random.normal(size=len(u))
-    begins = np.append(0, np.cumsum(length)[:-1])
-    means = np.add.reduceat(np.asarray(expand(basis, jnp.asarray(u))), begins) / length[:, None]
-    returns = np.add.reduceat(paid, begins) / (length if form else 1)
+    return np.repeat(mood, length, axis=0) + random.normal(size=(length.sum(), inputs)), length
+
+
+def means_of(values, length):
+    return np.add.reduceat(values, np.append(0, np.cumsum(length)[:-1])) / length.reshape(-1, *[1] * (values.ndim - 1))
+
+
+def summed_over(basis, u, length, paid, form=0):
+    means = means_of(np.asarray(expand(basis, jnp.asarray(u))), length)
+    returns = means_of(paid, length) * (1 if form else length)
     given = (jnp.asarray(part) for part in (means, returns, length))
     return evidence.add_episodes(evidence.no_sums(basis.size), *given)
 
@@ -125,12 +136,29 @@ def test_a_factor_that_offsets_another_has_a_share_below_0():
 @pytest.mark.parametrize("count", [30, 100])
 def test_the_slope_is_that_of_the_closest_line_whatever_features_express_it(count):
     """|u| bends the shapes of all factors, and a sine then takes the place of the second factor's line."""
-    basis = Basis(2, 0, True)
-    found = explain(summed(basis, lambda u: -2 * np.abs(u[:, 0]) + 0.5 * u[:, 1], count), 0, basis)
-    np.testing.assert_allclose(found.slope, [0, 0.5], atol=0.1)
+    basis, (u, length) = Basis(2, 0, True), moody(2, count)
+    effects = np.stack([-2 * np.abs(u[:, 0]), 0.5 * u[:, 1]], axis=1)
+    found = explain(summed_over(basis, u, length, effects.sum(axis=1)), 0, basis)
+    want = [np.cov(means_of(u[:, i], length), means_of(effects[:, i], length), aweights=length)[:, 0] for i in range(2)]
+    np.testing.assert_allclose(found.slope, [with_effect / own for own, with_effect in want], atol=0.05)
     assert float(found.linear[0]) < 0.1
     assert float(found.linear[1]) > 0.9
     np.testing.assert_allclose(found.paired, 0, atol=0.02)
+
+
+@pytest.mark.parametrize("count", [30, 100])
+def test_the_effect_of_a_rare_event_is_what_it_pays(count):
+    """It has two values, so that all of its shapes are one line: weights are not known one by one, but what they add up to is."""
+    random = np.random.default_rng(0)
+    length = random.integers(20, 40, size=count)
+    event = random.random(length.sum()) < 0.03
+    deviation = event.std()
+    u = np.stack([(event - event.mean()) / deviation, random.normal(size=len(event))], axis=1)
+    basis = Basis(2, 0, extended=True)
+    found = explain(summed_over(basis, u, length, 5.0 * event + 0.01 * random.normal(size=len(event))), 0, basis)
+    assert float(found.slope[0]) == pytest.approx(5 * deviation, rel=0.02)
+    assert float(found.deviation[0]) < 0.02
+    assert float(found.linear[0]) == pytest.approx(1, abs=1e-3)
 
 
 def test_the_effect_of_a_pair_is_told_apart():
@@ -138,11 +166,3 @@ def test_the_effect_of_a_pair_is_told_apart():
     found = explain(summed(basis, lambda u: u[:, 0] * u[:, 1], 100), 0, basis)
     np.testing.assert_allclose(found.paired, found.share, atol=0.1)
     np.testing.assert_allclose(found.slope, 0, atol=0.1)
-
-
-def test_the_covariance_of_an_effect_is_that_of_a_standard_normal():
-    covariance = covariance_of_effect()
-    u = np.random.default_rng(0).normal(size=(400_000, 1))
-    sampled = np.cov(np.asarray(jnp.concatenate([jnp.asarray(u), shapes(jnp.asarray(u), 3)], axis=1)), rowvar=False)
-    np.testing.assert_allclose(covariance, sampled, atol=0.01)
-    assert covariance[0, 0] == pytest.approx(1)

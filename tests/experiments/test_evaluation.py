@@ -9,8 +9,9 @@ import pytest
 import lare
 from lare.errors import LareError
 from lare.experiments import evaluation
-from lare.experiments.evaluation import evaluate_run
+from lare.experiments.evaluation import evaluate_run, random_play
 from lare.experiments.policy import policy_of
+from lare.experiments.statistics import mean_and_deviation, plus_minus
 from lare.experiments.video import check_video, write_video
 from lare.tasks.gymnasium import GymnasiumEnv
 from lare.tasks.load import read_task
@@ -43,6 +44,18 @@ def test_a_video_nowhere_is_one_line(tmp_path):
 def test_a_video_that_could_not_be_written_is_not_begun(tmp_path, name, message):
     with pytest.raises(LareError, match=message):
         check_video(tmp_path / name)
+
+
+def test_measures_of_random_play_stand_beside_those_of_the_policy(small, tmp_path, command):
+    task = toy_spec(measures=("distance",))
+    lare.train(task, small(method="dense", steps=60, seeds=1), out=tmp_path / "run", listeners=[])
+    status, out, err = command("evaluate", tmp_path / "run", "--episodes", 3)
+    assert (status, err) == (0, "")
+    random = np.array([one.measures["distance"] for one in random_play(task)])
+    shown = plus_minus(*mean_and_deviation(random))
+    assert [line.split()[:3] for line in out.splitlines()[2:3]] == [["seed", "0:", "distance"]]
+    assert out.splitlines()[3] == f"random actions: distance {shown}"
+    assert random.std() > 0
 
 
 def test_more_episodes_than_there_are_environments_begin_each_from_a_start_of_its_own(small, tmp_path, monkeypatch):

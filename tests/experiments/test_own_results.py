@@ -58,7 +58,10 @@ def test_the_first_method_of_a_table_that_is_listed_first_is_the_baseline(table,
             of_methods("mine").replace(",100,", ",99,"),
             "{} has no evaluation/return of mine at step 100 for every seed: no run is compared there",
         ),
-        (of_methods("mine").replace("Chase", "Chasing"), "{} has the task Chasing; the runs have Chase"),
+        (
+            of_methods("mine").replace("Chase", "Chasing"),
+            "{} has the task Chasing, which is left out: the runs have Chase",
+        ),
     ],
 )
 def test_a_table_that_does_not_fit_the_runs_is_named(rows, said, table, made):
@@ -66,11 +69,22 @@ def test_a_table_that_does_not_fit_the_runs_is_named(rows, said, table, made):
     assert find_all((run.directory, path), RETURN)[1] == [said.format(path)]
 
 
+def test_a_task_that_no_run_has_is_left_out(table, made):
+    """So that a table of a whole study can be compared with the runs of one of its tasks."""
+    run = made("a", [0.5, 0.75], td3={"warmup": 10})
+    path = table(of_methods("mine") + of_methods("mine").replace("Chase", "Depot"))
+    compared = compare(find_all((run.directory, path), RETURN)[0])
+    assert (compared.tasks, [row.label for row in compared.rows]) == (("Chase",), ["dense", "mine"])
+
+
 def test_a_seed_that_is_in_both_is_refused(table, made):
     run, path = made("a", [0.5]), table(of_methods("dense"))
     with pytest.raises(LareError) as error:
         compare(find_all((run.directory, path), RETURN)[0])
-    assert str(error.value) == f"{path} and {run.directory} are both dense on Chase with seed 0: leave one out"
+    assert str(error.value) == (
+        f"{path} and {run.directory} are both dense on Chase with seed 0: leave one out, or give the method in "
+        "the table another name"
+    )
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def test_a_reply_to_a_pasted_request_is_read_as_it_is(chase, sound, tmp_path, tr
     assert load(tmp_path / "phi.py", chase).model == "a model that is not named"
     path.write_text('{"Understand": ""}')
     with pytest.raises(
-        LareError, match=r"reply\.py does not exist, and .*reply\.json is not a model's reply: .*'Functions'"
+        LareError, match=r"reply\.json is not a model's reply \(.*'Functions'.*\), and .*reply\.py does not exist$"
     ):
         read_source(path)
 

@@ -36,6 +36,10 @@ SHARES = (
     "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes; below "
     "0%: it offsets others), and by how much a step's reward rises with one standard deviation of it:"
 )
+SET_IT = (
+    'If you know which of them it is, set it: `score = "sum"` or `score = "average"` in the task file, `--credit.score`, or '
+    "`CreditSettings(score=...)`."
+)
 FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
 
 
@@ -63,8 +67,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             ENTRIES,
             [
                 "The score is treated as an average over the steps of an episode: so far, this predicts returns better than a sum. "
-                'This may change. If you know which of them it is, write `score = "sum"` or `score = "average"` into the task '
-                "file.",
+                f"This may change. {SET_IT}",
                 "The factors explain 5% of the variation of the returns of 40 episodes.",
                 "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of.",
             ],
@@ -76,8 +79,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             [],
             [
                 "The score is treated as a sum over the steps of an episode: so far, this predicts returns better than an average. "
-                'This may change. If you know which of them it is, write `score = "sum"` or `score = "average"` into the task '
-                "file.",
+                f"This may change. {SET_IT}",
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
                 SHARES,
                 "- speed: 99%, +1 ± 0.1",
@@ -91,8 +93,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             [],
             [
                 "The score is treated as a sum over the steps of an episode: so far, an average predicts returns about as well. "
-                'This may change. If you know which of them it is, write `score = "sum"` or `score = "average"` into the task '
-                "file.",
+                f"This may change. {SET_IT}",
                 "Raw entries explain 5% of the variation of the returns of 40 episodes.",
             ],
         ),
@@ -123,13 +124,25 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
         (
             found(by_factors=0.99, by_all=0.99, varied=np.array([True, False]), share=np.array([0.99, 0.0])),
             None,
-            ["speed (before)", "busy (before)"],
+            ["speed (before)", "speed (after)"],
             [],
             [
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
                 SHARES,
                 "- speed (before): 99%, +1 ± 0.1",
-                "- busy (before): it has never varied",
+                "- speed (after): it has never varied",
+            ],
+        ),
+        (
+            found(by_factors=0.99, by_all=0.99, share=np.array([0.99, 0.0])),
+            None,
+            ["speed (before)", "speed (after)"],
+            [],
+            [
+                "The factors explain 99% of the variation of the returns of 40 episodes.",
+                SHARES,
+                "- speed (before): 99%, +1 ± 0.1",
+                "- speed (after): 0%, +2 ± 0.1",
                 "Each factor has two lines: before and after the step. If both ± are as large as the effects, the fit cannot tell "
                 "them apart: add up the two lines. If both ± are small and the effects have opposite signs, the change of the "
                 "factor in a step is paid.",

@@ -148,7 +148,9 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
         best: play the policy of each seed's best evaluation, instead of the last policy.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
-    from lare.experiments.evaluation import RANDOM_EPISODES, evaluation_of, random_returns
+    import numpy as np
+
+    from lare.experiments.evaluation import RANDOM_EPISODES, evaluation_of, random_play
     from lare.experiments.statistics import mean_and_deviation, plus_minus
     from lare.experiments.video import check_video, record_video
     from lare.run.directory import open_run
@@ -174,11 +176,16 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
             of_seed = plus_minus(*mean_and_deviation(found.returns[place, :, team]))
             of_best = "" if since is None else f" (the policy of step {since[place]:,})"
             say(f"{named}seed {seed}: return {of_seed} over {counted}{of_best}")
-    if len(roles) == 1 and len(by_chance := random_returns(opened.config.task, max(episodes, RANDOM_EPISODES))):
-        say(f"random actions: return {plus_minus(*mean_and_deviation(by_chance))} over {len(by_chance)} episodes")
+    by_chance = random_play(opened.config.task, max(episodes, RANDOM_EPISODES)) if len(roles) == 1 else []
+    if by_chance:
+        returns = np.array([one.total for one in by_chance])
+        say(f"random actions: return {plus_minus(*mean_and_deviation(returns))} over {len(by_chance)} episodes")
     for name, values in found.measures.items():
         for seed, of_seed in zip(opened.seeds, values, strict=True):
             say(f"seed {seed}: {name} {plus_minus(*mean_and_deviation(of_seed))}")
+        if by_chance:
+            of_chance = np.array([one.measures[name] for one in by_chance])
+            say(f"random actions: {name} {plus_minus(*mean_and_deviation(of_chance))}")
     if told := explanation_of(opened):
         say(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
     for line in told:

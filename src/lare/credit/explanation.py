@@ -12,9 +12,15 @@ correlation of the residual of a fit on the factors alone with the mean of raw e
 
     (p - S mu)_j / sqrt(S_jj (q - 2 mu . p + mu . S mu))
 
-The effect of factor i is g_i(u_i), the sum of its linear feature and its shapes times their weights. The weights alone do not
-tell how the reward rises with the factor, because a sine can take the place of a line. With u standard normal, the line that
-is closest to g_i has the slope E[u g_i(u)], and it has the part E[u g_i(u)]^2 / Var g_i(u) of the variance of the effect.
+The effect of factor i is g_i(u_i) = w_i . f_i(u_i), the sum of its linear feature and its shapes times their weights. The weights
+alone do not tell how the reward rises with the factor, because a sine can take the place of a line. Let C_i be the part of S of the
+features f_i, the covariance of their means over the episodes, with the linear feature first. The line that is closest to the mean
+effect of the episodes has the slope and the part of the effect's variance
+
+    e . w_i,  e = C_i[0] / C_i[0, 0]        (e . w_i)^2 C_i[0, 0] / (w_i . C_i w_i)
+
+and the slope has the posterior variance e . Sigma_i e. For a factor with two values, such as an event that happens or not, all f_i
+are the same line, and the slope is known as soon as returns tell the difference between the values.
 """
 
 from typing import NamedTuple
@@ -24,15 +30,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lare.credit import evidence
-from lare.credit.basis import Basis, expand
+from lare.credit.basis import FREQUENCIES, Basis
 from lare.credit.decomposition import AVERAGE, SUM
 from lare.credit.evidence import Posterior, Sums
 
 ROUNDS = 100
 """Maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
-ONE_FACTOR = Basis(1, 0, extended=True)
-"""The features that a factor has alone: itself and its shapes."""
-SHAPED = ONE_FACTOR.size
+SHAPED = 1 + 2 * FREQUENCIES
+"""The number of features that a factor has alone: itself and its shapes."""
 
 
 class Explanation(NamedTuple):
@@ -49,7 +54,8 @@ class Explanation(NamedTuple):
     """Share of the variation that factors and raw entries explain together."""
     slope: Float[Array, " factors"]
     """How much a step's reward rises if a factor rises by one standard deviation: the slope of the line that is closest to its
-    effect in the fit on factors. If the score is an average: the rise for a step of an episode of average length."""
+    effect in the fit on factors; 0 if its mean over an episode has never varied. If the score is an average: the rise for a step of
+    an episode of average length."""
     deviation: Float[Array, " factors"]
     """Posterior deviation of `slope`."""
     linear: Float[Array, " factors"]
@@ -81,7 +87,7 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     by_factors = explained(alone, form, numbers, fitted)
     own, paired = of_each(part, basis)
     scale = by_factors / jnp.where(jnp.sum(part) > 0, jnp.sum(part), 1)
-    slope, deviation, linear = effects(fitted.weight, sigma, basis)
+    slope, deviation, linear = effects(fitted.weight, sigma, given.s, basis)
     steps = jnp.where(
         form == AVERAGE, sums.steps / jnp.maximum(sums.episodes, 1), 1
     )  # r_hat of an average is divided by T
@@ -135,25 +141,21 @@ def of_each(part: Float[Array, " features"], basis: Basis) -> tuple[Float[Array,
 
 
 def effects(
-    weight: Float[Array, " features"], sigma: Float[Array, "features features"], basis: Basis
+    weight: Float[Array, " features"],
+    sigma: Float[Array, "features features"],
+    s: Float[Array, "features features"],
+    basis: Basis,
 ) -> tuple[Float[Array, " factors"], Float[Array, " factors"], Float[Array, " factors"]]:
     """Slope of each factor's effect, its posterior deviation, and the linear part of the effect's variance."""
-    if not basis.extended:
-        slope = weight[: basis.factors]
-        return slope, jnp.sqrt(jnp.diagonal(sigma)[: basis.factors]), jnp.ones_like(slope)
-    covariance = covariance_of_effect()
-    own = np.arange(basis.factors)[:, None] + basis.factors * np.arange(SHAPED)
-    of_own = weight[own]
-    slope = of_own @ covariance[0]
-    variance = jnp.einsum("fi,ij,fj->f", of_own, covariance, of_own)
-    deviation = jnp.einsum("i,fij,j->f", covariance[0], sigma[own[:, :, None], own[:, None, :]], covariance[0])
-    return slope, jnp.sqrt(deviation), jnp.where(variance > 0, slope**2 / jnp.where(variance > 0, variance, 1), 1)
-
-
-def covariance_of_effect() -> Float[Array, "shaped shaped"]:
-    """The covariance of the features of one factor, u and its shapes, for a standard normal u. It has Var u = 1 in front."""
-    u = jnp.linspace(-8, 8, 4001)
-    return jnp.cov(expand(ONE_FACTOR, u[:, None]), rowvar=False, aweights=jnp.exp(-(u**2) / 2), ddof=0)
+    own = np.arange(basis.factors)[:, None] + basis.factors * np.arange(SHAPED if basis.extended else 1)
+    block = own[:, :, None], own[:, None, :]
+    covariance, of_own = s[block], weight[own]
+    first = covariance[:, 0, 0]
+    line = covariance[:, 0] / jnp.where(first > 0, first, 1)[:, None]
+    slope = jnp.sum(line * of_own, axis=1)
+    variance = jnp.einsum("fi,fij,fj->f", of_own, covariance, of_own)
+    deviation = jnp.sqrt(jnp.maximum(jnp.einsum("fi,fij,fj->f", line, sigma[block], line), 0))
+    return slope, deviation, jnp.where(variance > 0, slope**2 * first / jnp.where(variance > 0, variance, 1), 1)
 
 
 def residual(

@@ -79,7 +79,8 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
         )
         said.append(
             f"The score is treated as {this} over the steps of an episode: so far, {why}. This may change. If you know which of "
-            'them it is, write `score = "sum"` or `score = "average"` into the task file.'
+            'them it is, set it: `score = "sum"` or `score = "average"` in the task file, `--credit.score`, or '
+            "`CreditSettings(score=...)`."
         )
     what = f"the mean reward of a step in {count} episodes" if found.of_steps else f"the returns of {count} episodes"
     if not factors:
@@ -104,7 +105,8 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
             else f"- {factors[i]}: it has never varied"
             for i in np.argsort(-np.abs(found.share), kind="stable").tolist()
         ]
-        if any(name.endswith("(before)") for name in factors):
+        varied = {name for name, varied in zip(factors, found.varied, strict=True) if varied}
+        if any(f"{name.removesuffix('(before)')}(after)" in varied for name in varied if name.endswith("(before)")):
             said.append(
                 "Each factor has two lines: before and after the step. If both ± are as large as the effects, the fit cannot tell "
                 "them apart: add up the two lines. If both ± are small and the effects have opposite signs, the change of the "

@@ -1,6 +1,6 @@
 """A comparison of methods as a page: the table, and the figures that rliable's authors recommend."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
@@ -28,9 +28,15 @@ def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | 
     runs, remarks = comparable(find_runs(directories), metric) if directories or not tables else ([], [])
     found: dict[str, list[Run | Measured]] = {label: list(of_label) for label, of_label in by_label(runs).items()}
     of_tables = [read_results(place, metric) for place in tables]
+    if of_runs := {run.config.task.name for run in runs}:
+        remarks += tasks_left_out(of_tables, of_runs)
+        of_tables = [
+            {label: kept for label, some in of_table.items() if (kept := [one for one in some if one.task in of_runs])}
+            for of_table in of_tables
+        ]
     for label, of_label in (item for of_table in of_tables for item in of_table.items()):
         found.setdefault(label, []).extend(of_label)
-    if tables and places[0] == tables[0]:  # its first method is the baseline
+    if tables and places[0] == tables[0] and of_tables[0]:  # its first method is the baseline
         first = next(iter(of_tables[0]))
         found = {first: found.pop(first), **found}
     if of_tables:
@@ -42,8 +48,22 @@ def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | 
     return found, remarks
 
 
-def other_ends(runs: Sequence[Run], tables: Sequence[Mapping[str, Sequence[Measured]]], metric: str) -> list[str]:
-    """Remarks on tables that lack the last step of the runs, or one of their tasks."""
+Tables = Sequence[Mapping[str, Sequence[Measured]]]
+"""Results of other programs, by file and by label."""
+
+
+def tasks_left_out(tables: Tables, of_runs: Collection[str]) -> list[str]:
+    """Remarks on tasks that are in tables, and that no run has."""
+    every = [one for of_table in tables for of_label in of_table.values() for one in of_label]
+    found = dict.fromkeys((one.source, one.task) for one in every if one.task not in of_runs)
+    return [
+        f"{source} has the task {task}, which is left out: the runs have {', '.join(sorted(of_runs))}"
+        for source, task in found
+    ]
+
+
+def other_ends(runs: Sequence[Run], tables: Tables, metric: str) -> list[str]:
+    """Remarks on tables that lack the last step of the runs."""
     last: dict[str, int] = {}  # of the shortest run of each task
     for run in runs:
         name, step = run.config.task.name, run.metrics()[-1]["step"]
@@ -55,8 +75,6 @@ def other_ends(runs: Sequence[Run], tables: Sequence[Mapping[str, Sequence[Measu
             said.append(
                 f"{one.source} has no {metric} of {method} at step {last[one.task]:,} for every seed: no run is compared there"
             )
-        elif last and one.task not in last:
-            said.append(f"{one.source} has the task {one.task}; the runs have {', '.join(sorted(last))}")
     return said
 
 

@@ -12,7 +12,7 @@ from lare.errors import LareError
 from lare.run.directory import Run, as_run
 from lare.tasks.env import HostEnv
 from lare.tasks.load import check_against_environment
-from lare.tasks.play import episode_of
+from lare.tasks.play import Episode, episode_of
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import make_env, make_host_env
 from lare.tasks.trust import unknown_module
@@ -73,15 +73,21 @@ def evaluation_of(run: Run, episodes: int, best: bool = False) -> Evaluation:
     return together(parts)
 
 
-def random_returns(task: TaskSpec, episodes: int = RANDOM_EPISODES) -> Float[np.ndarray, " episodes"]:
-    """True returns of random actions: of so many episodes, or as many as begin within some seconds.
+def random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
+    """The returns of `random_play`."""
+    return np.array([one.total for one in random_play(task)])
+
+
+def random_play(task: TaskSpec, episodes: int = RANDOM_EPISODES) -> list[Episode]:
+    """So many episodes of random actions, or as many as begin within some seconds.
 
     Empty if the environment must not be imported for a report, or does not run.
     """
-    found, until = [], time.monotonic() + PATIENCE
+    found: list[Episode] = []
+    until = time.monotonic() + PATIENCE
     if unknown_module(task) is None:
         with suppress(LareError), closing(make_host_env(task.roles[0])) as env:
             while len(found) < episodes and time.monotonic() < until:
                 random = np.random.default_rng(len(found))
-                found.append(episode_of(env, task.roles[0], None, random, len(found)).total)
-    return np.array(found)
+                found.append(episode_of(env, task.roles[0], None, random, len(found)))
+    return found

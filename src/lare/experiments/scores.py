@@ -187,8 +187,14 @@ def grouped(runs: Mapping[str, Sequence[Run | Measured]], key: str) -> tuple[lis
         for seed, values in one.curves.items():
             place = (label, one.task, one.draw, seed)
             if place in curves:
+                other = curves[place][0]
+                renamed = (
+                    ", or give the method in the table another name"
+                    if ".csv" in (one.source.suffix, other.suffix)
+                    else ""
+                )
                 raise LareError(
-                    f"{one.source} and {curves[place][0]} are both {label} on {one.task} with seed {seed}: leave one out"
+                    f"{one.source} and {other} are both {label} on {one.task} with seed {seed}: leave one out{renamed}"
                 )
             if not values:
                 raise LareError(f"{one.source} has no {key} of seed {seed} at any step: leave it out")

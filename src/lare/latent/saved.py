@@ -51,7 +51,7 @@ def text_of(source_path: Path) -> str:
         return parse(text).functions
     except MalformedReply as error:
         python = source_path.with_suffix(".py")
-        raise LareError(f"{python} does not exist, and {source_path} is not a model's reply: {error}") from error
+        raise LareError(f"{source_path} is not a model's reply ({error}), and {python} does not exist") from error
 
 
 def split_header(text: str) -> tuple[list[str], str]:

@@ -25,6 +25,8 @@ def decide(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     resolved = resolve(settings, env)
     if resolved.judges == task.judges:  # the task's own value makes no difference
         resolved = resolved.model_copy(update={"judges": None})
+    if "first_fit" in resolved.idle:
+        resolved = resolved.model_copy(update={"first_fit": None})
     if resolved.credit.score == "auto" and task.score is not None:
         credit = resolved.credit.model_copy(update={"score": task.score})
         resolved = resolved.model_copy(update={"credit": credit})

@@ -139,7 +139,8 @@ class ResolvedSettings(Checked):
     capacity: Annotated[int, Field(ge=4)]
     scale_rewards: bool
     reflect_every: Count | None = None
-    first_fit: Literal["held-out", "published"] | None = None
+    first_fit: Literal["held-out", "published"] | None = "published"
+    """None where it makes no difference. The default is for config.json files that are older than the setting."""
     hyperparameters: AlgorithmSettings
     """The hyperparameters of the algorithm."""
     credit: CreditSettings

@@ -1,8 +1,8 @@
 """Plays episodes of a task from the view of one of its roles, to verify and examine latent functions before training."""
 
 import contextlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -28,6 +28,8 @@ class Episode:
     reward: Float[np.ndarray, "steps rows"]
     """The true reward: each agent's, or the team's if the state is judged."""
     team_reward: Float[np.ndarray, " steps"]
+    measures: Mapping[str, float] = field(default_factory=dict)
+    """The task's own measures, from the last step."""
 
     @property
     def total(self) -> float:
@@ -59,7 +61,7 @@ def episodes_of(role: TaskSpec, count: int, policy: Policy | None = None, seed: 
 
 def episode_of(env: HostEnv, role: TaskSpec, policy: Policy | None, random: np.random.Generator, seed: int) -> Episode:
     """One episode."""
-    team, columns = team_of(role, env.spec), []
+    team, columns, measures = team_of(role, env.spec), [], {}
     for before, action, after in steps_of(env, policy, random, seed):
         shown, taken = rows_of(role, team, before, action)
         paid = np.asarray(team_mean(after.reward, before.alive, team))
@@ -67,7 +69,8 @@ def episode_of(env: HostEnv, role: TaskSpec, policy: Policy | None, random: np.r
         if role.judged_from == "state":
             alive, reward = np.ones(1, bool), paid[None]
         columns.append((shown, taken, rows_of(role, team, after, action)[0], alive, reward, paid))
-    return Episode(*(np.stack(part) for part in zip(*columns, strict=True)))
+        measures = {name: float(value) for name, value in after.measures.items()}
+    return Episode(*(np.stack(part) for part in zip(*columns, strict=True)), measures=measures)
 
 
 def steps_of(
