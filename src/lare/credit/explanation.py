@@ -88,9 +88,8 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     own, paired = of_each(part, basis)
     scale = by_factors / jnp.where(jnp.sum(part) > 0, jnp.sum(part), 1)
     slope, deviation, linear = effects(fitted.weight, sigma, given.s, basis)
-    steps = jnp.where(
-        form == AVERAGE, sums.steps / jnp.maximum(sums.episodes, 1), 1
-    )  # r_hat of an average is divided by T
+    # r_hat of an average is divided by T
+    steps = jnp.where(form == AVERAGE, sums.steps / jnp.maximum(sums.episodes, 1), 1)
     return Explanation(
         sums.episodes,
         of_steps,
