@@ -7,6 +7,7 @@ import pytest
 
 from lare.credit import evidence
 from lare.credit.basis import Basis, expand
+from lare.credit.explanation import add_steps, no_steps
 from lare.credit.explanation import explain as explain_sums
 
 explain = jax.jit(explain_sums, static_argnames="basis")
@@ -38,10 +39,12 @@ def means_of(values, length):
 
 
 def summed_over(basis, u, length, paid, form=0):
-    means = means_of(np.asarray(expand(basis, jnp.asarray(u))), length)
+    """The sums over the episodes, and those over the steps."""
+    features = np.asarray(expand(basis, jnp.asarray(u)))
     returns = means_of(paid, length) * (1 if form else length)
-    given = (jnp.asarray(part) for part in (means, returns, length))
-    return evidence.add_episodes(evidence.no_sums(basis.size), *given)
+    given = (jnp.asarray(part) for part in (means_of(features, length), returns, length))
+    steps = add_steps(no_steps(basis), jnp.asarray(features), jnp.ones(len(u), bool), basis)
+    return evidence.add_episodes(evidence.no_sums(basis.size), *given), steps
 
 
 @pytest.mark.parametrize("extended", [False, True])
@@ -49,14 +52,14 @@ def summed_over(basis, u, length, paid, form=0):
 def test_factors_that_tell_all(extended, form):
     """Two factors that vary alike: shares go as the squares of their weights."""
     basis = Basis(3, 2, extended)
-    sums = summed(basis, np.array([2.0, -1.0, 0, 0, 0]), form=form)
-    found = explain(sums, form, basis)
+    sums, of_steps = summed(basis, np.array([2.0, -1.0, 0, 0, 0]), form=form)
+    found = explain(sums, of_steps, form, basis)
     steps = float(sums.steps / sums.episodes) if form else 1  # a step of an average has a T-th of it
     assert float(found.episodes) == 120
     assert bool(found.of_steps) == (form == 0)
     assert float(found.by_factors) > 0.98
     np.testing.assert_allclose(found.share, [0.8, 0.2, 0], atol=0.1)
-    weight, deviation = np.asarray(found.slope) * steps, np.asarray(found.deviation) * steps
+    weight, deviation = np.asarray(found.slope) * steps, np.sqrt(np.diagonal(found.uncertainty)) * steps
     np.testing.assert_allclose(weight, [2, -1, 0], atol=0.15)
     assert (deviation > 0).all()
     assert (np.abs(weight - [2, -1, 0]) < 4 * deviation + 0.02).all()
@@ -66,12 +69,12 @@ def test_episodes_of_one_length_are_explained_by_their_returns():
     basis, random = Basis(2, 0, extended=False), np.random.default_rng(0)
     means, length = random.normal(size=(30, 2)), np.full(30, 7)
     given = (jnp.asarray(part) for part in (means, 7 * means @ [2.0, -1.0], length))
-    assert not explain(evidence.add_episodes(evidence.no_sums(2), *given), 0, basis).of_steps
+    assert not explain(evidence.add_episodes(evidence.no_sums(2), *given), no_steps(basis), 0, basis).of_steps
 
 
 def test_what_the_factors_leave_goes_with_the_entry_that_is_missing():
     basis = Basis(2, 3, extended=True)
-    found = explain(summed(basis, np.array([1.0, 0, 0, -1.0, 0])), 0, basis)
+    found = explain(*summed(basis, np.array([1.0, 0, 0, -1.0, 0])), 0, basis)
     assert 0.3 < float(found.by_factors) < 0.7
     assert float(found.by_all) > 0.98
     left = np.asarray(found.left)
@@ -81,35 +84,36 @@ def test_what_the_factors_leave_goes_with_the_entry_that_is_missing():
 
 def test_factors_that_tell_nothing():
     basis = Basis(2, 1, extended=False)
-    found = explain(summed(basis, np.array([0, 0, 1.0])), 0, basis)
+    found = explain(*summed(basis, np.array([0, 0, 1.0])), 0, basis)
     assert float(found.by_factors) < 0.1
     assert float(found.by_all) > 0.98
 
 
 def test_without_factors_the_entries_tell():
-    found = explain(summed(Basis(0, 3, extended=False), np.array([1.0, 0, 0])), 0, Basis(0, 3, extended=False))
+    found = explain(*summed(Basis(0, 3, extended=False), np.array([1.0, 0, 0])), 0, Basis(0, 3, extended=False))
     assert (float(found.by_factors), found.share.shape, found.slope.shape) == (0, (0,), (0,))
     assert float(found.by_all) > 0.98
 
 
 def test_an_entry_that_never_varies_goes_with_nothing():
     basis = Basis(1, 2, extended=False)
-    sums = summed(basis, np.array([1.0, 1.0, 0]))
+    sums, steps = summed(basis, np.array([1.0, 1.0, 0]))
     products = sums.products.at[2, :].set(0).at[:, 2].set(0)
-    assert float(explain(sums._replace(products=products), 0, basis).left[1]) == 0
+    assert float(explain(sums._replace(products=products), steps, 0, basis).left[1]) == 0
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_of_few_episodes_nothing_is_said(count):
     basis = Basis(1, 1, extended=False)
-    found = explain(summed(basis, np.ones(2), count=max(count, 1)) if count else evidence.no_sums(2), 0, basis)
+    given = summed(basis, np.ones(2), count=count) if count else (evidence.no_sums(2), no_steps(basis))
+    found = explain(*given, 0, basis)
     assert np.isnan(found.by_all)
 
 
 @pytest.mark.parametrize("noise", [0.1, 3.0])
 def test_the_shares_of_the_factors_add_up_to_what_they_explain(noise):
     basis = Basis(3, 2, extended=True)
-    found = explain(summed(basis, np.array([2.0, -1.0, 0.5, 1.0, 0]), count=30, noise=noise), 0, basis)
+    found = explain(*summed(basis, np.array([2.0, -1.0, 0.5, 1.0, 0]), count=30, noise=noise), 0, basis)
     assert 0 < float(found.by_factors) < 1
     assert float(found.share.sum()) == pytest.approx(float(found.by_factors))
 
@@ -123,7 +127,8 @@ def test_a_factor_that_offsets_another_has_a_share_below_0():
     sums = evidence.add_episodes(
         evidence.no_sums(2), jnp.asarray(means), jnp.asarray(20 * returns), jnp.asarray(length)
     )
-    found = explain(sums, 0, basis)
+    steps = add_steps(no_steps(basis), jnp.asarray(means), jnp.ones(200, bool), basis)
+    found = explain(sums, steps, 0, basis)
     np.testing.assert_allclose(found.slope, [2, -1], rtol=1e-3)
     want = [
         weight * np.cov(column, returns)[0, 1] / returns.var(ddof=1)
@@ -138,7 +143,7 @@ def test_the_slope_is_that_of_the_closest_line_whatever_features_express_it(coun
     """|u| bends the shapes of all factors, and a sine then takes the place of the second factor's line."""
     basis, (u, length) = Basis(2, 0, True), moody(2, count)
     effects = np.stack([-2 * np.abs(u[:, 0]), 0.5 * u[:, 1]], axis=1)
-    found = explain(summed_over(basis, u, length, effects.sum(axis=1)), 0, basis)
+    found = explain(*summed_over(basis, u, length, effects.sum(axis=1)), 0, basis)
     want = [np.cov(means_of(u[:, i], length), means_of(effects[:, i], length), aweights=length)[:, 0] for i in range(2)]
     np.testing.assert_allclose(found.slope, [with_effect / own for own, with_effect in want], atol=0.05)
     assert float(found.linear[0]) < 0.1
@@ -155,14 +160,14 @@ def test_the_effect_of_a_rare_event_is_what_it_pays(count):
     deviation = event.std()
     u = np.stack([(event - event.mean()) / deviation, random.normal(size=len(event))], axis=1)
     basis = Basis(2, 0, extended=True)
-    found = explain(summed_over(basis, u, length, 5.0 * event + 0.01 * random.normal(size=len(event))), 0, basis)
+    found = explain(*summed_over(basis, u, length, 5.0 * event + 0.01 * random.normal(size=len(event))), 0, basis)
     assert float(found.slope[0]) == pytest.approx(5 * deviation, rel=0.02)
-    assert float(found.deviation[0]) < 0.02
+    assert float(found.uncertainty[0, 0]) < 0.02**2
     assert float(found.linear[0]) == pytest.approx(1, abs=1e-3)
 
 
 def test_the_effect_of_a_pair_is_told_apart():
     basis = Basis(2, 0, True)
-    found = explain(summed(basis, lambda u: u[:, 0] * u[:, 1], 100), 0, basis)
+    found = explain(*summed(basis, lambda u: u[:, 0] * u[:, 1], 100), 0, basis)
     np.testing.assert_allclose(found.paired, found.share, atol=0.1)
     np.testing.assert_allclose(found.slope, 0, atol=0.1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lare.credit.basis import Basis
-from lare.credit.judging import FIRST, growing, judge, mean_features, predictions
+from lare.credit.judging import FIRST, features_of, growing, judge, predictions
 from lare.credit.returns import FormFound
 
 BASIS = Basis(2, 3, extended=True)
@@ -36,7 +36,7 @@ def test_no_return_is_seen_before_it_is_predicted():
     rows, alive, returns = played(noise=0.3)
     length = np.array([len(one) for one in rows])
     with jax.enable_x64(True):
-        means = mean_features(rows, alive, BASIS)[:, BASIS.of_factors]
+        means = features_of(rows, alive, BASIS)[0][:, BASIS.of_factors]
         changed = np.where(np.arange(len(rows)) < 40, returns, -returns)
         one, other = (predictions(means, paid, length, BASIS, 0) for paid in (returns, changed))
     # The block of episode 40 is predicted as a whole.
@@ -73,8 +73,11 @@ def test_agents_who_have_left_do_not_count():
     changed = [np.concatenate([one, np.full_like(one[:, :1], 9.0)], axis=1) for one in rows]
     there = [np.concatenate([one, np.zeros_like(one[:, :1])], axis=1) for one in alive]
     with jax.enable_x64(True):
-        one, other = mean_features(rows, alive, BASIS), mean_features(changed, there, BASIS)
+        (one, steps), (other, of_other) = (features_of(*given, BASIS) for given in ((rows, alive), (changed, there)))
     np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+    for sums, others in zip(steps, of_other, strict=True):
+        np.testing.assert_allclose(sums, others, rtol=1e-4, atol=1e-3)
+    assert int(steps.number) == sum(map(np.sum, alive))
 
 
 def test_few_episodes_say_nothing():

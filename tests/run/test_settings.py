@@ -10,7 +10,7 @@ from lare.errors import LareError
 from lare.run.decide import decide
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain
 from lare.tasks.load import read_task
-from toys import pick_spec
+from toys import pick_spec, toy_spec
 
 
 def decided(settings, task):
@@ -127,3 +127,10 @@ def test_it_is_said_to_whom_it_makes_no_difference(settings, message):
 
 def test_every_setting_of_the_decoder_matters_to_some_method():
     assert frozenset().union(*(method.settings for method in TABLE)) == set(CreditSettings.model_fields)
+
+
+def test_the_score_of_a_battle_is_a_sum():
+    """Of a task of one's own it is found out, unless the task says what it is."""
+    battle = decide(Settings(method="rd"), read_task("SMAX-2s3z"))
+    assert (battle.credit.score, decide(Settings(method="rd"), toy_spec()).credit.score) == ("sum", "auto")
+    assert decide(Settings(method="rd"), toy_spec(score="average")).credit.score == "average"

@@ -23,7 +23,7 @@ def found(**changes):
         "by_factors": 0.9,
         "by_all": 0.97,
         "slope": np.array([1.0, 2.0]),
-        "deviation": np.array([0.1, 0.1]),
+        "uncertainty": np.diag([0.01, 0.01]),
         "linear": np.array([0.81, 1.0]),
         "share": np.array([0.25, 0.65]),
         "paired": np.zeros(2),
@@ -129,23 +129,21 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             [
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
                 SHARES,
-                "- speed (before): 99%, +1 ± 0.1",
-                "- speed (after): it has never varied",
+                "- speed: 99%, +1 ± 0.1 (before: +1 ± 0.1; after: it has never varied)",
             ],
         ),
         (
-            found(by_factors=0.99, by_all=0.99, share=np.array([0.99, 0.0])),
+            found(by_factors=0.99, by_all=0.99, uncertainty=np.array([[0.01, -0.0098], [-0.0098, 0.01]])),
             None,
             ["speed (before)", "speed (after)"],
             [],
             [
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
                 SHARES,
-                "- speed (before): 99%, +1 ± 0.1",
-                "- speed (after): 0%, +2 ± 0.1",
-                "Each factor has two lines: before and after the step. If both ± are as large as the effects, the fit cannot tell "
-                "them apart: add up the two lines. If both ± are small and the effects have opposite signs, the change of the "
-                "factor in a step is paid.",
+                "- speed: 90%, +3 ± 0.02 (before: +1 ± 0.1; after: +2 ± 0.1)",
+                "In brackets are the parts of the states before and after the step. If their ± are as large as the numbers, the "
+                "fit cannot tell the two apart, and only their sum counts. If they are about equal and opposite, the change of the "
+                "factor is paid.",
             ],
         ),
         (

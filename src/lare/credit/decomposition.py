@@ -76,6 +76,14 @@ class Episodes(NamedTuple):
     """Each agent's share of the team's reward: 1/n for each of the n agents that are alive, else 0. None means equal shares."""
 
 
+def counted_rows(episodes: Episodes, there: Bool[Array, " episodes"]) -> Bool[Array, "rows *agents"]:
+    """The rows of steps of whole episodes that are there, by agents that acted."""
+    shape, count = episodes.features.shape[:-1], len(episodes.length)
+    known = (episodes.episode < count) & there[jnp.minimum(episodes.episode, count - 1)]
+    acted = jnp.ones(shape, bool) if episodes.share is None else episodes.share > 0
+    return known.reshape(-1, *[1] * (len(shape) - 1)) & acted
+
+
 class Decomposition(NamedTuple):
     """The whole state of return decomposition."""
 

@@ -13,14 +13,15 @@ correlation of the residual of a fit on the factors alone with the mean of raw e
     (p - S mu)_j / sqrt(S_jj (q - 2 mu . p + mu . S mu))
 
 The effect of factor i is g_i(u_i) = w_i . f_i(u_i), the sum of its linear feature and its shapes times their weights. The weights
-alone do not tell how the reward rises with the factor, because a sine can take the place of a line. Let C_i be the part of S of the
-features f_i, the covariance of their means over the episodes, with the linear feature first. The line that is closest to the mean
-effect of the episodes has the slope and the part of the effect's variance
+alone do not tell how the reward rises with the factor, because a sine can take the place of a line. Let C_i be the covariance of
+the features f_i over all steps, with the linear feature first. The line that is closest to the effect has the slope and the part of
+the effect's variance
 
     e . w_i,  e = C_i[0] / C_i[0, 0]        (e . w_i)^2 C_i[0, 0] / (w_i . C_i w_i)
 
-and the slope has the posterior variance e . Sigma_i e. For a factor with two values, such as an event that happens or not, all f_i
-are the same line, and the slope is known as soon as returns tell the difference between the values.
+and the slopes of two factors have the posterior covariance e_i . Sigma_ij e_j. If a factor has two values, such as an event that
+happens or not, all of its features are one line: the slope is known as soon as returns tell what the event pays, though the weights
+are not.
 """
 
 from typing import NamedTuple
@@ -40,6 +41,14 @@ SHAPED = 1 + 2 * FREQUENCIES
 """The number of features that a factor has alone: itself and its shapes."""
 
 
+class Steps(NamedTuple):
+    """Sums over steps of the features that each factor has alone, and of their products."""
+
+    number: Float[Array, ""]
+    total: Float[Array, "factors own"]
+    products: Float[Array, "factors own own"]
+
+
 class Explanation(NamedTuple):
     """The explanation of one team's score."""
 
@@ -54,10 +63,10 @@ class Explanation(NamedTuple):
     """Share of the variation that factors and raw entries explain together."""
     slope: Float[Array, " factors"]
     """How much a step's reward rises if a factor rises by one standard deviation: the slope of the line that is closest to its
-    effect in the fit on factors; 0 if its mean over an episode has never varied. If the score is an average: the rise for a step of
-    an episode of average length."""
-    deviation: Float[Array, " factors"]
-    """Posterior deviation of `slope`."""
+    effect in the fit on factors; 0 if it has never varied. If the score is an average: the rise for a step of an episode of
+    average length."""
+    uncertainty: Float[Array, "factors factors"]
+    """Posterior covariance of `slope`."""
     linear: Float[Array, " factors"]
     """The part of the variance of each factor's effect that this line has; 1 for a factor without effect."""
     share: Float[Array, " factors"]
@@ -69,7 +78,30 @@ class Explanation(NamedTuple):
     """Correlation of each raw entry with the residual of the fit on factors; 0 for an entry that has never varied."""
 
 
-def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation:
+def own_features(basis: Basis) -> Int[np.ndarray, "factors own"]:
+    """The indices of the features that each factor has alone, the linear one first."""
+    return np.arange(basis.factors)[:, None] + basis.factors * np.arange(SHAPED if basis.extended else 1)
+
+
+def no_steps(basis: Basis) -> Steps:
+    """The sums over no steps."""
+    factors, own = own_features(basis).shape
+    return Steps(jnp.zeros(()), jnp.zeros((factors, own)), jnp.zeros((factors, own, own)))
+
+
+def add_steps(
+    steps: Steps, features: Float[Array, "*batch features"], counts: Bool[Array, "*batch"], basis: Basis
+) -> Steps:
+    """Add the features of rows to the sums, in float64. Rows where `counts` is false are ignored."""
+    own = jnp.where(counts[..., None, None], features[..., own_features(basis)].astype(float), 0)
+    return Steps(
+        steps.number + jnp.sum(counts),
+        steps.total + jnp.einsum("...fi->fi", own),
+        steps.products + jnp.einsum("...fi,...fj->fij", own, own),
+    )
+
+
+def explain(sums: Sums, steps: Steps, form: Int[Array, ""] | int, basis: Basis) -> Explanation:
     """Explain returns by sums over the features of a basis, in float64."""
     group, of_factors = basis.group, basis.of_factors
     whole = evidence.fit(sums, form, group, evidence.unknown(basis.size, len(basis.sizes)), ROUNDS)
@@ -77,7 +109,9 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     of_steps, none = (form == SUM) & lengths_differ(sums), jnp.zeros(0)
     if not of_factors.any():
         left = jnp.zeros(basis.used_entries)
-        return Explanation(sums.episodes, of_steps, none > 0, jnp.zeros(()), by_all, none, none, none, none, none, left)
+        return Explanation(
+            sums.episodes, of_steps, none > 0, jnp.zeros(()), by_all, none, jnp.zeros((0, 0)), none, none, none, left
+        )
     alone, numbers = restricted(sums, np.flatnonzero(of_factors)), group[of_factors]
     fitted = evidence.fit(alone, form, numbers, evidence.unknown(len(numbers), int(numbers.max()) + 1), ROUNDS)
     sigma = evidence.covariance(alone, form, numbers, fitted)
@@ -87,17 +121,17 @@ def explain(sums: Sums, form: Int[Array, ""] | int, basis: Basis) -> Explanation
     by_factors = explained(alone, form, numbers, fitted)
     own, paired = of_each(part, basis)
     scale = by_factors / jnp.where(jnp.sum(part) > 0, jnp.sum(part), 1)
-    slope, deviation, linear = effects(fitted.weight, sigma, given.s, basis)
+    slope, uncertainty, linear = effects(fitted.weight, sigma, steps, basis)
     # r_hat of an average is divided by T
-    steps = jnp.where(form == AVERAGE, sums.steps / jnp.maximum(sums.episodes, 1), 1)
+    length = jnp.where(form == AVERAGE, sums.steps / jnp.maximum(sums.episodes, 1), 1)
     return Explanation(
         sums.episodes,
         of_steps,
         jnp.diagonal(given.s)[: basis.factors] > 0,
         by_factors,
         jnp.maximum(by_all, by_factors),
-        slope / steps,
-        deviation / steps,
+        slope / length,
+        uncertainty / length**2,
         linear,
         scale * (own + paired),
         scale * paired,
@@ -140,21 +174,20 @@ def of_each(part: Float[Array, " features"], basis: Basis) -> tuple[Float[Array,
 
 
 def effects(
-    weight: Float[Array, " features"],
-    sigma: Float[Array, "features features"],
-    s: Float[Array, "features features"],
-    basis: Basis,
-) -> tuple[Float[Array, " factors"], Float[Array, " factors"], Float[Array, " factors"]]:
-    """Slope of each factor's effect, its posterior deviation, and the linear part of the effect's variance."""
-    own = np.arange(basis.factors)[:, None] + basis.factors * np.arange(SHAPED if basis.extended else 1)
-    block = own[:, :, None], own[:, None, :]
-    covariance, of_own = s[block], weight[own]
+    weight: Float[Array, " features"], sigma: Float[Array, "features features"], steps: Steps, basis: Basis
+) -> tuple[Float[Array, " factors"], Float[Array, "factors factors"], Float[Array, " factors"]]:
+    """Slope of each factor's effect, the posterior covariance of these slopes, and the linear part of each effect's variance."""
+    own = own_features(basis)
+    number = jnp.maximum(steps.number, 1)
+    mean = steps.total / number
+    covariance = steps.products / number - mean[:, :, None] * mean[:, None, :]
+    of_own, of_sigma = weight[own], sigma[own[:, :, None, None], own]
     first = covariance[:, 0, 0]
     line = covariance[:, 0] / jnp.where(first > 0, first, 1)[:, None]
     slope = jnp.sum(line * of_own, axis=1)
     variance = jnp.einsum("fi,fij,fj->f", of_own, covariance, of_own)
-    deviation = jnp.sqrt(jnp.maximum(jnp.einsum("fi,fij,fj->f", line, sigma[block], line), 0))
-    return slope, deviation, jnp.where(variance > 0, slope**2 * first / jnp.where(variance > 0, variance, 1), 1)
+    uncertainty = jnp.einsum("fi,figj,gj->fg", line, of_sigma, line)
+    return slope, uncertainty, jnp.where(variance > 0, slope**2 * first / jnp.where(variance > 0, variance, 1), 1)
 
 
 def residual(

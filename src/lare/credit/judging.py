@@ -23,7 +23,7 @@ from lare.credit.basis import Basis
 from lare.credit.closed_form import GROWTH_OF_FIT, ROUNDS, LinearDecoder
 from lare.credit.decomposition import AVERAGE, SUM
 from lare.credit.evidence import Posterior, Sums
-from lare.credit.explanation import Explanation, explain
+from lare.credit.explanation import Explanation, Steps, add_steps, explain, no_steps
 from lare.credit.returns import BETTER, FormFound
 from lare.float64 import float64
 
@@ -61,7 +61,7 @@ def judge(
     """
     length = np.array([len(steps) for steps in rows])
     with float64():
-        means = mean_features(rows, alive, basis)
+        means, steps = features_of(rows, alive, basis)
         forms = (SUM, AVERAGE) if len(set(length)) > 1 else (SUM,)
         forms = {"sum": (SUM,), "average": (AVERAGE,)}.get(score or "", forms)
         told = {form: predictions(means[:, basis.of_factors], returns, length, basis, form) for form in forms}
@@ -73,7 +73,7 @@ def judge(
         else:
             lengths = None
         sums = evidence.add_episodes(evidence.no_sums(basis.size), *map(jnp.asarray, (means, returns, length)))
-        explanation = jax.tree.map(np.asarray, explained(sums, form, basis=basis))
+        explanation = jax.tree.map(np.asarray, explained(sums, steps, form, basis=basis))
     decided = min(errors.values()) < BETTER * max(errors.values())
     return Judgement(
         r2(returns, told[form]),
@@ -90,29 +90,32 @@ def r2(returns: Float[np.ndarray, " episodes"], predicted: Float[np.ndarray, " l
     return 1 - float(np.sum((later - predicted) ** 2)) / spread if spread > 0 else np.nan
 
 
-def mean_features(
+def features_of(
     rows: Sequence[Float[np.ndarray, "_ agents inputs"]], alive: Sequence[Bool[np.ndarray, "_ agents"]], basis: Basis
-) -> Float[np.ndarray, "episodes features"]:
-    """The mean features of each episode, with inputs standardised over all steps."""
+) -> tuple[Float[np.ndarray, "episodes features"], Steps]:
+    """The mean features of each episode, with inputs standardised over all steps, and the sums over all steps."""
     every = np.concatenate([steps[there] for steps, there in zip(rows, alive, strict=True)]).astype(np.float64)
     mean, spread = every.mean(axis=0), every.std(axis=0)
     spread = np.where(spread > 1e-6 * np.abs(mean), spread, 0)  # a constant may vary by this much in float32
     known = (jnp.asarray(one, jnp.float32) for one in (mean, spread, np.zeros(basis.size), 0))
     decoder, longest = LinearDecoder(basis, *known), max(map(len, rows))
-    found = []
+    found, sums = [], no_steps(basis)
     for steps, there in zip(rows, alive, strict=True):
         share = there / np.maximum(there.sum(axis=1, keepdims=True), 1) / len(steps)
         padding = (0, longest - len(steps)), (0, 0)  # to one length, so that `of_one` is compiled once
-        found.append(of_one(decoder, np.pad(steps, (*padding, (0, 0))).astype(np.float32), np.pad(share, padding)))
-    return np.stack(found)
+        padded = np.pad(steps, (*padding, (0, 0))).astype(np.float32)
+        mean, sums = of_one(decoder, sums, padded, np.pad(share, padding))
+        found.append(mean)
+    return np.stack(found), sums
 
 
 @jax.jit
 def of_one(
-    decoder: LinearDecoder, steps: Float[Array, "steps agents inputs"], share: Float[Array, "steps agents"]
-) -> Float[Array, " features"]:
-    """The weighted sum of the features of some steps."""
-    return jnp.einsum("taf,ta->f", decoder.features(steps).astype(float), share)
+    decoder: LinearDecoder, sums: Steps, steps: Float[Array, "steps agents inputs"], share: Float[Array, "steps agents"]
+) -> tuple[Float[Array, " features"], Steps]:
+    """The weighted sum of the features of an episode's steps, and the sums over the steps of all episodes so far."""
+    features = decoder.features(steps).astype(float)
+    return jnp.einsum("taf,ta->f", features, share), add_steps(sums, features, share > 0, decoder.basis)
 
 
 def predictions(

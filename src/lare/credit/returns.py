@@ -107,7 +107,7 @@ def form_found(state: Decomposition) -> FormFound | None:
     """
     if state.rivals is None:
         return None
-    errors = np.asarray(errors_told_apart(state.rivals))
+    errors = np.asarray(jax.jit(errors_told_apart)(state.rivals))
     if np.isclose(*errors, rtol=1e-3):
         return None
     average = bool(state.average)
@@ -140,7 +140,8 @@ def deviation(
     """The posterior deviation of r_hat (of T r_hat, if the score is an average). For `Fit.EVIDENCE` only, in float64."""
     assert state.closed is not None
     assert isinstance(state.decoder, LinearDecoder)
-    place = int(state.average) if len(forms) > 1 else 0
+    place = state.average.astype(int) if len(forms) > 1 else 0
     known = jax.tree.map(lambda leaf: leaf[place].astype(float), state.closed.posterior)
     sums, features = closed_form.whole(state.closed.summed), state.decoder.features(rows)
-    return evidence.deviation(evidence.spread(sums, forms[place], state.decoder.basis.group, known), features)
+    form = jnp.asarray(forms)[place]
+    return evidence.deviation(evidence.spread(sums, form, state.decoder.basis.group, known), features)

@@ -54,6 +54,39 @@ def form_of_effect(found: Explanation, factor: int) -> str:
     return " (its effect is curved)" if found.linear[factor] < STRAIGHT else ""
 
 
+def factor_lines(found: Explanation, names: list[str]) -> list[str]:
+    """A line on each factor, those with the largest shares first. Its values before and after a step have one line."""
+    places: dict[str, list[int]] = {}
+    for place, name in enumerate(names):
+        places.setdefault(name.removesuffix(" (before)").removesuffix(" (after)"), []).append(place)
+    order = sorted(places, key=lambda name: -abs(float(found.share[places[name]].sum())))
+    lines = [factor_line(found, name, places[name]) for name in order]
+    if any(len(some) == 2 and found.varied[some].all() for some in places.values()):
+        lines.append(
+            "In brackets are the parts of the states before and after the step. If their ± are as large as the numbers, the fit "
+            "cannot tell the two apart, and only their sum counts. If they are about equal and opposite, the change of the factor "
+            "is paid."
+        )
+    return lines
+
+
+def factor_line(found: Explanation, name: str, places: list[int]) -> str:
+    """The line on a factor that has one place or two: before and after the step."""
+    varied = [place for place in places if found.varied[place]]
+    if not varied:
+        return f"- {name}: it has never varied"
+    effects = [effect(found, [place]) if place in varied else "it has never varied" for place in places]
+    parts = f" (before: {effects[0]}; after: {effects[1]})" if len(places) == 2 else ""
+    remark = next((said for place in varied if (said := form_of_effect(found, place))), "")
+    return f"- {name}: {found.share[varied].sum():z.0%}, {effect(found, varied)}{parts}{remark}"
+
+
+def effect(found: Explanation, places: list[int]) -> str:
+    """The sum of the slopes at some places, with its posterior deviation."""
+    variance = float(found.uncertainty[np.ix_(places, places)].sum())
+    return f"{found.slope[places].sum():+.3g} ± {np.sqrt(max(variance, 0)):.1g}"
+
+
 def words(found: Explanation, form: FormFound | None, factors: list[str], entries: list[str]) -> list[str]:
     """The sentences, one in each string.
 
@@ -99,19 +132,7 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
             "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes; "
             "below 0%: it offsets others), and by how much a step's reward rises with one standard deviation of it:"
         )
-        said += [
-            f"- {factors[i]}: {found.share[i]:z.0%}, {found.slope[i]:+.3g} ± {found.deviation[i]:.1g}{form_of_effect(found, i)}"
-            if found.varied[i]
-            else f"- {factors[i]}: it has never varied"
-            for i in np.argsort(-np.abs(found.share), kind="stable").tolist()
-        ]
-        varied = {name for name, varied in zip(factors, found.varied, strict=True) if varied}
-        if any(f"{name.removesuffix('(before)')}(after)" in varied for name in varied if name.endswith("(before)")):
-            said.append(
-                "Each factor has two lines: before and after the step. If both ± are as large as the effects, the fit cannot tell "
-                "them apart: add up the two lines. If both ± are small and the effects have opposite signs, the change of the "
-                "factor in a step is paid."
-            )
+        said += factor_lines(found, factors)
     if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:
         place = int(np.argmax(np.abs(found.left)))
         way = "large" if found.left[place] > 0 else "small"

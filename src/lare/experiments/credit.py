@@ -1,16 +1,18 @@
 """The proxy rewards that a run's decoders give to the steps of an episode, beside the true rewards."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
+from lare.credit.decomposition import Decomposition
 from lare.credit.methods import Fit
 from lare.credit.returns import deviation
 from lare.credit.settings import RECENT
 from lare.data import replay
+from lare.data.replay import Index, StoredSteps
 from lare.experiments.watch import newest_episode
 from lare.float64 import float64
 from lare.run.directory import Run
@@ -54,17 +56,27 @@ def credit_of(run: Run) -> Credit | None:
     index = newest_episode(one)
     if not config.method.has_proxy or index is None:
         return None
-    steps = replay.read(one.replay, index)
-    proxy = rewards(steps, Paid(one.credit, one.scale), config)
+    steps, proxy = jax.jit(partial(paid, config=config))(one, index)
     uncertainty = None
     if one.credit and config.method.fit is Fit.EVIDENCE and config.judged_rows == 1:
         with float64():
-            known = np.asarray(deviation(one.credit[0], features(steps, config, 0)[:, 0], config.forms))
+            known = np.asarray(jax.jit(partial(uncertain, config=config))(one.credit[0], steps))
         uncertainty = 2 * known / np.where(one.credit[0].average, steps.length, 1)
     factors = np.asarray(steps.before["factors"]) if "factors" in steps.before else np.zeros((len(proxy), 1, 0))
     correlations = factor_correlations(learner, config)
     reward = np.asarray(steps.before["reward"])
     return Credit(reward, np.asarray(proxy), uncertainty, factors, bool(reward[:-1].any()), correlations)
+
+
+def paid(learner: Learner, index: Index, config: TrainConfig) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
+    """Steps of one seed's replay, and their proxy rewards."""
+    steps = replay.read(learner.replay, index)
+    return steps, rewards(steps, Paid(learner.credit, learner.scale), config)
+
+
+def uncertain(credit: Decomposition, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:
+    """The posterior deviation of a single agent's proxy rewards, in float64."""
+    return deviation(credit, features(steps, config, 0)[:, 0], config.forms)
 
 
 def correlations(
@@ -83,9 +95,9 @@ def factor_correlations(learner: Learner, config: TrainConfig) -> Float[np.ndarr
     if not config.method.latent or config.judged_rows > 1 or config.env.agents > 1:
         return np.zeros(0)
     buffer = learner.replay
-    known = int(jnp.min(buffer.transitions - jax.vmap(replay.oldest_transition)(buffer)))
+    known = int(np.min(buffer.transitions - jax.jit(jax.vmap(replay.oldest_transition))(buffer)))
     count = min(RECENT, known)
-    steps = jax.vmap(lambda one: replay.read(one, replay.newest(one, count)))(buffer)
+    steps = jax.jit(jax.vmap(lambda one: replay.read(one, replay.newest(one, count))))(buffer)
     reward, last = np.asarray(steps.before["reward"]).ravel(), np.asarray(steps.last).ravel()
     factors = np.asarray(steps.before["factors"]).reshape(len(reward), -1)
     if not reward[~last].any():  # paid at the end only, so the true reward of each step is unknown

@@ -137,7 +137,7 @@ def newest_episode(learner: Learner) -> Index | None:
     buffer = learner.replay
     if not int(replay.finished(buffer)[0]):
         return None
-    env, episode = jnp.zeros((), int), buffer.episodes[0] - 1
-    begin = int(buffer.first[0, episode % buffer.first.shape[-1]])
-    number = jnp.arange(begin, int(replay.end_of(buffer, env, episode)))
-    return Index(jnp.zeros_like(number), number)
+    env, episode = np.int32(0), np.asarray(buffer.episodes)[0] - 1
+    begin = int(np.asarray(buffer.first)[0, episode % buffer.first.shape[-1]])
+    number = np.arange(begin, int(jax.jit(replay.end_of)(buffer, env, episode)))
+    return Index(jnp.zeros(len(number), int), jnp.asarray(number))

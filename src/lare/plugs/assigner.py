@@ -29,6 +29,7 @@ from lare.plugs.store import Store
 from lare.run.usual import MANY_AGENTS
 from lare.tasks.load import as_task
 from lare.tasks.spec import Judges, TaskSpec
+from lare.tasks.table import known_score
 
 SAMPLE = 256
 """About how many steps are kept to verify `phi` on, when it is loaded from a file."""
@@ -81,8 +82,8 @@ class CreditAssigner:
         """
         task = None if task is None else as_task(task, playable=False)
         decoder = settings or (CreditSettings() if agents == 1 else MANY_AGENTS)
-        if decoder.score == "auto" and task is not None and task.score is not None:
-            decoder = decoder.model_copy(update={"score": task.score})
+        if decoder.score == "auto" and task is not None and (score := known_score(task)) is not None:
+            decoder = decoder.model_copy(update={"score": score})
         observation, action = layouts(task, {"observation": observation_space, "action": action_space})
         self.config = CreditConfig(
             find_method(method),

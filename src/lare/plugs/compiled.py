@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from lare.credit import closed_form, decomposition, descent, returns
+from lare.credit import closed_form, decomposition, descent, explanation, returns
 from lare.credit.decomposition import Decomposition, Episodes
+from lare.credit.explanation import Explanation, Steps
 from lare.credit.methods import METHODS
 from lare.credit.settings import CreditSettings
 from lare.normalise import Scale, magnitude, observe_scale
@@ -56,6 +57,23 @@ def tell(state: Decomposition, episodes: Episodes, settings: CreditSettings) -> 
 def add(state: Decomposition, episodes: Episodes) -> Decomposition:
     """Add episodes to the sums again."""
     return returns.add_episodes(state, episodes, episodes.mask > 0)
+
+
+@jax.jit
+def add_steps(state: Decomposition, steps: Steps, episodes: Episodes) -> Steps:
+    """Add the steps of these episodes to the sums over steps."""
+    assert state.closed is not None
+    decoder, rows = state.closed.decoder, decomposition.counted_rows(episodes, episodes.mask > 0)
+    return explanation.add_steps(steps, decoder.features(episodes.features), rows, decoder.basis)
+
+
+@jax.jit
+def explain(state: Decomposition, steps: Steps, average: Bool[Array, ""]) -> Explanation:
+    """Explain the returns in the sums."""
+    assert state.closed is not None
+    return explanation.explain(
+        closed_form.whole(state.closed.summed), steps, average.astype(int), state.closed.decoder.basis
+    )
 
 
 is_stale = jax.jit(returns.is_stale)

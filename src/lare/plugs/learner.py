@@ -9,8 +9,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lare.credit import closed_form, decomposition, explanation, prediction, returns
+from lare.credit import closed_form, decomposition, prediction, returns
 from lare.credit.decomposition import Decomposition, Episodes
+from lare.credit.explanation import no_steps
 from lare.credit.methods import Encoder, Fit, Reward
 from lare.credit.words import entry_names, words
 from lare.float64 import float64
@@ -244,12 +245,10 @@ class Learner:
         with on_host(), float64():
             judge = self.state._replace(closed=closed_form.init(basis, 1))
             judge = compiled.begin_again(judge)
+            steps = no_steps(basis)
             for piece in self.pieces(list(self.store.episodes.values())):
-                judge = compiled.add(judge, piece)
-            assert judge.closed is not None
-            sums = closed_form.whole(judge.closed.summed)
-            found = explanation.explain(sums, int(self.state.average), basis)
-            found = jax.tree.map(np.asarray, found)
+                judge, steps = compiled.add(judge, piece), compiled.add_steps(judge, steps, piece)
+            found = jax.tree.map(np.asarray, compiled.explain(judge, steps, self.state.average))
         names = [] if self.config.phi is None else self.config.phi.columns_by(self.config.judges)
         return words(found, returns.form_found(self.state), names, self.entry_names(len(found.left)))
 

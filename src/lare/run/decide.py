@@ -9,7 +9,7 @@ from lare.run.settings import ResolvedSettings, Settings
 from lare.run.usual import algorithm_of, resolve
 from lare.tasks.env import EnvSpec
 from lare.tasks.spec import TaskSpec
-from lare.tasks.table import env_spec
+from lare.tasks.table import env_spec, known_score
 
 
 def decide(settings: Settings, task: TaskSpec) -> ResolvedSettings:
@@ -27,8 +27,8 @@ def decide(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         resolved = resolved.model_copy(update={"judges": None})
     if "first_fit" in resolved.idle:
         resolved = resolved.model_copy(update={"first_fit": None})
-    if resolved.credit.score == "auto" and task.score is not None:
-        credit = resolved.credit.model_copy(update={"score": task.score})
+    if resolved.credit.score == "auto" and (score := known_score(task)) is not None:
+        credit = resolved.credit.model_copy(update={"score": score})
         resolved = resolved.model_copy(update={"credit": credit})
     check_method(resolved, task, env)
     check_room(resolved, task, env)

@@ -23,6 +23,8 @@ class Family(NamedTuple):
     """Makes the environment of a task."""
     reads: tuple[str, ...] = ()
     """Which of `NOT_FOR_ALL` this family reads."""
+    score: str | None = None
+    """Whether the score of all its tasks is a sum or an average over the steps, if that is known."""
 
 
 def particles(task: TaskSpec, **_: Any) -> JaxEnv:
@@ -57,8 +59,8 @@ def pettingzoo(task: TaskSpec, **kwargs: Any) -> HostEnv:
 
 FAMILIES = {
     "particles": Family(particles),
-    "smax": Family(smax),
-    "smac": Family(smac),
+    "smax": Family(smax, score="sum"),
+    "smac": Family(smac, score="sum"),
     "pettingzoo": Family(pettingzoo, reads=("max_episode_steps", "arguments", "agents")),
 }
 
@@ -77,13 +79,22 @@ GYMNASIUM = Family(gymnasium, reads=("max_episode_steps",))
 """The family of all other names."""
 
 
+def family_of(task: TaskSpec) -> Family:
+    return LOGS if task.environment == NO_ENVIRONMENT else FAMILIES.get(task.family, GYMNASIUM)
+
+
+def known_score(task: TaskSpec) -> str | None:
+    """`sum` or `average` over the steps of an episode, if the task or its family says so."""
+    return task.score or family_of(task).score
+
+
 def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
     """A task's environment. `kwargs` are passed to the constructor of an environment on the host.
 
     Raises:
         LareError: the environment cannot be made, or does not match the task.
     """
-    family = LOGS if task.environment == NO_ENVIRONMENT else FAMILIES.get(task.family, GYMNASIUM)
+    family = family_of(task)
     check_keys(task, family)
     env = family.make(task, **kwargs)
     try:

@@ -9,6 +9,7 @@ they are due. The functions must be called within `float64()`, because `closed_f
 
 from collections.abc import Callable
 from functools import partial
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,7 @@ PLACES = prediction.LAST
 """The most episodes that are read at a time."""
 
 Credit = tuple[Decomposition, ...]
+Carried = TypeVar("Carried")
 
 
 def learn_returns(
@@ -66,26 +68,30 @@ def learn_those_due(
 
 
 def pieces(
-    credit: Credit,
+    carried: tuple[Carried, ...],
     buffer: Replay,
     since: Int[Array, " envs"],
-    take: Callable[[Decomposition, Episodes, Bool[Array, " episodes"]], Decomposition],
+    take: Callable[[Carried, Episodes, Bool[Array, " episodes"]], Carried],
     config: TrainConfig,
     expected: int = PLACES,
-) -> Credit:
-    """Apply `take` to each team's decoder and all finished episodes from number `since` on, about `expected` at a time."""
+) -> tuple[Carried, ...]:
+    """Apply `take` to what each team carries, such as its decoder, and to all finished episodes from number `since` on, about
+    `expected` at a time.
+    """
     longest = config.env.max_steps
     rows = max(1, min(expected, PLACES, ROWS // (config.judged_rows * longest))) * longest
     total = jnp.sum(episodes_since(buffer, since))
 
-    def piece(carry: tuple[Int[Array, ""], Credit]) -> tuple[Int[Array, ""], Credit]:
-        start, credit = carry
+    def piece(carry: tuple[Int[Array, ""], tuple[Carried, ...]]) -> tuple[Int[Array, ""], tuple[Carried, ...]]:
+        start, carried = carry
         sample = in_order(buffer, since, start, PLACES, rows)
         steps, there = replay.read(buffer, sample.steps), sample.episodes.mask > 0
-        credit = tuple(take(one, episodes_of(steps, sample, config, place), there) for place, one in enumerate(credit))
-        return start + jnp.sum(there), credit
+        carried = tuple(
+            take(one, episodes_of(steps, sample, config, place), there) for place, one in enumerate(carried)
+        )
+        return start + jnp.sum(there), carried
 
-    return jax.lax.while_loop(lambda carry: carry[0] < total, piece, (jnp.zeros_like(total), credit))[1]
+    return jax.lax.while_loop(lambda carry: carry[0] < total, piece, (jnp.zeros_like(total), carried))[1]
 
 
 def tell(credit: Credit, buffer: Replay, since: Int[Array, " envs"], config: TrainConfig) -> Credit:
@@ -112,12 +118,7 @@ def from_stored(credit: Credit, buffer: Replay, config: TrainConfig) -> Credit:
     """One seed: decoders with all finished episodes of a replay in their statistics and sums, but not fitted yet."""
 
     def observe(one: Decomposition, episodes: Episodes, there: Bool[Array, " episodes"]) -> Decomposition:
-        count = len(episodes.length)
-        known = (episodes.episode < count) & there[jnp.minimum(episodes.episode, count - 1)]
-        mask = known[:, None] & (
-            jnp.ones(episodes.features.shape[:2], bool) if episodes.share is None else episodes.share > 0
-        )
-        return decomposition.observe_steps(one, episodes.features, mask)
+        return decomposition.observe_steps(one, episodes.features, decomposition.counted_rows(episodes, there))
 
     credit = pieces(credit, buffer, buffer.oldest, observe, config)
     return sum_again(credit, buffer, jnp.array(True), config)

@@ -8,15 +8,17 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool
 
-from lare.credit import closed_form, returns
-from lare.credit.explanation import Explanation, explain
+from lare.credit import closed_form, decomposition, returns
+from lare.credit.closed_form import LinearDecoder
+from lare.credit.decomposition import Episodes
+from lare.credit.explanation import Explanation, Steps, add_steps, explain, no_steps
 from lare.credit.methods import METHODS, Decoder
 from lare.credit.words import FEWEST, entry_names, words
 from lare.data.replay import Replay
 from lare.float64 import float64
 from lare.run.directory import Run
 from lare.training.config import TrainConfig
-from lare.training.episodes import from_stored
+from lare.training.episodes import from_stored, pieces
 from lare.training.learner import Learner, init_credit
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
@@ -58,11 +60,21 @@ def explain_stored(
     """Explanations from all finished episodes of the first seed."""
     buffer, average = of_seed((replay, averages))
     credit = from_stored(init_credit([jax.random.key(0)] * len(average), config), buffer, config)
-    found = []
-    for one, form, basis in zip(credit, average, config.bases, strict=True):
-        assert one.closed is not None
-        found.append(explain(closed_form.whole(one.closed.summed), form.astype(int), basis))
-    return found
+    closed = [one.closed for one in credit if one.closed is not None]
+
+    def take(
+        carried: tuple[LinearDecoder, Steps], episodes: Episodes, there: Bool[Array, " episodes"]
+    ) -> tuple[LinearDecoder, Steps]:
+        decoder, steps = carried
+        rows = decomposition.counted_rows(episodes, there)
+        return decoder, add_steps(steps, decoder.features(episodes.features), rows, decoder.basis)
+
+    empty = tuple((one.decoder, no_steps(one.decoder.basis)) for one in closed)
+    of_steps = pieces(empty, buffer, buffer.oldest, take, config)
+    return [
+        explain(closed_form.whole(one.summed), steps, form.astype(int), one.decoder.basis)
+        for one, (_, steps), form in zip(closed, of_steps, average, strict=True)
+    ]
 
 
 def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:

@@ -16,8 +16,12 @@ from toys import PHI, phi
         (PHI, 2, ["f_near", "f_effort"]),
         (phi("return [-action, action]"), 2, ["factor_1", "action"]),
         (phi("return (action, -action)"), 2, ["action", "factor_2"]),
-        # Where the list is not written out, or not at the end, or not as long, there are no names in it.
-        (phi("factors = [action, -action]\nreturn factors"), 2, ["factor_1", "factor_2"]),
+        (phi("factors = [action, -action]\nreturn factors"), 2, ["action", "factor_2"]),
+        (phi("factors = [action, observation]\nreturn [f[:, :1] for f in factors]"), 2, ["action", "observation"]),
+        # Where the list is not written out, or not once, or not at the end, or not as long, there are no names in it.
+        (phi("factors = [action]\nfactors = [action, -action]\nreturn factors"), 2, ["factor_1", "factor_2"]),
+        (phi("factors = [action]\nfactors.append(action)\nreturn factors"), 2, ["factor_1", "factor_2"]),
+        (phi("factors = [action]\nreturn [f for f in factors if True]"), 1, ["factor_1"]),
         (phi("return [action] * 2"), 2, ["factor_1", "factor_2"]),
         (phi("if True:\n    return [action]"), 1, ["factor_1"]),
         (phi("return [x for x in (action, action)]"), 2, ["factor_1", "factor_2"]),

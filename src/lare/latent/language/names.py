@@ -32,13 +32,32 @@ def factor_names(source: str) -> list[str] | None:
     """The names in the list that the function returns, or None if they cannot be determined."""
     for node in ast.walk(parsed(source)):
         if isinstance(node, ast.FunctionDef) and node.name == NAME and isinstance(node.body[-1], ast.Return):
-            returned = node.body[-1].value
-            if isinstance(returned, ast.List | ast.Tuple):
+            listed = written_out(node, node.body[-1].value)
+            if listed is not None:
                 return [
                     item.id if isinstance(item, ast.Name) else f"factor_{number}"
-                    for number, item in enumerate(returned.elts, start=1)
+                    for number, item in enumerate(listed, start=1)
                 ]
     return None
+
+
+def written_out(function: ast.FunctionDef, returned: ast.expr | None) -> list[ast.expr] | None:
+    """The items of a list or tuple that is written out: `[a, b]`, `factors`, or `[f.reshape(n, 1) for f in factors]`, where the
+    function assigns `factors` once.
+    """
+    if isinstance(returned, ast.ListComp) and len(returned.generators) == 1 and not returned.generators[0].ifs:
+        returned = returned.generators[0].iter
+        returned = returned if isinstance(returned, ast.Name) else None
+    if isinstance(returned, ast.Name):
+        assigned = [
+            node.value
+            for node in ast.walk(function)
+            if isinstance(node, ast.Assign)
+            for target in node.targets
+            if isinstance(target, ast.Name) and target.id == returned.id
+        ]
+        returned = assigned[0] if len(assigned) == 1 else None
+    return returned.elts if isinstance(returned, ast.List | ast.Tuple) else None
 
 
 def factor_meanings(source: str) -> dict[str, str]:
