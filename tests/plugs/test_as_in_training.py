@@ -44,7 +44,7 @@ def both(method, env, phi=None):
         factors = np.zeros((len(rows), 1, 1, 0), np.float32)
         if phi is not None:
             factors = phi.of_steps(before, action, after, "before")[:, None, None]
-        learner = with_steps(learner, config, some, factors if phi is not None else None)
+        learner = with_steps(learner, config, some, factors if phi is not None else None, tell=True)
         alive = some.before.alive[:, 0] if env.agents > 1 else None
         lanes, never = [0] * len(rows), np.zeros(len(rows), bool)
         credit.add(before, action, after, reward, never, some.ended[:, 0], lanes=lanes, alive=alive)
