@@ -44,7 +44,8 @@ def test_tasks_are_listed(command):
     [
         ("train Task --steps 1e5", "--steps 1e5: not a whole number, such as 10000; see lare train --help"),
         ("train Task --step 9", "unrecognized options: --step, 9 (did you mean '--steps'?); see lare train --help"),
-        ("trian", "unrecognized options: trian (did you mean 'train'?); see lare --help"),
+        ("trian", "there is no command 'trian' (did you mean 'train'?); see lare --help"),
+        ("check task.toml", "there is no command 'check'; see lare --help"),
         ("evaluate a b", "unrecognized options: b; see lare evaluate --help"),
         ("evaluate a --seed 3", "unrecognized options: --seed, 3; see lare evaluate --help"),
         ("evaluate", "lare evaluate needs RUN (a run directory); see lare evaluate --help"),

@@ -40,6 +40,8 @@ def parse(
         except SystemExit as stopped:
             if not stopped.code:
                 raise
+    if arguments and arguments[0] not in commands and not arguments[0].startswith("-"):
+        raise LareError(f"there is no command {arguments[0]!r}{did_you_mean(arguments[0], commands)}; see lare --help")
     command = f"lare {arguments[0]}" if arguments and arguments[0] in commands else "lare"
     raise LareError(f"{in_one_line(box.getvalue(), commands)}; see {command} --help")
 
