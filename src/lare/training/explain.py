@@ -70,10 +70,10 @@ def explain_stored(
         return decoder, add_steps(steps, decoder.features(episodes.features), rows, decoder.basis)
 
     empty = tuple((one.decoder, no_steps(one.decoder.basis)) for one in closed)
-    of_steps = pieces(empty, buffer, buffer.oldest, take, config)
+    summed = pieces(empty, buffer, buffer.oldest, take, config)
     return [
         explain(closed_form.whole(one.summed), steps, form.astype(int), one.decoder.basis)
-        for one, (_, steps), form in zip(closed, of_steps, average, strict=True)
+        for one, (_, steps), form in zip(closed, summed, average, strict=True)
     ]
 
 
