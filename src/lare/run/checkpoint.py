@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lare.errors import LareError, shortened
@@ -121,9 +120,10 @@ def named_leaves(learner: Any) -> dict[str, Any]:
 
 
 @jax.jit
-def take(buffer: jax.Array, index: jax.Array) -> jax.Array:
+def take(columns: dict[str, jax.Array], index: jax.Array) -> dict[str, jax.Array]:
     """Rows of every environment of every seed."""
-    return jax.vmap(jax.vmap(lambda rows, where: rows[where]))(buffer, index)
+    of_env = jax.vmap(jax.vmap(lambda rows, where: rows[where]))
+    return {name: of_env(column, index) for name, column in columns.items()}
 
 
 def save(
@@ -157,8 +157,8 @@ def save(
     start = np.minimum(start, end)
     count = end - start + 1
     width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations
-    index = jnp.asarray((start[..., None] + np.arange(width)) % rows)
-    segment = {name: np.asarray(take(column, index))[:, :, : count.max()] for name, column in buffer.columns.items()}
+    taken = take(buffer.columns, (start[..., None] + np.arange(width)) % rows)
+    segment = {name: np.asarray(values)[:, :, : count.max()] for name, values in taken.items()}
     write_atomically(directory / f"rows-{number}.npz", lambda file: np.savez(file, allow_pickle=False, **segment))
     segments.append({"number": number, "start": start.tolist(), "count": count.tolist()})
     alive = [one for one in segments if np.any(np.add(one["start"], one["count"]) > end - rows)]

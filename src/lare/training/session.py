@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key, Shaped
 
 from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import find_method
@@ -56,6 +56,14 @@ def config_for(run: Run) -> TrainConfig:
         steps=settings.steps,
         fit_updates=settings.fit_updates,
     )
+
+
+@jax.jit
+def in_first_environment(
+    column: Shaped[Array, "seeds envs rows *rest"], rows: Int[Array, "seeds steps"]
+) -> Shaped[Array, "seeds steps *rest"]:
+    """Some rows of a column of the replay."""
+    return jax.vmap(lambda of_seed, chosen: of_seed[0, chosen])(column, rows)
 
 
 @dataclass
@@ -136,9 +144,9 @@ class Session:
 
     def actions_now(self, steps: int) -> Float[np.ndarray, "seeds steps action"]:
         """The actions of an off-policy algorithm's policies, without noise, in the newest states of the first environment."""
-        held, seeds = self.learner.replay, np.arange(len(self.run.seeds))[:, None]
+        held = self.learner.replay
         rows = np.asarray(held.next_row)[:, :1] - 1 - np.arange(min(steps, int(np.min(held.next_row))))
-        seen = held.columns["observation"][seeds, 0, rows % replay.capacity(held)]
+        seen = in_first_environment(held.columns["observation"], rows % replay.capacity(held))
         available = np.ones((*rows.shape, 1, self.config.env.action_size), bool)
         action, _ = self.functions.act(self.actor, (), seen, available, None, np.zeros(rows.shape, bool))
         return np.asarray(action)[:, :, 0]
