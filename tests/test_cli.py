@@ -161,6 +161,16 @@ def test_verify_prints_each_check(command, phi, spec_file):
     assert last.startswith("It ran in a process of its own (")
 
 
+def test_verify_says_what_cannot_be_exported(command, phi, spec_file):
+    phi.write_text(phi.read_text().replace("np.square(action)", "np.sort(action, axis=1)"))
+    status, out, _ = command("verify", phi, "--task", spec_file())
+    assert status == 0
+    assert out.splitlines()[-2] == (
+        "advice  lare export cannot make it a part of the exported reward: it has a call of np.sort (docs/export.md lists what can "
+        "be)"
+    )
+
+
 def test_verify_says_how_much_of_the_score_the_factors_explain(command, phi, spec_file):
     status, out, err = command("verify", phi, "--task", spec_file(), "--fit", "30")
     assert (status, err) == (0, "playing 30 episodes by random actions\n")

@@ -109,9 +109,11 @@ def same(exported, name, inputs, wanted):
     for key, one in described["inputs"].items():
         assert given[key].shape == (len(given[key]), *one["shape"][1:])
     of_numpy = exported.load(name)(**given)
+    of_a_row = exported.load(name)(**{key: rows[0] for key, rows in given.items()})
     session = onnxruntime.InferenceSession(exported.HERE / f"{name}.onnx", providers=["CPUExecutionProvider"])
     of_onnx = dict(zip(described["outputs"], session.run(None, given), strict=True))
     for key, one in described["outputs"].items():
+        np.testing.assert_allclose(of_a_row[key], of_numpy[key][0], rtol=1e-5, atol=1e-6)
         for found in (of_numpy[key], of_onnx[key]):
             assert found.shape == (len(found), *one["shape"][1:])
             assert found.dtype == one["type"]
@@ -251,6 +253,7 @@ def test_phi_and_decoder_are_one_function_without_lare(run, tmp_path, phi):
     rows = np.concatenate([phi(before, action), before, action / 2], axis=1)
     wanted = decomposition.proxy_rewards(of_seed(learner).credit[0], jnp.asarray(rows), config.credit)
     np.testing.assert_allclose(json.loads(done.stdout), wanted, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(loaded(tmp_path / "out").reward(before[0], action[0], after[0]), wanted[0], rtol=1e-4)
     assert np.std(wanted) > 0
     assert set(loaded(tmp_path / "out").described("reward")["inputs"]) == {"before", "action"}
 
@@ -269,6 +272,7 @@ def test_a_phi_without_translation_runs_beside_the_decoder(small, command, tmp_p
     np.testing.assert_allclose(exported.factors(before, action, after), function(before, action), rtol=1e-6)
     wanted = exported.load("reward")(factors=function(before, action))["r_hat"]
     np.testing.assert_allclose(exported.reward(before, action, after), wanted, rtol=1e-6)
+    np.testing.assert_allclose(exported.reward(before[0], action[0], after[0]), wanted[0], rtol=1e-6)
 
 
 def test_the_policy_is_that_of_policy_of(run, tmp_path):

@@ -1,5 +1,8 @@
 """`phi` as a graph: the same numbers as the program, by NumPy and by ONNX Runtime; or a word on what has no translation."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import onnxruntime
 import pytest
@@ -9,7 +12,7 @@ from lare.deploy import onnx
 from lare.deploy.exported import OPERATIONS
 from lare.deploy.graph import Graph
 from lare.deploy.phi import factors
-from lare.deploy.rows import Rows, Untranslatable
+from lare.deploy.rows import FUNCTIONS, Rows, Untranslatable
 from tiers import long
 
 ENTRIES, ACTIONS = 6, 2
@@ -68,6 +71,8 @@ TRANSLATED = [
     "x, y = o[:, 0:1], o[:, 1:2]\nreturn [np.maximum(x, y), np.minimum(x, 0.0), np.sign(y), np.floor(x), np.cos(x) * np.sin(y)]",
     "def near(x, size=1.0):\n    return np.exp(-np.square(x) / size)\nreturn [near(o[:, 0:1]), near(o[:, 1:2], size=2.0)]",
     "return [o[:, i][:, None] for i in range(2)]",
+    "return [np.round(o[:, 0:1] * 4), np.around(o[:, 1:2], 2), o[:, 2:3].round(decimals=1), np.rint(a[:, 0:1])]",
+    "weights = np.arange(6) + np.arange(1, 4, 0.5)\nreturn [np.sum(o * weights, axis=1, keepdims=True)]",
 ]
 
 
@@ -111,6 +116,8 @@ def test_recorded_functions_have_a_translation(task, draw):
         ("return [o.reshape(2, -1)[:, 0:1]]", "a reshape of the batch"),
         ("return [o[:, 0:1] * np.zeros((9, 1))]", "np.zeros"),
         ("return [o[:, 0:1] * 2 ** 100]", "a large number"),
+        ("return [np.sum(o * np.arange(10 ** 12), axis=1, keepdims=True)]", "a large constant"),
+        ("return [o[:, 0:1] * np.arange(1, 2, 0)[0]]", "division by zero"),
         ("x = [0.0] * 10 ** 9\nreturn [o[:, 0:1]]", "a large constant"),
         ("x = 2 ** 64\nfor i in range(9):\n    x = x ** 9\nreturn [o[:, 0:1] + x]", "a large number"),
         (
@@ -129,6 +136,12 @@ def test_recorded_functions_have_a_translation(task, draw):
 def test_what_has_no_translation_is_named(body, message):
     with pytest.raises(Untranslatable, match=message):
         graph_of(program(body))
+
+
+def test_the_documentation_lists_the_functions():
+    section = (Path(__file__).parents[2] / "docs" / "export.md").read_text().partition("these functions of NumPy")[2]
+    listed = re.findall(r"`([\w.]+)`", section.partition("; and the methods")[0])
+    assert listed == sorted(FUNCTIONS)
 
 
 def test_a_source_that_was_not_checked_is_not_read():

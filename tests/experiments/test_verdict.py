@@ -42,8 +42,8 @@ def said(returns, random=CHANCE, task="Toy", **facts):
                 "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from factors and raw entries, explain next to nothing of the score: R² of the last returns, "
                 "before they were learned from, is -3.00.",
-                "Next: the score depends on something else. `lare design Toy --reflect 2 --model NAME` asks for another phi; "
-                "`--method bayes` needs no phi.",
+                "Next: another phi, because this one misses what the score depends on (`lare design Toy --reflect 2 --model "
+                "NAME`); or none (`--method bayes`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),
@@ -54,10 +54,21 @@ def said(returns, random=CHANCE, task="Toy", **facts):
                 "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from raw entries, explain nearly all of the score: R² of the last returns, before they were "
                 "learned from, is 0.90.",
-                "Next: returns are predicted well, so it may depend on the algorithm: more `--steps`, or another `--algorithm` "
+                "The proxy rewards are good, so the algorithm is the limit. Next: more `--steps`, or another `--algorithm` "
                 "(`lare algorithms`).",
                 "If state and action have more than 12 entries together, a score that depends on products of them, such as price "
                 "times power, needs a phi (`lare prompt`).",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
+            ],
+        ),
+        (
+            FLAT - 50,
+            {"return_r2": 0.0},
+            [
+                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
+                "Its proxy rewards, from raw entries, explain next to nothing of the score: R² of the last returns, before they "
+                "were learned from, is 0.00.",
+                "Next: a phi, because the raw entries do not show what the score depends on (`lare prompt Toy`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),
@@ -66,7 +77,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             {"at_the_end": 40.0},
             [
                 "It learned. The return is 31 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
-                "That is no more than training on the return at the end alone gives here (40).",
+                "That is less than training on the return at the end alone gives here (40).",
                 "Next: it was better before, 92 at step 4,000. `lare evaluate runs/x --best` plays the best policy of each seed.",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
@@ -90,9 +101,10 @@ def said(returns, random=CHANCE, task="Toy", **facts):
         ),
         (
             FELL_A_LITTLE,
-            {"of_evaluation": 6.0},
+            {"of_evaluation": 6.0, "at_the_end": 26.0},  # two standard errors of a difference are 17
             [
                 "It learned. The return is 42.5 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
+                "That is about as much as training on the return at the end alone gives here (26).",
                 "Next: it was better before, 62 at step 4,000. `lare evaluate runs/x --best` plays the best policy of each seed.",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
@@ -110,7 +122,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             {},
             [
                 "It got worse than random actions. The return is -169 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
-                "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
+                "Next: more `--steps`, or another `--algorithm` (`lare algorithms`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),
@@ -119,7 +131,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             {},
             [
                 "It got worse than random actions. The return is -949 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
-                "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
+                "Next: more `--steps`, or another `--algorithm` (`lare algorithms`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),
@@ -144,7 +156,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
                 "episodes.",
                 "Its proxy rewards, from factors and raw entries, usually explain the score (median R² of returns: 0.98), but not "
                 "the last episodes (R² -0.93): the policy has changed, and the decoder has to adapt.",
-                "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
+                "Next: more `--steps`, or another `--algorithm` (`lare algorithms`).",
             ],
         ),
         (
@@ -188,7 +200,7 @@ def test_better_than_chance_is_not_learned_if_the_policy_was_so_before_training(
     began = "after 8,000 steps; random actions get 0 ± 1 in 3 episodes, the policy before training"
     assert said(FLAT, before=51.0)[:2] == [
         f"It has not learned yet. The return is 51 {began} 51.",
-        "Next: it may need more steps: more `--steps`, or another `--algorithm` (`lare algorithms`).",
+        "Next: more `--steps`, or another `--algorithm` (`lare algorithms`).",
     ]
     assert said(FLAT, before=30.0)[0] == f"It learned. The return is 51 {began} 30."
 

@@ -9,6 +9,7 @@ from lare.errors import LareError
 from lare.latent.function import verified
 from lare.llm.prompts import candidate
 from lare.tasks.documentation import without_clause
+from lare.tasks.draft import bodies
 from lare.tasks.load import load_task
 from lare.tasks.new import draft
 from lare.tasks.spec import FILL_IN
@@ -116,6 +117,15 @@ def test_entries_keep_their_lines_and_are_counted_once(tmp_path):
     assert task.observation == "3 entries.\n0: floor\n1 to 2: waiting people, by floor"
 
 
+def test_a_size_that_the_text_states_is_not_repeated():
+    texts = {"observation": "3 entries: speeds", "action": "31 entries: forces"}
+    heads = {"observation": "3 entries.", "action": "3 entries, each between -1 and 1."}
+    assert bodies(texts, heads) == [
+        '\nobservation = """\n3 entries: speeds\n"""',
+        '\naction = """\n3 entries, each between -1 and 1.\n31 entries: forces\n"""',
+    ]
+
+
 def test_whatever_speaks_of_rewards_is_left_out(tmp_path):
     drafted = draft("toys/Told-v0")
     task = load(tmp_path, drafted.toml)
@@ -136,6 +146,7 @@ def test_whatever_speaks_of_rewards_is_left_out(tmp_path):
 def test_what_is_not_documented_must_be_filled_in(tmp_path):
     drafted = draft("toys/Silent-v0")
     assert drafted.missing == ("description", "observation", "action")
+    assert "Left out" not in drafted.toml
     with pytest.raises(LareError, match=f"description still says '{FILL_IN}'"):
         load(tmp_path, drafted.toml)
     task = load(tmp_path, drafted.toml.replace(FILL_IN, "Say"))

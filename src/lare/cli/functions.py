@@ -121,6 +121,7 @@ def verify(
     """
     from lare.cli.design import policy_that_plays
     from lare.credit.words import FEWEST
+    from lare.deploy.phi import missing_translation
     from lare.latent.function import of_verdict
     from lare.latent.saved import read_source
     from lare.latent.verification.verify import verify as verify_source
@@ -147,6 +148,10 @@ def verify(
             say(f"        {line}")
     for line in verdict.advice:
         say(f"advice  {line}")
+    if verdict.passed and (part := missing_translation(source, role.observation_size, role.action_size)):
+        say(
+            f"advice  lare export cannot make it a part of the exported reward: it has {part} (docs/export.md lists what can be)"
+        )
     if verdict.isolation:
         say(f"It ran in {verdict.isolation}.")
     if not verdict.passed:

@@ -37,8 +37,8 @@ def train(
 
     Args:
         task: a shipped name (see `lare tasks`), or the path of a task file. Not given with --resume.
-        function: a latent function (.py) to use instead of a recorded one, verified before it is run. Where several teams learn,
-            one --function for each, in the order of the task.
+        function: a latent function (.py), or a reply with one (.json), to use instead of a recorded one; verified before it is
+            run. Where several teams learn, one --function for each, in the order of the task.
         model: with --reflect-every, the model to ask: the path of a recording (.json), or the name of a model behind an
             OpenAI-compatible endpoint.
         base_url: the endpoint; the default is OPENAI_BASE_URL, or else OpenAI's.

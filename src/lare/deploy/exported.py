@@ -4,7 +4,8 @@
     action = exported.load("policy")(observation=observation)["action"]
     r_hat = exported.reward(before, action, after)  # and length=STEPS of the episode, if `export.json` lists it
 
-`export.json` lists the inputs and outputs of each function, with their shapes. The first axis of all of them is the batch.
+`export.json` lists the inputs and outputs of each function, with their shapes. The first axis of all of them is the batch. A
+single row may be given without this axis; then the outputs have none either.
 """
 
 import json
@@ -29,6 +30,7 @@ OPERATIONS = {
     "Sign": np.sign,
     "Floor": np.floor,
     "Ceil": np.ceil,
+    "Round": np.rint,
     "Sqrt": np.sqrt,
     "Reciprocal": np.reciprocal,
     "Exp": np.exp,
@@ -94,11 +96,13 @@ def load(name):
             )
         if unknown := [key for key in inputs if key not in graph["inputs"]]:
             raise ValueError(f"{name} needs the inputs {needed}: there is no input {', '.join(unknown)}")
-        values = constants | {key: as_input(key, inputs[key], like) for key, like in graph["inputs"].items()}
+        given = {key: as_input(key, inputs[key], like) for key, like in graph["inputs"].items()}
+        single = all(given[key].ndim < len(like["shape"]) for key, like in graph["inputs"].items())
+        values = constants | {key: array[None] if single else array for key, array in given.items()}
         for operation, arguments, result, axis in graph["operations"]:
             more = {} if axis is None else {"axis": axis}
             values[result] = OPERATIONS[operation](*(values[argument] for argument in arguments), **more)
-        return {key: values[key] for key in graph["outputs"]}
+        return {key: values[key][0] if single else values[key] for key in graph["outputs"]}
 
     return function
 

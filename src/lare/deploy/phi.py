@@ -36,6 +36,7 @@ ARITHMETIC: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
 CONSTANTS = {"np.pi": math.pi, "np.e": math.e, "np.newaxis": None, "np.inf": math.inf}
 CASTS = frozenset({"float", "np.float32", "np.float64"})
 OF_CONSTANTS = frozenset("sqrt exp log tanh cos sin abs square maximum minimum sum mean max min prod".split())
+"""Functions of NumPy whose results for constants are no larger than these."""
 
 
 class Returned(Exception):
@@ -70,6 +71,21 @@ def factors(graph: Graph, source: str, observation: Rows, action: Rows) -> Rows:
         RecursionError,
     ) as error:
         raise Untranslatable(str(error)) from error
+
+
+def missing_translation(source: str, observation_size: int, action_size: int) -> str | None:
+    """The part of a function that cannot be translated; None if all of it can.
+
+    `source` has passed the gate; the sizes are those of the rows that it judges.
+    """
+    graph = Graph()
+    observation = Rows(graph, graph.input("observation", (observation_size,)), (observation_size,))
+    action = Rows(graph, graph.input("action", (action_size,)), (action_size,))
+    try:
+        factors(graph, source, observation, action)
+    except Untranslatable as error:
+        return str(error)
+    return None
 
 
 class Walk:
@@ -212,6 +228,8 @@ class Walk:
                 return {"range": range, "len": len}[name](*(self.value(one, names) for one in node.args))
             case ast.Name(id="float"):
                 return float(self.value(node.args[0], names))
+            case ast.Attribute(value=ast.Name(id="np"), attr="arange"):
+                return counted(*(self.value(one, names) for one in node.args), **named)
             case ast.Attribute(attr="astype", value=of) if ast.unparse(node.args[0]) in CASTS:
                 return self.value(of, names).as_numbers()
             case ast.Attribute(attr=name, value=of) if name in METHODS and ast.unparse(of) != "np":
@@ -231,6 +249,14 @@ def check_size(name: str, left: Any, right: Any) -> None:
         raise Untranslatable("a large constant")
     if any(value > 2**64 for value in whole) or (name == "power" and np.max(np.abs(right)) > 64):
         raise Untranslatable("a large number")
+
+
+def counted(start: Any, stop: Any = None, step: Any = 1) -> np.ndarray:
+    """`numpy.arange`, of constants."""
+    low, high = (0, start) if stop is None else (start, stop)
+    if not (high - low) / step <= LARGEST:
+        raise Untranslatable("a large constant")
+    return np.arange(low, high, step)
 
 
 def applied(name: str, values: list[Any], named: Mapping[str, Any]) -> Any:

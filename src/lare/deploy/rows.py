@@ -135,6 +135,12 @@ def clip(x: Any, a_min: Any = None, a_max: Any = None) -> Any:
     return x if a_max is None else together("Min", x, a_max)
 
 
+def rounded(x: Rows, decimals: int = 0) -> Rows:
+    """`numpy.round`: to the nearest number with so many decimals, and from the middle to the even one."""
+    size = 10.0**decimals
+    return together("Div", together("Round", together("Mul", x, size)), size)
+
+
 def where(condition: Rows, yes: Any, no: Any) -> Rows:
     """`numpy.where`. A constant among the values is first given the axes of the condition."""
     if not is_rows(condition) or condition.kind != "bool":
@@ -260,6 +266,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
             "sign": "Sign",
             "floor": "Floor",
             "ceil": "Ceil",
+            "rint": "Round",
             "maximum": "Max",
             "minimum": "Min",
             "power": "Pow",
@@ -284,6 +291,8 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "logical_and": elementwise("And", kind="bool", of="bool"),
     "logical_or": elementwise("Or", kind="bool", of="bool"),
     "logical_not": elementwise("Not", kind="bool", of="bool"),
+    "round": rounded,
+    "around": rounded,
     "square": lambda x: together("Mul", x, x),
     "log1p": lambda x: together("Log", together("Add", x, 1.0)),
     "expm1": lambda x: together("Sub", together("Exp", x), 1.0),
@@ -310,4 +319,4 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "array": passed,
 }
 """By NumPy's names. Functions that are methods too take the same arguments as methods."""
-METHODS = frozenset("sum mean max min prod any all argmax argmin clip reshape".split())
+METHODS = frozenset("sum mean max min prod any all argmax argmin clip reshape round".split())

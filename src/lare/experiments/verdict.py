@@ -132,11 +132,12 @@ def deviation(values: Float[np.ndarray, " episodes"]) -> float:
 
 
 def compared(run: Facts) -> list[str]:
-    """A comparison with training on the return at the end alone."""
+    """A comparison with training on the return at the end alone, whose standard error is taken to be as large."""
     if run.at_the_end is None:
         return []
-    way = "more" if run.last > run.at_the_end else "no more"
-    return [f"That is {way} than training on the return at the end alone gives here ({shown(run.at_the_end)})."]
+    above, bar = run.last - run.at_the_end, 2 * math.sqrt(2) * error_at_the_end(run)
+    way = "about as much as" if abs(above) <= bar else "more than" if above > 0 else "less than"
+    return [f"That is {way} training on the return at the end alone gives here ({shown(run.at_the_end)})."]
 
 
 def told(run: Facts) -> list[str]:
@@ -168,8 +169,12 @@ def todo(run: Facts) -> list[str]:
     """What to do next."""
     found = []
     if explains_nothing(run):
-        other = f"`lare design {run.task} --reflect 2 --model NAME` asks for another phi; " if run.latent else ""
-        found.append(f"Next: the score depends on something else. {other}`--method bayes` needs no phi.")
+        found.append(
+            f"Next: another phi, because this one misses what the score depends on (`lare design {run.task} --reflect 2 --model "
+            "NAME`); or none (`--method bayes`)."
+            if run.latent
+            else f"Next: a phi, because the raw entries do not show what the score depends on (`lare prompt {run.task}`)."
+        )
     elif is_rising(run):
         found.append(
             f"Next: it was still rising. To continue: `lare train --resume {run.directory} --steps {2 * int(run.steps[-1])}`."
@@ -194,8 +199,10 @@ def todo(run: Facts) -> list[str]:
         )
     elif len(run.random) and not has_learned(run):
         good = (run.return_r2 or 0) > MOSTLY
-        what = "returns are predicted well, so it may depend on the algorithm" if good else "it may need more steps"
-        found.append(f"Next: {what}: more `--steps`, or another `--algorithm` (`lare algorithms`).")
+        found.append(
+            ("The proxy rewards are good, so the algorithm is the limit. " if good else "")
+            + "Next: more `--steps`, or another `--algorithm` (`lare algorithms`)."
+        )
         if good and not run.latent:
             found.append(
                 f"If state and action have more than {MOST_PAIRED} entries together, a score that depends on products of them, "

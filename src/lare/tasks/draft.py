@@ -47,10 +47,11 @@ def warning(
     left_out: Sequence[str], origin: str = "the documentation of the environment", unused: Sequence[str] = ()
 ) -> list[str]:
     sections = [f"# Sections that were not used: {', '.join(unused)}."] if unused else []
+    fewer = [f"# Left out on purpose: {len(left_out)} sentences or rows with words such as reward, cost or score."]
     return [
         f"# A first draft, from {origin}. Read it before you use it: a language model will",
-        "# know only these texts. Left out on purpose: "
-        f"{len(left_out)} sentences or rows with words such as reward, cost or score.",
+        "# know only these texts.",
+        *(fewer if left_out else []),
         *sections,
         "# Take out anything else that reveals the reward. Describe the goal, not how it is rewarded.",
     ]
@@ -61,7 +62,7 @@ def bodies(texts: Mapping[str, str], heads: Mapping[str, str]) -> list[str]:
 
     def body(key: str, text: str) -> str:
         head = heads.get(key, "")
-        return text if text.startswith(head) else f"{head}\n{text}"
+        return text if text.startswith(head.removesuffix(".")) else f"{head}\n{text}"
 
     return [f"\n{key} = {quoted(body(key, text or f'{FILL_IN}: {WANTED[key]}'))}" for key, text in texts.items()]
 
