@@ -112,11 +112,13 @@ def differences(exhibit: Exhibit, budget: Budget, tasks: int, runs: Sequence[Run
 def of_one_agent(runs: Mapping[str, Run]) -> Iterator[str]:
     """Differences from the paper's protocol for one agent; `runs` has one run of each task."""
     for task, run in runs.items():
-        drawn, longest = run.config.settings.credit.drawn_steps, env_spec(run.config.task).max_steps
+        credit, longest = run.config.settings.credit, env_spec(run.config.task).max_steps
+        drawn = credit.drawn_steps
         if longest < drawn:
             yield (
-                f"Episodes of fewer than {drawn} steps are taken whole, so that RRD and RRD-unbiased are the same as RD on {task}, "
-                f"whose episodes have {longest} steps (the paper: {drawn} steps)."
+                f"Episodes of fewer than {drawn} steps are taken whole (the paper: {drawn} steps with replacement). So RRD and "
+                f"RRD-unbiased have the loss of RD on {task}, whose episodes have {longest} steps; an update reads "
+                f"{credit.steps // drawn} episodes, and {credit.steps // longest} for RD."
             )
     before = [task for task, run in runs.items() if run.config.task.judges == "before"]
     exception = (

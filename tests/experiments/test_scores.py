@@ -131,6 +131,24 @@ def test_settings_in_which_runs_differ_are_named(made):
     assert differing(runs[1:]) == []
 
 
+def test_methods_with_different_functions_are_named(made):
+    def of(method, digest, place, **settings):
+        run = made(f"{method}-{place}", [1.0], method=method, **settings)
+        return Run(run.directory, run.config.model_copy(update={"function_sha256": (digest,)}), ())
+
+    recorded, own = of("lare-bayes", 8 * "a", 0), of("lare-rd", 8 * "b", 1)
+    assert differing([recorded, own]) == ["phi on Chase (aaaaaaaa: lare-bayes; bbbbbbbb: lare-rd)"]
+    assert differing([recorded, of("lare-rd", 8 * "a", 2), made("dense", [1.0])]) == []
+    draws = [
+        of(method, 8 * digest, digest, draw=draw)
+        for method in ("lare-bayes", "lare-rd")
+        for draw, digest in enumerate("ab")
+    ]
+    assert differing(draws) == []
+    assert differing([recorded, of("llm-reward", 8 * "b", 3)]) == []
+    assert differing([recorded, of("lare-bayes", 8 * "b", 4)]) == []  # rows of their own, named after them
+
+
 def test_runs_whose_step_sizes_fall_over_other_numbers_of_steps_are_told_apart(made):
     short = made("a", [1.0], algorithm="ppo", rollout_steps=50)
     settings = short.config.settings.model_copy(update={"steps": 500})

@@ -126,6 +126,13 @@ def test_tasks_without_a_common_scale_are_compared_together_by_the_order_of_thei
     assert "All tasks" not in (tmp_path / "page.html").read_text()
 
 
+def test_a_missing_table_over_all_tasks_is_said(made, command):
+    runs = [made("a", [1.0, 3.0]), made("b", [2.0, 4.0], method="rd"), made("c", [7.0, 9.0], "Depot", method="rd")]
+    status, out, _ = command("compare", *(run.directory for run in runs))
+    assert status == 0
+    assert "\nNo table over all tasks: it needs the same baseline, and another method, on every task" in out
+
+
 def test_something_else_than_the_return_is_compared(made):
     run = made("a", [1.0, 3.0])
     lines = [line | {"credit/error": 2 * line["seed"]} for line in run.metrics()]

@@ -130,6 +130,11 @@ def test_the_form_of_the_score_is_the_users_else_the_tasks(said_by_task, set_by_
     assert decide(settings, task).credit.score == taken
 
 
+def test_the_form_of_the_score_makes_no_difference_to_episodes_of_one_length():
+    settings = [Settings(method="lare-rd", credit={"score": score}) for score in ("auto", "sum", "average")]
+    assert len({decide(one, read_task("CN-6")) for one in settings}) == 1
+
+
 @pytest.mark.parametrize("method", ["bayes", "rd-linear"])
 def test_no_weight_for_each_entry_of_a_picture(method):
     task = toy_spec()

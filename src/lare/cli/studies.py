@@ -96,6 +96,10 @@ def compare(
     if rows := page.cells_of_all(comparisons):
         say("\nAll tasks: each run is compared with the runs on the same task.")
         show(page.HEAD_OF_ALL, rows)
+    elif len(comparisons) > 1:
+        say(
+            "\nNo table over all tasks: it needs the same baseline, and another method, on every task with equally many seeds."
+        )
     say(page.MEANINGS)
     say(f"wrote {out}")
 

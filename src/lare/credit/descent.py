@@ -37,7 +37,7 @@ def loss_of_means(
     target, weight = targets(state, episodes, settings)
     decoded = decode(decoder, state, episodes.features, settings, key)
     r_hat, penalty = (over_agents(values, episodes.share) for values in decoded)
-    steps = episodes.length if fit is Fit.ALL_STEPS else jnp.minimum(episodes.length, len(r_hat) // len(target))
+    steps = jnp.minimum(episodes.length, len(r_hat) // len(target)) if fit.draws_steps else episodes.length
     mean = losses.episode_means(r_hat, episodes.episode, steps)
     if fit is Fit.DRAWN_STEPS_UNBIASED:
         variance = losses.subsampling_variance(r_hat.reshape(len(target), -1), episodes.length)

@@ -51,6 +51,11 @@ class Fit(StrEnum):
         return self in (Fit.EVIDENCE, Fit.SIGNS)
 
     @property
+    def draws_steps(self) -> bool:
+        """Whether an update reads K steps of each episode, and not all of them."""
+        return "drawn_steps" in OF_FIT[self]
+
+    @property
     def apart(self) -> bool:
         """Whether the fit is too expensive for every update of the algorithm, and so runs between chunks of updates."""
         return self is Fit.SUBTRAJECTORIES

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from lare.credit.methods import find_method
 from lare.errors import LareError, did_you_mean
 from lare.run.directory import Run
 
@@ -157,7 +158,24 @@ def differing(runs: Sequence[Run]) -> list[str]:
         name: "; ".join(f"{value}: {', '.join(methods)}" for value, methods in values.items())
         for name, values in found.items()
     }
-    return [f"{name} ({values})" for name, values in sorted(told.items())]
+    return [f"{name} ({values})" for name, values in sorted(told.items())] + other_functions(runs)
+
+
+def other_functions(runs: Sequence[Run]) -> list[str]:
+    """The tasks on which methods were trained with different latent functions of one kind and draw, with these functions."""
+    found: dict[tuple[str, str, int, int], dict[str, dict[str, None]]] = {}
+    for run in runs:
+        settings, task = run.config.settings, run.config.task.name
+        if (method := find_method(settings.method)).latent:
+            name = " ".join(digest[:8] for digest in run.config.function_sha256)
+            place = task, method.kind, settings.draw, settings.candidates
+            found.setdefault(place, {}).setdefault(name, {})[method.name] = None
+    told = {
+        task: "; ".join(f"{name}: {', '.join(methods)}" for name, methods in names.items())
+        for (task, *_), names in found.items()
+        if len({tuple(methods) for methods in names.values()}) > 1
+    }
+    return [f"phi on {task} ({names})" for task, names in told.items()]
 
 
 def grouped(runs: Mapping[str, Sequence[Run | Measured]], key: str) -> tuple[list[Group], tuple[str, ...]]:

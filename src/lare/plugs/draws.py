@@ -22,16 +22,14 @@ def batch(store: Store, fit: Fit, settings: CreditSettings, random: np.random.Ge
     def drawn(some: int) -> list[Episode]:
         return [store.episodes[store.oldest[place][1]] for place in random.integers(len(store.oldest), size=some)]
 
-    match fit:
-        case Fit.ALL_STEPS:
-            rows = max(settings.steps, longest)
-            mean = max(1, store.ended_steps // store.ended)
-            return packed(store, drawn(max(1, settings.steps // mean)), max(1, settings.steps // 2), rows)
-        case Fit.SUBTRAJECTORIES:
-            return padded(store, drawn(settings.episodes), longest)
-        case _:
-            chosen = drawn(max(1, settings.steps // settings.drawn_steps))
-            return parts(store, chosen, settings.drawn_steps, random)
+    if fit is Fit.SUBTRAJECTORIES:
+        return padded(store, drawn(settings.episodes), longest)
+    if fit.draws_steps:
+        chosen = drawn(max(1, settings.steps // settings.drawn_steps))
+        return parts(store, chosen, settings.drawn_steps, random)
+    rows = max(settings.steps, longest)
+    mean = max(1, store.ended_steps // store.ended)
+    return packed(store, drawn(max(1, settings.steps // mean)), max(1, settings.steps // 2), rows)
 
 
 def parts(store: Store, episodes: Sequence[Episode], drawn: int, random: np.random.Generator) -> Episodes:

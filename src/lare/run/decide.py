@@ -27,9 +27,12 @@ def decide(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         resolved = resolved.model_copy(update={"judges": None})
     if "first_fit" in resolved.idle:
         resolved = resolved.model_copy(update={"first_fit": None})
-    if resolved.credit.score == "auto" and (score := known_score(task)) is not None:
-        credit = resolved.credit.model_copy(update={"score": score})
-        resolved = resolved.model_copy(update={"credit": credit})
+    score = resolved.credit.score
+    if env.fixed_length:  # the form of the score makes no difference
+        score = "auto"
+    elif score == "auto":
+        score = known_score(task) or score
+    resolved = resolved.model_copy(update={"credit": resolved.credit.model_copy(update={"score": score})})
     check_method(resolved, task, env)
     check_room(resolved, task, env)
     return resolved

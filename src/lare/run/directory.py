@@ -85,8 +85,15 @@ def describe(task: TaskSpec, settings: ResolvedSettings, functions: Sequence[Lat
         function_sha256=tuple(function.digest for function in functions),
         isolation=isolation(task, functions[0]) if functions else None,
         versions={name: version(name) for name in VERSIONS} | {"python": platform.python_version()},
-        machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}",
+        machine=f"{platform.system()} {platform.machine()}, {cores()}, {jax.default_backend()}",
     )
+
+
+def cores() -> str:
+    """How many cores this process may use, and how many there are: XLA divides sums among them, which decides about rounding."""
+    there = os.cpu_count() or 1
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else there
+    return f"{usable} of {there} cores" if usable < there else f"{there} cores"
 
 
 def isolation(task: TaskSpec, function: LatentFunction) -> str:

@@ -195,7 +195,7 @@ def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: Train
         return None
     if fit is Fit.SUBTRAJECTORIES:
         return sample_padded(buffer, key, updates, credit.episodes, longest)
-    if fit is not Fit.ALL_STEPS:
+    if fit.draws_steps:
         drawn = min(credit.drawn_steps, longest)
         return sample_parts(buffer, key, updates, parts_count(config), drawn)
     if config.env.fixed_length:
