@@ -3,7 +3,6 @@
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lare.algorithms.settings import PPOSettings, QMIXSettings, TD3Settings
@@ -111,7 +110,11 @@ def factors_for(config, steps, seed=1):
 
 
 def untrained(config, seed=0):
-    return common.init(jax.random.key(seed), config, lambda key: module_of(config).init(key, config))
+    return jitted(begun, config)(jax.random.key(seed))
+
+
+def begun(key, config):
+    return common.init(key, config, lambda key: module_of(config).init(key, config))
 
 
 def with_steps(learner, config, steps, factors=None, tell=False):
@@ -136,7 +139,7 @@ def jitted(function, config):
 
 def told(learner, config):
     """A learner whose decoders have been told of all episodes that have finished."""
-    given = jax.tree.map(lambda leaf: leaf[None], (learner.credit, learner.replay, learner.counted))
+    given = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (learner.credit, learner.replay, learner.counted))
     with jax.enable_x64(True):
         learned = jitted(learn_returns, config)(*given)
     credit, counted = jax.tree.map(lambda leaf: leaf[0], learned)
@@ -151,8 +154,11 @@ def stored(config, seed=0):
 def every_step(learner):
     """All that is stored of the first environment, in order."""
     held = learner.replay
-    number = jnp.arange(int(replay.oldest_transition(held)[0]), int(held.transitions[0]))
-    return replay.read(held, replay.Index(jnp.zeros_like(number), number))
+    number = np.arange(int(replay.oldest_transition(held)[0]), int(held.transitions[0]))
+    return read(held, replay.Index(np.zeros_like(number), number))
+
+
+read = jax.jit(replay.read)
 
 
 def paid_by(learner):

@@ -36,8 +36,11 @@ def episodes(count=40, noise=0.1, seed=0, lengths=(5, 30)):
 def summed(means, returns, length, pieces=1):
     sums = evidence.no_sums(means.shape[1])
     for piece in np.array_split(np.arange(len(means)), pieces):
-        sums = evidence.add_episodes(sums, *(jnp.asarray(part[piece]) for part in (means, returns, length)))
+        sums = add_episodes(sums, *(part[piece] for part in (means, returns, length)))
     return sums
+
+
+add_episodes = jax.jit(evidence.add_episodes)
 
 
 @partial(jax.jit, static_argnames=("form", "group", "rounds"))
@@ -269,7 +272,7 @@ def test_pairs_cost_nothing_where_the_score_has_no_product(seed, count, noise, l
     basis = Basis(0, 8, extended=True)
     _, raw, *rest = synthetic(seed, count, noise, longest, "perfect")
     deviation = np.concatenate(raw[:count]).std(axis=0)
-    together = np.asarray(expand(basis, jnp.asarray(np.concatenate(raw) / deviation)), float)
+    together = np.asarray(jax.jit(expand, static_argnums=0)(basis, np.concatenate(raw) / deviation), float)
     features = np.split(together, np.cumsum([len(rows) for rows in raw])[:-1])
     additive = basis.group < basis.group.max()
     with jax.enable_x64(True):

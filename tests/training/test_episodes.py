@@ -202,7 +202,7 @@ def test_proxy_rewards_of_either_form_add_up_to_the_return(score, given):
     config = config_of("lare-linear", capacity=2000, credit=CreditSettings(score=given))
     steps, factors, of_step, lengths = scored(config, score)
     learner = list(in_pieces(config, steps, factors, 6))[-1]
-    got = np.asarray(common.rewards(every_step(learner), paid_by(learner), config))[:, 0]
+    got = np.asarray(jitted(common.rewards, config)(every_step(learner), paid_by(learner)))[:, 0]
     each = np.split(got, np.cumsum(lengths)[:-1])
     total, paid = np.array([one.sum() for one in each]), steps.after.reward[np.cumsum(lengths) - 1, 0, 0]
     right = given in ("auto", score)

@@ -29,6 +29,7 @@ from recipes import (
     factors_for,
     jitted,
     paid_by,
+    read,
     steps_of,
     stored,
     untrained,
@@ -43,6 +44,10 @@ TEAMS = partial(config_of, algorithm="ippo", env=RIVALS)
 
 def close(one, other, rtol=1e-4, atol=1e-5):
     jax.tree.map(partial(np.testing.assert_allclose, rtol=rtol, atol=atol), one, other)
+
+
+def proxy_rewards(steps, paid, config):
+    return common.proxy_rewards(steps, paid, config, 0)
 
 
 def fitted(learner, config, key=0):
@@ -111,10 +116,10 @@ def test_the_unbiased_loss_has_the_expectation_of_the_full_one_for_episodes_of_a
         learner = learner._replace(credit=(learner.credit[0]._replace(decoder=steep),))
         draws = sample_parts(learner.replay, jax.random.key(3), 1, 40_000, drawn)
         first = jax.tree.map(lambda leaf: leaf[0], draws)
-        _, measured = common.fit(learner.credit, learner.replay, first, jax.random.key(0), config)
+        _, measured = jitted(common.fit, config)(learner.credit, learner.replay, first, jax.random.key(0))
         losses[name] = float(measured["credit/loss"])
     every, unit = every_step(learner), float(magnitude(learner.credit[0].scale))
-    r_hat = np.asarray(common.proxy_rewards(every, paid_by(learner), config, 0))[:, 0] / unit
+    r_hat = np.asarray(jitted(proxy_rewards, config)(every, paid_by(learner)))[:, 0] / unit
     r = np.asarray(every.before["reward"])[:, 0] / unit
     errors = [(a.mean() - b.mean()) ** 2 for a, b in zip(np.split(r_hat, ENDS), np.split(r, ENDS), strict=True)]
     chosen = np.bincount(np.searchsorted(ENDS, draws.episodes.first.number[0], side="right"), minlength=5) / 40_000
@@ -133,7 +138,8 @@ def test_padding_counts_for_nothing(method):
     elsewhere = draws._replace(steps=draws.steps._replace(number=jnp.where(padding, 40, draws.steps.number)))
     assert (np.asarray(draws.steps.number) != elsewhere.steps.number).any()
     one, other = (
-        common.fit(learner.credit, learner.replay, each, jax.random.key(0), config) for each in (draws, elsewhere)
+        jitted(common.fit, config)(learner.credit, learner.replay, each, jax.random.key(0))
+        for each in (draws, elsewhere)
     )
     close(one, other, 1e-5, 1e-7)
 
@@ -143,7 +149,7 @@ def test_padding_counts_for_nothing(method):
 def test_rewards(method, scale_rewards):
     config = config_of(method, scale_rewards=scale_rewards)
     learner, steps = stored(config), steps_of()
-    got, unit = common.rewards(every_step(learner), paid_by(learner), config), magnitude(learner.scale[0])
+    got, unit = jitted(common.rewards, config)(every_step(learner), paid_by(learner)), magnitude(learner.scale[0])
     assert got.shape == (TOTAL, 1)
     got = np.asarray(got)[:, 0] * (unit if scale_rewards else 1)
     true, ended = steps.after.reward.ravel(), steps.ended.ravel()
@@ -173,7 +179,7 @@ def begun(config):
 def test_an_episode_under_way_is_worth_half_as_much_as_the_best():
     config = config_of("ircr")
     learner, _ = begun(config)
-    got = common.rewards(every_step(learner), paid_by(learner), config)[:, 0]
+    got = jitted(common.rewards, config)(every_step(learner), paid_by(learner))[:, 0]
     np.testing.assert_array_equal(got[-2:], [0.5, 0.5])
     assert float(got[0]) != 0.5
 
@@ -221,7 +227,7 @@ def test_accuracy_is_of_the_newest_steps():
     learner = says_its_factor(learner, [1.0])
     # Episodes of one length: those of the newest iteration. Of any length: as many steps as are measured, or as there are.
     same_length = replace(config, env=replace(config.env, fixed_length=True))
-    newest, every = common.assess(learner, same_length), common.assess(learner, config)
+    newest, every = jitted(common.assess, same_length)(learner), jitted(common.assess, config)(learner)
     assert float(newest["credit/error"]) == pytest.approx(0.5, rel=1e-5)
     assert float(newest["credit/correlation"]) == pytest.approx(1, rel=1e-4)
     assert float(every["credit/error"]) == pytest.approx((7 * (TOTAL - 10) + 5) / TOTAL, rel=1e-5)
@@ -262,7 +268,7 @@ def test_two_environments_are_one_twice_as_long(method):
         (one, wide, replay.Index(env, number)),
         (other, long, replay.Index(0 * env, number + TOTAL * env)),
     ):
-        rewards.append(common.rewards(replay.read(learner.replay, index), paid_by(learner), config))
+        rewards.append(jitted(common.rewards, config)(read(learner.replay, index), paid_by(learner)))
     close(*rewards, 1e-3, 1e-4)
 
 
@@ -310,7 +316,7 @@ def earnings(steps, team, env=0):
 def test_rewards_of_teams(method):
     config, steps = TEAMS(method), steps_of(RIVALS)
     learner, alive = stored(config), steps.before.alive[:, 0]
-    got = np.asarray(common.rewards(every_step(learner), paid_by(learner), config))
+    got = np.asarray(jitted(common.rewards, config)(every_step(learner), paid_by(learner)))
     assert not alive.all()
     for team in RIVALS.teams:
         of_team = np.split(earnings(steps, team), ENDS)
@@ -334,14 +340,14 @@ def numbered():
 
 def test_every_agent_has_the_proxy_rewards_of_its_own_steps():
     config, learner, steps, own = numbered()
-    got = common.rewards(every_step(learner), paid_by(learner), config)
+    got = jitted(common.rewards, config)(every_step(learner), paid_by(learner))
     np.testing.assert_array_equal(got, own * steps.before.alive[:, 0])
 
 
 def test_shared_credit_is_the_mean_over_the_agents_who_are_there():
     config, learner, steps, own = numbered()
     shared = replace(config, method=replace(config.method, shared=True))
-    got = np.asarray(common.rewards(every_step(learner), paid_by(learner), shared))
+    got = np.asarray(jitted(common.rewards, shared)(every_step(learner), paid_by(learner)))
     alive = steps.before.alive[:, 0]
     for row, there, numbers in zip(got, alive, own, strict=True):
         for team in RIVALS.teams:
@@ -356,7 +362,7 @@ def test_every_team_is_measured_by_itself_and_by_those_who_are_there():
     alive = steps.before.alive
     factors = np.where(alive, steps.after.reward, 1e3)[..., None]
     learner = says_its_factor(with_steps(untrained(config), config, steps, factors), [1.0, -1.0])
-    found = common.assess(learner, config)
+    found = jitted(common.assess, config)(learner)
     assert {name: round(float(value), 3) for name, value in found.items() if "correlation" in name} == {
         "credit/correlation": 1,
         "credit/correlation_first": 1,
@@ -398,7 +404,7 @@ def test_must_learn_who_earned_what(method, fixed_length):
     noise = np.random.default_rng(0).normal(size=steps.after.reward.shape).astype(np.float32)
     learner = with_steps(untrained(config), config, steps, np.stack([steps.after.reward, noise], axis=-1))
     credit, _ = jax.jit(partial(common.fit_often, config=config))(learner, jax.random.key(2))
-    found = common.assess(learner._replace(credit=credit), config)
+    found = jitted(common.assess, config)(learner._replace(credit=credit))
     assert float(found["credit/correlation"]) > 0.9
     assert float(found["credit/error"]) < 0.35  # untrained, it is 0.8 and more
 
@@ -427,10 +433,10 @@ def test_what_stands_where_an_agent_has_left_changes_nothing(method):
     found = []
     for given, z in ((steps, factors), (spoilt, np.where(gone[..., None], 99, factors).astype(np.float32))):
         learner = with_steps(untrained(config), config, given, z)
-        rewards = common.rewards(every_step(learner), paid_by(learner), config)
+        rewards = jitted(common.rewards, config)(every_step(learner), paid_by(learner))
         assert not np.asarray(rewards)[gone[:, 0]].any()
         update = fitted(learner, config) if config.method.descends else ()
-        found.append((learner.credit, learner.scale, rewards, update, common.assess(learner, config)))
+        found.append((learner.credit, learner.scale, rewards, update, jitted(common.assess, config)(learner)))
     close(*found)
 
 
@@ -467,9 +473,9 @@ def test_an_agent_that_was_never_there_is_as_none(method):
     assert jax.tree.structure(one.credit) == jax.tree.structure(other.credit)
     found = []
     for learner, config in ((one, many), (other, few)):
-        rewards = common.rewards(every_step(learner), paid_by(learner), config)[:, :2]
+        rewards = jitted(common.rewards, config)(every_step(learner), paid_by(learner))[:, :2]
         update = fitted(learner, config) if config.method.descends else ()
-        found.append((learner.credit, learner.scale, rewards, update, common.assess(learner, config)))
+        found.append((learner.credit, learner.scale, rewards, update, jitted(common.assess, config)(learner)))
     close(*found, 1e-3, 1e-4)
 
 
@@ -492,7 +498,7 @@ def test_credit_of_the_state_is_one_row_a_step_and_pays_all_who_are_there_alike(
         want = np.concatenate([want, np.clip(drawn.before["action"], -1, 1).reshape(TOTAL, 1, -1)], axis=-1)
     np.testing.assert_array_equal(rows, want)
     assert rows.shape[:2] == (TOTAL, 1)
-    got = np.asarray(common.rewards(drawn, paid_by(learner), config))
+    got = np.asarray(jitted(common.rewards, config)(drawn, paid_by(learner)))
     alive = steps.before.alive[:, 0]
     of_step = got.sum(axis=1) / np.maximum(alive.sum(axis=1), 1)
     np.testing.assert_allclose(got, of_step[:, None] * alive, rtol=1e-5, atol=1e-6)
@@ -524,7 +530,7 @@ def test_credit_of_the_state_is_measured_against_what_the_team_earned():
     config, steps = judged_by_state("lare-linear", factors=(1,)), steps_of(TOGETHER)
     earned = earnings(steps, TOGETHER.teams[0]).astype(np.float32)
     learner = with_steps(untrained(config), config, steps, 0.5 + earned[:, None, None, None])
-    found = common.assess(says_its_factor(learner, [1.0]), config)
+    found = jitted(common.assess, config)(says_its_factor(learner, [1.0]))
     assert float(found["credit/error"]) == pytest.approx(0.5, rel=1e-4)
     assert float(found["credit/correlation"]) == pytest.approx(1, rel=1e-4)
 
@@ -538,8 +544,8 @@ def test_optimism_adds_deviations_to_what_is_paid_and_to_nothing_else(env, score
     )
     one, other = stored(plain), stored(hopeful)
     steps, paid = every_step(one), paid_by(other)
-    before = np.asarray(common.rewards(steps, paid_by(one), plain))
-    after = np.asarray(common.rewards(steps, paid, hopeful))
+    before = np.asarray(jitted(common.rewards, plain)(steps, paid_by(one)))
+    after = np.asarray(jitted(common.rewards, hopeful)(steps, paid))
     features = common.features(steps, hopeful, 0)
     with jax.enable_x64(True):
         rows = features.reshape(-1, features.shape[-1])
@@ -548,13 +554,13 @@ def test_optimism_adds_deviations_to_what_is_paid_and_to_nothing_else(env, score
     alive = np.asarray(common.alive(steps, hopeful))
     np.testing.assert_allclose(after, np.where(alive, before + 2 * deviation / parts, 0), rtol=1e-3, atol=1e-5)
     assert (after[alive] > before[alive]).all()
-    np.testing.assert_array_equal(np.where(alive, common.proxy_rewards(steps, paid, hopeful, 0), 0), before)
-    for name, value in common.assess(one, plain).items():
-        np.testing.assert_array_equal(common.assess(other, hopeful)[name], value)
+    np.testing.assert_array_equal(np.where(alive, jitted(proxy_rewards, hopeful)(steps, paid), 0), before)
+    for name, value in jitted(common.assess, plain)(one).items():
+        np.testing.assert_array_equal(jitted(common.assess, hopeful)(other)[name], value)
 
 
 def test_optimism_waits_for_two_returns():
     config = config_of("bayes", credit=CreditSettings(optimism=2.0))
     learner = untrained(config)
-    paid = common.rewards(every_step(stored(config)), paid_by(learner), config)
+    paid = jitted(common.rewards, config)(every_step(stored(config)), paid_by(learner))
     np.testing.assert_array_equal(paid, 0)

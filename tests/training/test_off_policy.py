@@ -13,7 +13,7 @@ from lare.data import replay
 from lare.training import learner as common
 from lare.training import off_policy
 from lare.training.compiled import compiled
-from recipes import ALONE, config_of, factors_for, paid_by, steps_of, stored, untrained, with_steps
+from recipes import ALONE, config_of, factors_for, jitted, paid_by, read, steps_of, stored, untrained, with_steps
 
 
 def test_relabelling_is_by_the_newest_decoder():
@@ -21,15 +21,16 @@ def test_relabelling_is_by_the_newest_decoder():
     credit = CreditSettings(hidden=(8,), drawn_steps=4, steps=24, learning_rate=0.3)
     config = config_of("lare-rrdu", rollout_steps=1, credit=credit)
     learner = stored(config)
-    after, metrics = off_policy.improve_one(learner, steps_of(), jax.random.key(0), jnp.array(0), config)
+    after, metrics = jitted(off_policy.improve_one, config)(learner, steps_of(), jax.random.key(0), jnp.array(0))
     draw_key, _, noise_key = jax.random.split(jax.random.key(0), 3)
     index = jax.tree.map(lambda leaf: leaf[0], off_policy.sample(learner.replay, draw_key, 1, config).batch)
-    batch, losses = replay.read(learner.replay, index), []
+    batch, losses = read(learner.replay, index), []
+    update = jax.jit(partial(td3.update, settings=config.hyperparameters))
     for decoder in (learner.credit, after.credit):
-        reward = common.rewards(batch, common.Paid(decoder, learner.scale), config)
+        reward = jitted(common.rewards, config)(batch, common.Paid(decoder, learner.scale))
         _, key = jax.random.split(jax.random.split(noise_key, 1)[0])
         seen = off_policy.transitions(batch, reward)
-        _, measured = td3.update(learner.algorithm, seen, key, jnp.array(0), config.hyperparameters)
+        _, measured = update(learner.algorithm, seen, key, jnp.array(0))
         losses.append(float(measured["critic/loss"]))
     assert float(metrics["critic/loss"]) == pytest.approx(losses[1], rel=1e-4)
     assert losses[0] != pytest.approx(losses[1], rel=1e-2)
@@ -67,7 +68,7 @@ def test_scaled_rewards_are_those_in_units_of_the_mean_return():
     plain, scaled = config_of("dense"), config_of("dense", scale_rewards=True)
     learner = stored(plain)
     draw = replay.read(learner.replay, off_policy.sample(learner.replay, jax.random.key(0), 1, plain).batch)
-    one, other = (common.rewards(draw, paid_by(learner), config) for config in (plain, scaled))
+    one, other = (jitted(common.rewards, config)(draw, paid_by(learner)) for config in (plain, scaled))
     np.testing.assert_allclose(other, one / jnp.sqrt(learner.scale[0].mean_square), rtol=1e-5)
 
 

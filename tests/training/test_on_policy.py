@@ -22,6 +22,7 @@ from recipes import (
     config_of,
     every_step,
     factors_for,
+    jitted,
     paid_by,
     steps_of,
     untrained,
@@ -40,7 +41,7 @@ def newest(steps, count=20):
 def taken(config, steps, factors=None):
     """A learner that has met some steps, and the rollout of the last 20."""
     learner = with_steps(untrained(config), config, steps, factors)
-    return learner, on_policy.rollout(learner, newest(steps), config)
+    return learner, jitted(on_policy.rollout, config)(learner, newest(steps))
 
 
 @pytest.mark.parametrize("method", ["dense", "episodic", "lare-rrdu"])
@@ -52,7 +53,7 @@ def test_the_rollout_is_the_newest_steps_with_what_the_method_pays(method):
     np.testing.assert_array_equal(rollout.next_observation, last.after.observation[:, 0])
     np.testing.assert_array_equal(rollout.action, last.action[:, 0])
     np.testing.assert_array_equal(rollout.ended, last.ended)
-    want = common.rewards(every_step(learner), paid_by(learner), config)[-20:]
+    want = jitted(common.rewards, config)(every_step(learner), paid_by(learner))[-20:]
     np.testing.assert_allclose(rollout.reward, want, rtol=1e-5)
     if method == "episodic":
         returns = [part.sum() for part in np.split(steps.after.reward.ravel(), np.cumsum(LENGTHS)[:-1])]

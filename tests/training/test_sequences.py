@@ -14,7 +14,20 @@ from lare.normalise import standardise
 from lare.training import learner as common
 from lare.training import sequences
 from lare.training.compiled import compiled
-from recipes import LENGTHS, TOGETHER, TOTAL, config_of, factors_for, paid_by, steps_of, stored, untrained, with_steps
+from recipes import (
+    LENGTHS,
+    TOGETHER,
+    TOTAL,
+    config_of,
+    factors_for,
+    jitted,
+    paid_by,
+    read,
+    steps_of,
+    stored,
+    untrained,
+    with_steps,
+)
 from tiers import long
 
 qmix = partial(config_of, algorithm="qmix", env=TOGETHER, environments=2)
@@ -25,7 +38,14 @@ def of_seed(learner, place=0):
 
 
 def one_seed(leaves):
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], leaves)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], leaves)
+
+
+def sequences_of(learner, drawn, steps, config):
+    def of(learner, drawn):
+        return sequences.sequences(learner.replay, drawn, steps, paid_by(learner), learner.algorithm.states, config)
+
+    return jax.jit(of)(learner, drawn)
 
 
 def episodes_of(steps):
@@ -38,8 +58,8 @@ def episodes_of(steps):
 def test_episodes_against_the_steps_that_were_stored(method):
     config, steps = qmix(method), steps_of(TOGETHER, 2)
     learner = stored(config)
-    drawn = sample_distinct_episodes(learner.replay, jax.random.key(0), 12)
-    batch = sequences.sequences(learner.replay, drawn, 12, paid_by(learner), learner.algorithm.states, config)
+    drawn = jax.jit(sample_distinct_episodes, static_argnums=2)(learner.replay, jax.random.key(0), 12)
+    batch = sequences_of(learner, drawn, 12, config)
     assert np.asarray(drawn.mask).tolist() == [1] * 10 + [0, 0]
     whole = episodes_of(steps)
     before, after = steps.before, steps.after
@@ -60,8 +80,9 @@ def test_episodes_against_the_steps_that_were_stored(method):
             else:
                 np.testing.assert_array_equal(got[length:], np.broadcast_to(given[1][last], got[length:].shape))
         np.testing.assert_array_equal(batch.action[place, :length], steps.action[rows, env])
-        index = replay.Index(jnp.full(length, env), jnp.asarray(rows))
-        paid = np.asarray(common.rewards(replay.read(learner.replay, index), paid_by(learner), config))
+        number = np.concatenate([rows, np.full(12 - length, last)])
+        index = replay.Index(np.full(12, env), number)
+        paid = np.asarray(jitted(common.rewards, config)(read(learner.replay, index), paid_by(learner)))[:length]
         alive = before.alive[rows, env]
         want = (paid * alive).sum(axis=1) / np.maximum(alive.sum(axis=1), 1)
         np.testing.assert_allclose(batch.reward[place, :length], want, rtol=1e-4, atol=1e-6)
@@ -75,7 +96,7 @@ def test_the_mixer_is_given_the_state_by_its_mean_and_deviation_or_all_observati
     rows = steps.after.state.reshape(-1, 5)
     np.testing.assert_allclose(states.mean, rows.mean(axis=0), rtol=1e-3, atol=1e-5)
     drawn = episodes_at(learner.replay, replay.Index(jnp.zeros(1, int), jnp.zeros(1, int)))
-    batch = sequences.sequences(learner.replay, drawn, 5, paid_by(learner), states, config)
+    batch = sequences_of(learner._replace(algorithm=learner.algorithm._replace(states=states)), drawn, 5, config)
     want = standardise(states, jnp.asarray(steps.before.state[:5, 0]))
     np.testing.assert_allclose(batch.state[0, :5], want, rtol=1e-4, atol=1e-5)
 

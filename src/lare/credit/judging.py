@@ -72,8 +72,7 @@ def judge(
             lengths = predictions(no_factors, returns, length, basis, SUM)
         else:
             lengths = None
-        sums = evidence.add_episodes(evidence.no_sums(basis.size), *map(jnp.asarray, (means, returns, length)))
-        explanation = jax.tree.map(np.asarray, explained(sums, steps, form, basis=basis))
+        explanation = jax.tree.map(np.asarray, explained(means, returns, length, steps, form, basis=basis))
     decided = min(errors.values()) < BETTER * max(errors.values())
     return Judgement(
         r2(returns, told[form]),
@@ -157,7 +156,19 @@ def learn(
     return sums, evidence.fit(sums, form, basis.group[basis.of_factors], known, ROUNDS)
 
 
-explained = jax.jit(explain, static_argnames="basis")
+@partial(jax.jit, static_argnames="basis")
+def explained(
+    means: Float[Array, "episodes features"],
+    returns: Float[Array, " episodes"],
+    length: Int[Array, " episodes"],
+    steps: Steps,
+    form: Int[Array, ""] | int,
+    basis: Basis,
+) -> Explanation:
+    """`explain`, by a fit to these episodes."""
+    return explain(
+        evidence.add_episodes(evidence.no_sums(basis.size), means, returns, length), steps, form, basis=basis
+    )
 
 
 def growing(count: int) -> Iterator[tuple[int, int]]:

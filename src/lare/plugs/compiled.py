@@ -19,6 +19,8 @@ from lare.credit.methods import METHODS
 from lare.credit.settings import CreditSettings
 from lare.normalise import Scale, magnitude, observe_scale
 
+init = jax.jit(decomposition.init, static_argnums=range(1, 7))
+
 
 @jax.jit
 def observe_steps(

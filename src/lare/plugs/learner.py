@@ -267,4 +267,4 @@ def untrained(config: CreditConfig) -> Decomposition | None:
         return None
     key, steps = jax.random.key(config.seed), config.max_steps or 1
     with on_host():
-        return decomposition.init(key, config.basis, config.method, config.settings, steps, config.agents, config.forms)
+        return compiled.init(key, config.basis, config.method, config.settings, steps, config.agents, config.forms)
