@@ -32,6 +32,8 @@ CACHE = {
     "jax_compilation_cache_dir": str(Path(__file__).parents[1] / ".pytest_cache" / "jax"),
     "jax_persistent_cache_min_compile_time_secs": 0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
+    # Nobody looks for the lines of Python in a compiled test program, and to note them takes a few percent of the time.
+    "jax_include_full_tracebacks_in_locations": False,
 }
 # Code that runs for a moment need not be optimised for minutes. Fusion emitters double the time that small programs take to
 # compile, and a program in parts, for the compiler's threads, takes a fifth more; a JAX that does not know a flag would end the

@@ -11,10 +11,11 @@ from lare.algorithms.settings import PPOSettings
 from lare.normalise import deviation, observe
 
 SETTINGS = PPOSettings(hidden=(16,), minibatch_size=8, epochs=3)
+init, update = jax.jit(ppo.init, static_argnums=(1, 2, 3, 4)), jax.jit(ppo.update, static_argnums=4)
 
 
 def state_of(discrete=True, settings=SETTINGS):
-    return ppo.init(jax.random.key(0), 3, 2, discrete, settings)
+    return init(jax.random.key(0), 3, 2, discrete, settings)
 
 
 def rollout_of(time=6, lanes=4, discrete=True, seed=0, ended=None):
@@ -113,7 +114,7 @@ def test_rewards_of_any_scale_and_offset_train_alike(discrete):
     state = state_of(discrete, settings)
     quiet = state._replace(params=state.params._replace(critic=jax.tree.map(jnp.zeros_like, state.params.critic)))
     actors = [
-        ppo.update(quiet, rollout._replace(reward=scale * rollout.reward), jax.random.key(1), jnp.array(1.0), settings)[
+        update(quiet, rollout._replace(reward=scale * rollout.reward), jax.random.key(1), jnp.array(1.0), settings)[
             0
         ].params.actor
         for scale in (1.0, 1e-3, 1e3)
@@ -156,7 +157,7 @@ def test_an_update_against_plain_numpy():
             leaf[place], slope[place] = kept, (ends[0] - ends[1]) / 2e-5
     norm = np.sqrt(sum((slope**2).sum() for slope in gradient))
     assert norm > 0.1
-    after, _ = ppo.update(state, rollout, jax.random.key(1), jnp.array(0.5), settings)
+    after, _ = update(state, rollout, jax.random.key(1), jnp.array(0.5), settings)
     mean, square = (jax.tree.leaves(getattr(after.optimizer[0], name)) for name in ("mu", "nu"))
     new = jax.tree.leaves(after.params)
     for slope, leaf, m, v, moved in zip(gradient, old, mean, square, new, strict=True):
@@ -172,11 +173,11 @@ def test_how_far_an_update_moves_the_policy_is_measured():
     settings = PPOSettings(hidden=(16,), minibatch_size=24, epochs=1, learning_rate=0.05)
     state, rollout = state_of(settings=settings), rollout_of()
     batch, left = ppo.prepare(state, rollout, settings)[0], jnp.array(1.0)
-    after, first = ppo.update(state, rollout, jax.random.key(1), left, settings)
+    after, first = update(state, rollout, jax.random.key(1), left, settings)
     assert float(first["actor/approx_kl"]) == pytest.approx(0, abs=1e-6)
     assert float(first["actor/clip_fraction"]) == 0
     twice = settings.model_copy(update={"epochs": 2})
-    _, both = ppo.update(state, rollout, jax.random.key(1), left, twice)
+    _, both = update(state, rollout, jax.random.key(1), left, twice)
     log = np.asarray(after.params.actor.log_probability(batch.observation, batch.action) - batch.log_probability)
     assert float(both["actor/approx_kl"]) == pytest.approx((np.exp(log) - 1 - log).mean() / 2, rel=1e-3)
     beyond = (np.abs(np.exp(log) - 1) > 0.2).mean()
@@ -187,9 +188,9 @@ def test_how_far_an_update_moves_the_policy_is_measured():
 def test_annealing_ends_at_rest():
     settings = PPOSettings(hidden=(16,), minibatch_size=8, epochs=1, anneal=True)
     state = state_of(settings=settings)
-    after, _ = ppo.update(state, rollout_of(), jax.random.key(1), jnp.array(0.0), settings)
+    after, _ = update(state, rollout_of(), jax.random.key(1), jnp.array(0.0), settings)
     assert jax.tree.all(jax.tree.map(jnp.array_equal, after.params, state.params))
-    after, _ = ppo.update(state, rollout_of(), jax.random.key(1), jnp.array(1.0), settings)
+    after, _ = update(state, rollout_of(), jax.random.key(1), jnp.array(1.0), settings)
     assert not jax.tree.all(jax.tree.map(jnp.array_equal, after.params, state.params))
 
 
@@ -208,7 +209,7 @@ def test_must_learn_to_follow(discrete):
         reward = reward_of(observation, action)
         ends = jnp.ones((1, 256))
         rollout = Rollout(observation, action, reward, observation, 1 - ends, ends)
-        return ppo.update(state, rollout, keys[2], jnp.array(1.0), settings)[0]
+        return update(state, rollout, keys[2], jnp.array(1.0), settings)[0]
 
     def reward_of(observation, action):
         if discrete:
@@ -225,7 +226,7 @@ def test_must_learn_to_follow(discrete):
 def test_values_may_move_from_what_the_critic_said():
     """The anchor of the value clip is the critic's own output, whatever unit the newest returns give it."""
     settings = PPOSettings(hidden=(8,))
-    state = ppo.init(jax.random.key(0), 3, 2, False, settings)
+    state = init(jax.random.key(0), 3, 2, False, settings)
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(2, 6, 4, 3)).astype(np.float32)
     action, reward = rng.normal(size=(6, 4, 2)).astype(np.float32), 100 + rng.normal(size=(6, 4)).astype(np.float32)
@@ -265,7 +266,7 @@ def test_agents_that_are_not_there_change_nothing(discrete, normalise):
     state = state_of(discrete, settings)
     with_all = jnp.ones((6, 4))
     found = [
-        ppo.update(state, given, jax.random.key(1), jnp.array(1.0), settings)
+        update(state, given, jax.random.key(1), jnp.array(1.0), settings)
         for given in (rollout, rollout._replace(mask=with_all), padded(rollout))
     ]
     for other in found[1:]:
@@ -291,8 +292,8 @@ def test_what_follows_an_agents_last_step_does_not_reach_back():
 
 def test_what_an_unavailable_choice_is_worth_teaches_nothing():
     """The gradient does not know of logits that were not there."""
-    state, rollout = ppo.init(jax.random.key(0), 3, 2, True, SETTINGS), rollout_of()
+    state, rollout = init(jax.random.key(0), 3, 2, True, SETTINGS), rollout_of()
     only = rollout.action > 0
-    after, measured = ppo.update(state, rollout._replace(available=only), jax.random.key(1), jnp.array(1.0), SETTINGS)
+    after, measured = update(state, rollout._replace(available=only), jax.random.key(1), jnp.array(1.0), SETTINGS)
     assert jax.tree.all(jax.tree.map(jnp.array_equal, after.params.actor, state.params.actor))
     assert float(measured["actor/entropy"]) == 0

@@ -23,7 +23,8 @@ def worked() -> QMIX:
 
 
 def small(seed=0, monotonic=True) -> QMIX:
-    return qmix.init(jax.random.key(seed), 2, 2, 3, 2, SETTINGS.model_copy(update={"monotonic": monotonic}))
+    settings = SETTINGS.model_copy(update={"monotonic": monotonic})
+    return jax.jit(qmix.init, static_argnums=(1, 2, 3, 4, 5))(jax.random.key(seed), 2, 2, 3, 2, settings)
 
 
 def same(a, b) -> bool:
@@ -56,7 +57,7 @@ def test_unavailable_actions_are_not_what_would_be_done():
 
 
 def test_loss_and_gradient():
-    loss, gradient = jax.value_and_grad(qmix.loss, has_aux=True)(
+    loss, gradient = jax.jit(jax.value_and_grad(qmix.loss, has_aux=True), static_argnums=3)(
         worked().online, worked().target, sequences(), SETTINGS
     )
     assert float(loss[0]) == pytest.approx(PINNED["loss"], rel=1e-6)
@@ -69,7 +70,7 @@ def test_an_update():
     assert float(metrics["critic/loss"]) == pytest.approx(PINNED["loss"], rel=1e-6)
     value = (np.asarray(PINNED["lambda_return"]) * mask).sum() / mask.sum()
     assert float(metrics["critic/value"]) == pytest.approx(value, rel=1e-5)
-    again, _ = qmix.loss(after.online, after.target, sequences(), SETTINGS)
+    again, _ = jax.jit(qmix.loss, static_argnums=3)(after.online, after.target, sequences(), SETTINGS)
     assert float(again) == pytest.approx(PINNED["loss_after"], rel=1e-6)
 
 
@@ -233,7 +234,7 @@ def test_vdn_learns_the_agents_alone():
     total = jnp.sum(value[:, :-1] * sequences().action, axis=(-2, -1))
     vdn = SETTINGS.model_copy(update={"monotonic": False})
     error = sequences().mask * (total - qmix.targets(state.target, value, sequences(), vdn)) ** 2
-    _, metrics = qmix.update(state, sequences(), STAY, vdn)
+    _, metrics = jax.jit(qmix.update, static_argnums=3)(state, sequences(), STAY, vdn)
     assert float(metrics["critic/loss"]) == pytest.approx(float(error.sum() / 2 / 5), rel=1e-5)
 
 

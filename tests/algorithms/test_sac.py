@@ -12,11 +12,12 @@ from lare.networks import MLP
 from twins import forward, transitions
 
 SETTINGS = SACSettings(hidden=(8, 8), temperature=0.5)
+init, update = jax.jit(sac.init, static_argnums=(1, 2, 3)), jax.jit(sac.update, static_argnums=4)
 
 
 @pytest.fixture(scope="module")
 def state():
-    return sac.init(jax.random.key(0), 3, 2, SETTINGS)
+    return init(jax.random.key(0), 3, 2, SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +83,7 @@ def test_the_temperature_follows_the_entropy(state, batch, log_sigma, entropy, f
     last = jax.tree.map(lambda leaf: jnp.array([0.0, 0, log_sigma, log_sigma]) if leaf.shape == (4,) else leaf, last)
     actor = eqx.tree_at(lambda actor: actor.layers[-1], state.online.actor, last)
     start = state._replace(online=state.online._replace(actor=actor))
-    after, measured = sac.update(start, batch, jax.random.key(2), jnp.array(0), SETTINGS)
+    after, measured = update(start, batch, jax.random.key(2), jnp.array(0), SETTINGS)
     assert float(measured["actor/entropy"]) == pytest.approx(entropy, abs=0.3)
     assert float(measured["actor/temperature"]) == pytest.approx(0.5)
     change = float(after.online.log_temperature - state.online.log_temperature)
@@ -93,7 +94,7 @@ def test_the_policy_descends_its_loss(state, batch):
     """alpha log pi - min Q, at the same noise, is smaller after a step than before."""
     key = jax.random.split(jax.random.key(2))[1]
     fast = SACSettings(hidden=(8, 8), learning_rate=1e-3)
-    after, _ = sac.update(state, batch, jax.random.key(2), jnp.array(0), fast)
+    after, _ = update(state, batch, jax.random.key(2), jnp.array(0), fast)
 
     def loss(actor):
         action, log_pi = sac.sample(actor, batch.observation, key)

@@ -11,11 +11,12 @@ from lare.algorithms.table import DDPG
 from twins import forward, transitions
 
 SETTINGS = TD3Settings(hidden=(8, 8), batch_size=16)
+init, update = jax.jit(td3.init, static_argnums=(1, 2, 3)), jax.jit(td3.update, static_argnums=4)
 
 
 @pytest.fixture(scope="module")
 def state():
-    return td3.init(jax.random.key(0), 3, 2, SETTINGS)
+    return init(jax.random.key(0), 3, 2, SETTINGS)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,7 @@ def test_policy_and_targets_wait_for_their_turn(state, batch):
 
 
 def test_critic_loss_is_the_sum_of_both_squared_errors(state, batch):
-    _, metrics = td3.update(state, batch, jax.random.key(2), jnp.array(0), SETTINGS)
+    _, metrics = update(state, batch, jax.random.key(2), jnp.array(0), SETTINGS)
     y = np.asarray(td3.target_values(state.target, batch, jax.random.key(2), SETTINGS))
     x = np.concatenate([batch.observation, batch.action], axis=1)
     want = sum(((forward(one_of(state.online.critics, i), x)[:, 0] - y) ** 2).mean() for i in range(2))
@@ -90,12 +91,12 @@ def test_networks_start_as_published(state):
 
 def test_ddpg_is_one_critic_without_noise_or_delay(batch):
     settings = DDPG.model_copy(update={"hidden": (8, 8)})
-    start = td3.init(jax.random.key(0), 3, 2, settings)
+    start = init(jax.random.key(0), 3, 2, settings)
     assert {leaf.shape[0] for leaf in jax.tree.leaves(start.online.critics)} == {1}
     y = td3.target_values(start.target, batch, jax.random.key(1), settings)
     action = np.tanh(forward(start.target.actor, np.asarray(batch.next_observation)))
     x = np.concatenate([batch.next_observation, action], axis=1)
     future = forward(one_of(start.target.critics, 0), x)[:, 0]
     np.testing.assert_allclose(y, batch.reward + 0.99 * batch.continues * future, rtol=1e-5, atol=1e-6)
-    after, _ = td3.update(start, batch, jax.random.key(2), jnp.array(0), settings)
+    after, _ = update(start, batch, jax.random.key(2), jnp.array(0), settings)
     assert not jax.tree.all(jax.tree.map(jnp.array_equal, after.target, start.target))

@@ -1,5 +1,7 @@
 """What is explained, by which factor, and what is missing: on episodes whose score is known."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,11 +42,22 @@ def means_of(values, length):
 
 def summed_over(basis, u, length, paid, form=0):
     """The sums over the episodes, and those over the steps."""
-    features = np.asarray(expand(basis, jnp.asarray(u)))
+    features = np.asarray(expanded(basis, u))
     returns = means_of(paid, length) * (1 if form else length)
-    given = (jnp.asarray(part) for part in (means_of(features, length), returns, length))
-    steps = add_steps(no_steps(basis), jnp.asarray(features), jnp.ones(len(u), bool), basis)
-    return evidence.add_episodes(evidence.no_sums(basis.size), *given), steps
+    return of_episodes(means_of(features, length), returns, length), of_steps(features, basis)
+
+
+expanded = jax.jit(expand, static_argnums=0)
+
+
+@jax.jit
+def of_episodes(means, returns, length):
+    return evidence.add_episodes(evidence.no_sums(means.shape[1]), means, returns, length)
+
+
+@partial(jax.jit, static_argnums=1)
+def of_steps(features, basis):
+    return add_steps(no_steps(basis), features, jnp.ones(len(features), bool), basis)
 
 
 @pytest.mark.parametrize("extended", [False, True])

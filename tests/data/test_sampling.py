@@ -17,6 +17,20 @@ ENV = EnvSpec(
 )
 CONFIG = config_of("rd", env=ENV, environments=ENVS)
 
+sample_transitions, sample_episodes, sample_distinct_episodes, sample_steps = (
+    jax.jit(function, static_argnums=2)
+    for function in (
+        sampling.sample_transitions,
+        sampling.sample_episodes,
+        sampling.sample_distinct_episodes,
+        sampling.sample_steps,
+    )
+)
+sample_packed, sample_parts, sample_padded = (
+    jax.jit(function, static_argnums=(2, 3, 4))
+    for function in (sampling.sample_packed, sampling.sample_parts, sampling.sample_padded)
+)
+
 
 @pytest.fixture(scope="module")
 def held():
@@ -38,7 +52,7 @@ def where(held, index):
 
 
 def test_transitions_of_all_environments_are_drawn_alike(held):
-    index = sampling.sample_transitions(held, jax.random.key(0), (200, 500))
+    index = sample_transitions(held, jax.random.key(0), (200, 500))
     total = int(replay.size(held).sum())
     assert replay.size(held).tolist() == [41, 50, 46]
     share = np.bincount(where(held, index).ravel(), minlength=total) / 100_000 * total
@@ -47,7 +61,7 @@ def test_transitions_of_all_environments_are_drawn_alike(held):
 
 
 def test_episodes_of_all_environments_are_drawn_alike(held):
-    drawn = sampling.sample_episodes(held, jax.random.key(0), (30_000,))
+    drawn = sample_episodes(held, jax.random.key(0), (30_000,))
     assert replay.finished(held).tolist() == [5, 6, 6]
     places, counts = np.unique(np.stack(drawn.first, axis=1), axis=0, return_counts=True)
     assert len(places) == 17
@@ -56,7 +70,7 @@ def test_episodes_of_all_environments_are_drawn_alike(held):
 
 
 def test_drawn_episodes_are_whole_and_finished(held):
-    drawn = jax.tree.map(np.asarray, sampling.sample_episodes(held, jax.random.key(0), (50,)))
+    drawn = jax.tree.map(np.asarray, sample_episodes(held, jax.random.key(0), (50,)))
     place, longest = np.arange(12), max(LENGTHS)
     assert drawn.length.max() == longest == len(place)
     env, number = np.broadcast_arrays(drawn.first.env[:, None], drawn.first.number[:, None] + place)
@@ -71,7 +85,7 @@ def test_drawn_episodes_are_whole_and_finished(held):
 
 @pytest.mark.parametrize("count", [1, 6, 17, 40])
 def test_distinct_episodes_have_no_repeats(held, count):
-    draw = jax.jit(lambda key: sampling.sample_distinct_episodes(held, key, count))
+    draw = jax.jit(lambda key: sample_distinct_episodes(held, key, count))
     every = np.stack(
         sampling.episodes_at(held, sampling.one_of(replay.finished(held), jax.random.key(0), (999,))).first
     )
@@ -91,10 +105,10 @@ def test_distinct_episodes_have_no_repeats(held, count):
 
 def test_drawing_from_nothing_gives_something_that_counts_for_nothing():
     nothing, key = untrained(CONFIG).replay, jax.random.key(0)
-    np.testing.assert_array_equal(sampling.sample_transitions(nothing, key, (3,)).number, 0)
-    np.testing.assert_array_equal(sampling.sample_episodes(nothing, key, (3,)).mask, 0)
-    np.testing.assert_array_equal(sampling.sample_distinct_episodes(nothing, key, 3).mask, 0)
-    np.testing.assert_array_equal(sampling.sample_packed(nothing, key, 2, 24, 12).episodes.mask, 0)
+    np.testing.assert_array_equal(sample_transitions(nothing, key, (3,)).number, 0)
+    np.testing.assert_array_equal(sample_episodes(nothing, key, (3,)).mask, 0)
+    np.testing.assert_array_equal(sample_distinct_episodes(nothing, key, 3).mask, 0)
+    np.testing.assert_array_equal(sample_packed(nothing, key, 2, 24, 12).episodes.mask, 0)
 
 
 def one(draw):
@@ -105,7 +119,7 @@ def one(draw):
 @jax.jit
 def packed(held, key):
     """An update on about 24 steps, of episodes of 12 at most."""
-    return sampling.sample_packed(held, key, 1, 24, 12)
+    return sample_packed(held, key, 1, 24, 12)
 
 
 @pytest.mark.parametrize("key", range(4))
@@ -127,7 +141,7 @@ def test_packed_episodes_are_whole_and_masked_never_padded(key, envs):
 def test_as_many_packed_episodes_as_the_steps_are_on_average():
     """Mean length 8.2: 60 steps are 7 episodes, and the rows hold no more than 60."""
     held, found = stored(CONFIG).replay, []
-    draws = sampling.sample_packed(held, jax.random.key(0), 8, 60, 12)
+    draws = sample_packed(held, jax.random.key(0), 8, 60, 12)
     for length, mask in zip(np.asarray(draws.episodes.length), np.asarray(draws.episodes.mask), strict=True):
         fits = np.cumsum(length)[:7] <= 60
         np.testing.assert_array_equal(mask, [*fits, *[0] * (60 - 7)])
@@ -138,7 +152,7 @@ def test_as_many_packed_episodes_as_the_steps_are_on_average():
 @pytest.mark.parametrize("envs", [1, 3])
 def test_parts_of_episodes_stay_inside_them(envs):
     held = stored(config_of("rrdu", env=ENV, environments=envs)).replay
-    drawn = sampling.sample_parts(held, jax.random.key(0), 7, 6, 4)
+    drawn = sample_parts(held, jax.random.key(0), 7, 6, 4)
     first, length, env = (
         np.repeat(np.asarray(part), 4, axis=1)
         for part in (drawn.episodes.first.number, drawn.episodes.length, drawn.episodes.first.env)
@@ -154,7 +168,7 @@ def test_parts_of_episodes_stay_inside_them(envs):
 
 
 def test_padded_episodes_are_whole_and_repeat_their_end():
-    drawn = sampling.sample_padded(stored(CONFIG).replay, jax.random.key(0), 5, 8, 12)
+    drawn = sample_padded(stored(CONFIG).replay, jax.random.key(0), 5, 8, 12)
     steps = np.asarray(drawn.steps.number).reshape(5 * 8, 12)
     first, length = (np.asarray(part).ravel() for part in (drawn.episodes.first.number, drawn.episodes.length))
     for row, begin, count in zip(steps, first, length, strict=True):
@@ -166,7 +180,7 @@ def test_padded_episodes_are_whole_and_repeat_their_end():
 @given(st.lists(st.integers(1, 40), min_size=6, max_size=6), st.sampled_from([1, 2, 5, 12]), st.integers(0, 1000))
 @settings(max_examples=15, deadline=None)
 def test_steps_are_drawn_without_replacement_and_all_of_them_where_there_are_too_few(lengths, drawn, seed):
-    steps = np.asarray(sampling.sample_steps(jax.random.key(seed), jnp.asarray(lengths), drawn))
+    steps = np.asarray(sample_steps(jax.random.key(seed), jnp.asarray(lengths), drawn))
     assert steps.shape == (len(lengths), drawn)
     for length, row in zip(lengths, steps, strict=True):
         assert row.min() >= 0
@@ -178,13 +192,13 @@ def test_steps_are_drawn_without_replacement_and_all_of_them_where_there_are_too
 
 @pytest.mark.parametrize(("length", "drawn"), [(6, 3), (6, 6)])
 def test_every_step_is_drawn_equally_often(length, drawn):
-    steps = sampling.sample_steps(jax.random.key(1), jnp.full(20_000, length), drawn)
+    steps = sample_steps(jax.random.key(1), jnp.full(20_000, length), drawn)
     share = np.bincount(np.asarray(steps).ravel(), minlength=length) / steps.size
     np.testing.assert_allclose(share, 1 / length, atol=0.01)
 
 
 def test_every_pair_of_steps_is_drawn_equally_often():
-    steps = np.sort(np.asarray(sampling.sample_steps(jax.random.key(2), jnp.full(30_000, 5), 2)), axis=1)
+    steps = np.sort(np.asarray(sample_steps(jax.random.key(2), jnp.full(30_000, 5), 2)), axis=1)
     share = np.bincount(steps[:, 0] * 5 + steps[:, 1], minlength=25) / len(steps)
     np.testing.assert_allclose(share[share > 0], 0.1, atol=0.01)
     assert (share > 0).sum() == 10

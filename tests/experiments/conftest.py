@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from lare.experiments import statistics
 from lare.run.decide import decide
 from lare.run.directory import Run, describe
 from lare.run.settings import Settings
@@ -30,3 +31,9 @@ def made(tmp_path):
         return Run(directory, config, ())
 
     return make
+
+
+@pytest.fixture(autouse=True)
+def few_bootstrap_samples(monkeypatch):
+    """Two thousand of them take seconds; tests of the intervals themselves ask for more."""
+    monkeypatch.setattr(statistics, "REPETITIONS", 50)
