@@ -54,8 +54,8 @@ def said(returns, random=CHANCE, task="Toy", **facts):
                 "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from raw entries, explain nearly all of the score: R² of the last returns, before they were "
                 "learned from, is 0.90.",
-                "The proxy rewards are good, so the algorithm is the limit. Next: more `--steps`, or another `--algorithm` "
-                "(`lare algorithms`).",
+                "The proxy rewards predict returns well, so the algorithm may be the limit. Next: more `--steps`, or another "
+                "`--algorithm` (`lare algorithms`).",
                 "If state and action have more than 12 entries together, a score that depends on products of them, such as price "
                 "times power, needs a phi (`lare prompt`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",

@@ -200,7 +200,7 @@ def todo(run: Facts) -> list[str]:
     elif len(run.random) and not has_learned(run):
         good = (run.return_r2 or 0) > MOSTLY
         found.append(
-            ("The proxy rewards are good, so the algorithm is the limit. " if good else "")
+            ("The proxy rewards predict returns well, so the algorithm may be the limit. " if good else "")
             + "Next: more `--steps`, or another `--algorithm` (`lare algorithms`)."
         )
         if good and not run.latent:
