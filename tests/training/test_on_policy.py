@@ -203,7 +203,7 @@ def test_agents_that_have_left_change_nothing():
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize(("algorithm", "env"), [long("ppo", ALONE), ("ippo", RIVALS)])
+@pytest.mark.parametrize(("algorithm", "env"), [("ppo", ALONE), long("ippo", RIVALS)])
 def test_seeds_in_lockstep_are_seeds_alone(algorithm, env):
     config = config_of("lare-rd", algorithm, env, rollout_steps=TOTAL, environments=2)
     functions = compiled(config)
