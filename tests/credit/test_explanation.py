@@ -115,6 +115,16 @@ def test_an_entry_that_never_varies_goes_with_nothing():
     assert float(explain(sums._replace(products=products), steps, 0, basis).left[1]) == 0
 
 
+def test_a_factor_whose_mean_is_the_same_in_all_episodes_is_told_apart():
+    """Although it varies within them, returns cannot tell what it pays. Rounding is no difference."""
+    basis, random = Basis(2, 0, extended=False), np.random.default_rng(0)
+    length = np.full(40, 8)
+    u = random.normal(size=(320, 2))
+    u[:, 1] = np.tile([1.0, 1, 1, -1, -1, -1, -1, 1], 40) + 1e-9 * u[:, 0]
+    found = explain(*summed_over(basis, u, length, u @ [1.0, 1.0]), 0, basis)
+    assert found.varied.tolist() == [True, False]
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_of_few_episodes_nothing_is_said(count):
     basis = Basis(1, 1, extended=False)

@@ -129,7 +129,8 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             [
                 "The factors explain 99% of the variation of the returns of 40 episodes.",
                 SHARES,
-                "- speed: 99%, +1 ± 0.1 (before: +1 ± 0.1; after: it has never varied)",
+                "- speed: 99%, +1 ± 0.1 (before: +1 ± 0.1; after: its mean is the same in all episodes, so returns do not tell "
+                "what it pays)",
             ],
         ),
         (

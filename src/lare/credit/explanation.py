@@ -37,6 +37,8 @@ from lare.credit.evidence import Posterior, Sums
 
 ROUNDS = 100
 """Maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
+SAME = 1e-5
+"""Episode means of a standardised factor that deviate by less than this are the same: they differ by rounding."""
 SHAPED = 1 + 2 * FREQUENCIES
 """The number of features that a factor has alone: itself and its shapes."""
 
@@ -56,14 +58,14 @@ class Explanation(NamedTuple):
     of_steps: Bool[Array, ""]
     """Whether the shares are of the variation of R/T, not of R: the score is a sum, and episodes differ in length."""
     varied: Bool[Array, " factors"]
-    """Whether a factor has differed between steps."""
+    """Whether a factor's mean has differed between episodes by more than rounding."""
     by_factors: Float[Array, ""]
     """Share of the returns' variation that the factors explain, with their shapes and pairs; 0 if there are no factors."""
     by_all: Float[Array, ""]
     """Share of the variation that factors and raw entries explain together."""
     slope: Float[Array, " factors"]
     """How much a step's reward rises if a factor rises by one standard deviation: the slope of the line that is closest to its
-    effect in the fit on factors; 0 if it has never varied. If the score is an average: the rise for a step of an episode of
+    effect in the fit on factors; 0 if its mean has not varied. If the score is an average: the rise for a step of an episode of
     average length."""
     uncertainty: Float[Array, "factors factors"]
     """Posterior covariance of `slope`."""
@@ -127,7 +129,7 @@ def explain(sums: Sums, steps: Steps, form: Int[Array, ""] | int, basis: Basis) 
     return Explanation(
         sums.episodes,
         of_steps,
-        jnp.diagonal(given.s)[: basis.factors] > 0,
+        jnp.diagonal(given.s)[: basis.factors] > SAME**2 * sums.steps,
         by_factors,
         jnp.maximum(by_all, by_factors),
         slope / length,

@@ -70,12 +70,15 @@ def factor_lines(found: Explanation, names: list[str]) -> list[str]:
     return lines
 
 
+SAME_MEAN = "its mean is the same in all episodes, so returns do not tell what it pays"
+
+
 def factor_line(found: Explanation, name: str, places: list[int]) -> str:
     """The line on a factor that has one place or two: before and after the step."""
     varied = [place for place in places if found.varied[place]]
     if not varied:
-        return f"- {name}: it has never varied"
-    effects = [effect(found, [place]) if place in varied else "it has never varied" for place in places]
+        return f"- {name}: {SAME_MEAN}"
+    effects = [effect(found, [place]) if place in varied else SAME_MEAN for place in places]
     parts = f" (before: {effects[0]}; after: {effects[1]})" if len(places) == 2 else ""
     remark = next((said for place in varied if (said := form_of_effect(found, place))), "")
     return f"- {name}: {found.share[varied].sum():z.0%}, {effect(found, varied)}{parts}{remark}"

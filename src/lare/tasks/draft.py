@@ -47,7 +47,8 @@ def warning(
     left_out: Sequence[str], origin: str = "the documentation of the environment", unused: Sequence[str] = ()
 ) -> list[str]:
     sections = [f"# Sections that were not used: {', '.join(unused)}."] if unused else []
-    fewer = [f"# Left out on purpose: {len(left_out)} sentences or rows with words such as reward, cost or score."]
+    some = "1 sentence or row" if len(left_out) == 1 else f"{len(left_out)} sentences or rows"
+    fewer = [f"# Left out on purpose: {some} with words such as reward, cost or score."]
     return [
         f"# A first draft, from {origin}. Read it before you use it: a language model will",
         "# know only these texts.",
