@@ -44,19 +44,19 @@ def summed_over(basis, u, length, paid, form=0):
     """The sums over the episodes, and those over the steps."""
     features = np.asarray(expanded(basis, u))
     returns = means_of(paid, length) * (1 if form else length)
-    return of_episodes(means_of(features, length), returns, length), of_steps(features, basis)
+    return over_episodes(means_of(features, length), returns, length), over_steps(features, basis)
 
 
 expanded = jax.jit(expand, static_argnums=0)
 
 
 @jax.jit
-def of_episodes(means, returns, length):
+def over_episodes(means, returns, length):
     return evidence.add_episodes(evidence.no_sums(means.shape[1]), means, returns, length)
 
 
 @partial(jax.jit, static_argnums=1)
-def of_steps(features, basis):
+def over_steps(features, basis):
     return add_steps(no_steps(basis), features, jnp.ones(len(features), bool), basis)
 
 

@@ -145,6 +145,10 @@ def test_methods_with_different_functions_are_named(made):
         for draw, digest in enumerate("ab")
     ]
     assert differing(draws) == []
+    another = [
+        of(method, 8 * digest, f"more{digest}", draw=1) for method, digest in (("lare-bayes", "c"), ("lare-rd", "d"))
+    ]
+    assert differing([recorded, own, *another])[1:] == ["phi on Chase (cccccccc: lare-bayes; dddddddd: lare-rd)"]
     assert differing([recorded, of("llm-reward", 8 * "b", 3)]) == []
     assert differing([recorded, of("lare-bayes", 8 * "b", 4)]) == []  # rows of their own, named after them
 

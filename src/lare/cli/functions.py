@@ -191,8 +191,8 @@ def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes:
     if math.isfinite(found.r2):
         say(
             f"Returns of episodes not seen yet, predicted by the factors: R² = {r2_shown(found.r2)} (1: exactly; 0: no better than "
-            "their mean). Each was predicted from the episodes before it, of which the first ones had few: if the factors are "
-            "right, R² rises with more episodes."
+            "their mean). LaRe predicted each return from the episodes before it. The first predictions had few such episodes: if "
+            "the factors are right, R² rises with more."
         )
         if found.r2_of_lengths is not None:
             say(

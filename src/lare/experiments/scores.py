@@ -106,9 +106,13 @@ def by_function(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
         return {label: list(runs)}
     found: dict[str, list[Run]] = {}
     for run in runs:
-        name = " ".join(digest[:8] for digest in run.config.function_sha256)
-        found.setdefault(f"{label}, phi {name}", []).append(run)
+        found.setdefault(f"{label}, phi {functions_of(run)}", []).append(run)
     return found
+
+
+def functions_of(run: Run) -> str:
+    """A short name for a run's latent functions."""
+    return " ".join(digest[:8] for digest in run.config.function_sha256)
 
 
 def by_directory(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
@@ -167,15 +171,14 @@ def other_functions(runs: Sequence[Run]) -> list[str]:
     for run in runs:
         settings, task = run.config.settings, run.config.task.name
         if (method := find_method(settings.method)).latent:
-            name = " ".join(digest[:8] for digest in run.config.function_sha256)
             place = task, method.kind, settings.draw, settings.candidates
-            found.setdefault(place, {}).setdefault(name, {})[method.name] = None
-    told = {
-        task: "; ".join(f"{name}: {', '.join(methods)}" for name, methods in names.items())
+            found.setdefault(place, {}).setdefault(functions_of(run), {})[method.name] = None
+    told = [
+        (task, "; ".join(f"{name}: {', '.join(methods)}" for name, methods in names.items()))
         for (task, *_), names in found.items()
         if len({tuple(methods) for methods in names.values()}) > 1
-    }
-    return [f"phi on {task} ({names})" for task, names in told.items()]
+    ]
+    return [f"phi on {task} ({names})" for task, names in told]
 
 
 def grouped(runs: Mapping[str, Sequence[Run | Measured]], key: str) -> tuple[list[Group], tuple[str, ...]]:
