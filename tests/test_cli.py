@@ -9,6 +9,7 @@ import pytest
 
 from lare import cli
 from lare.algorithms.table import ALGORITHMS
+from lare.cli.runs import when_saved
 from lare.credit.methods import METHODS
 from lare.latent.verification.checks import CHECKS
 from lare.llm.prompts import candidate
@@ -414,6 +415,18 @@ def test_help_names_the_type_of_an_option_that_may_be_left_out(command):
         assert f" {option} " in out
 
 
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        (5_000, "the policy of step 5,000, before its first update"),
+        (10_000, "the policy of step 10,000, before its first update"),
+        (15_000, "the policy of step 15,000"),
+    ],
+)
+def test_a_policy_that_was_saved_before_it_was_trained_is_named(step, said):
+    assert when_saved(step, warmup=10_000) == said
+
+
 def test_from_training_to_report(command, spec_file, phi):
     run = Path("runs/Chase-lare-linear-td3-s0")
     status, out, _ = command("train", spec_file(), *TINY, "--function", phi)
@@ -427,6 +440,8 @@ def test_from_training_to_report(command, spec_file, phi):
     evaluated, by_chance = out.splitlines()
     assert re.fullmatch(r"seed 0: return -\S+ ± \S+ over 2 episodes", evaluated)
     assert re.fullmatch(r"random actions: return -\S+ ± \S+ over 10 episodes", by_chance)
+    _, out, _ = command("evaluate", run, "--episodes", 2, "--best")
+    assert re.match(r"seed 0: return -\S+ ± \S+ over 2 episodes \(the policy of step [12]00", out)
 
     assert command("report", run) == (0, f"wrote {run / 'report.html'}\n", "")
     assert "f_near" in (run / "report.html").read_text(encoding="utf-8")

@@ -149,6 +149,28 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             ],
         ),
         (
+            FLAT - 1000,
+            {"saturated": 1},
+            [
+                "It got worse than random actions. The return is -949 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
+                "Next: the policy chooses the same action in every state, with each entry at a bound. More `--steps` alone will "
+                "not change that. Bring observations to about -1 to 1, or try another `--algorithm` (`lare algorithms`), or more "
+                "random steps at first.",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
+            ],
+        ),
+        (
+            np.vstack([FLAT - 1000, FLAT - 1000]),
+            {"saturated": 1},
+            [
+                "It got worse than random actions. The return is -949 after 8,000 steps (mean over 2 seeds); random actions get 0 "
+                "± 1 in 3 episodes.",
+                "Next: the policy chooses the same action in every state with 1 of 2 seeds, with each entry at a bound. More "
+                "`--steps` alone will not change that. Bring observations to about -1 to 1, or try another `--algorithm` "
+                "(`lare algorithms`), or more random steps at first.",
+            ],
+        ),
+        (
             np.vstack([FLAT - 50, FLAT - 50]),
             {"return_r2": -0.93, "usual_r2": 0.98, "latent": True},
             [

@@ -7,7 +7,7 @@ from gymnasium.spaces import Box
 
 import lare
 from lare.training import session as sessions
-from lare.training.advice import of_actions, of_returns
+from lare.training.advice import SATURATION, of_returns, of_saturation, saturation
 from toys import Chase, Ear, toy_spec
 
 
@@ -71,17 +71,18 @@ STUCK = np.full((1, 4, 2), [[1.0, -0.995]])
 
 
 @pytest.mark.parametrize(
-    ("actions", "whose"),
+    ("actions", "shares", "whose"),
     [
-        (STUCK, "The policy chooses"),
-        (np.concatenate([STUCK * 0.5, STUCK]), "The policy of seed 4 chooses"),
-        (np.concatenate([STUCK, -STUCK, STUCK * 0.5]), "The policy of seeds 3, 4 chooses"),
-        (STUCK * [1.0, 0.9], None),  # one entry is not at a bound
-        (STUCK * [[1.0], [1.0], [-1.0], [1.0]], None),  # from one bound to the other
+        (STUCK, [1.0], "The policy chooses"),
+        (np.concatenate([STUCK * 0.5, STUCK]), [0.0, 1.0], "The policy of seed 4 chooses"),
+        (np.concatenate([STUCK, -STUCK, STUCK * 0.5]), [1.0, 1.0, 0.0], "The policy of seeds 3, 4 chooses"),
+        (STUCK * [1.0, 0.9], [0.5], None),  # one entry is not at a bound
+        (STUCK * [[1.0], [1.0], [-1.0], [1.0]], [0.0], None),  # from one bound to the other
     ],
 )
-def test_a_policy_at_its_bounds(actions, whose):
-    said = of_actions(actions, range(3, 3 + len(actions)))
+def test_a_policy_at_its_bounds(actions, shares, whose):
+    assert list(saturation(actions)) == shares
+    said = of_saturation(shares, range(3, 3 + len(actions)))
     assert [line.partition(" the same action")[0] for line in said] == ([] if whose is None else [whose])
 
 
@@ -94,6 +95,7 @@ def test_the_newest_states_are_asked(small, tmp_path):
     newest = int(held.next_row[1, 0]) - np.arange(1, 6)
     seen = np.asarray(held.columns["observation"][1, 0, newest, 0])
     np.testing.assert_allclose(2 * actions[1], lare.policy_of(run, seed=run.seeds[1])(seen), rtol=1e-5)
+    assert session.actions_now(5000).shape == (2, 5000, 1)  # more than are stored: they are repeated
     session.close()
 
 
@@ -101,5 +103,6 @@ def test_a_policy_that_has_not_been_trained_says_nothing(small, tmp_path, monkey
     monkeypatch.setattr(sessions.Session, "actions_now", lambda session, steps: np.ones((1, steps, 1)))
     for steps, count in ((24, 0), (48, 1)):
         ear, settings = Ear(), small(method="dense", algorithm="td3", seeds=1, steps=steps, td3={"warmup": 24})
-        lare.train(toy_spec(), settings, out=tmp_path / str(steps), listeners=[ear])
+        run = lare.train(toy_spec(), settings, out=tmp_path / str(steps), listeners=[ear])
         assert sum(line.startswith("The policy chooses") for line in ear.heard) == count
+        assert [line.get(SATURATION) for line in run.metrics()] == [1.0 if count else None]

@@ -174,7 +174,7 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
         for place, seed in enumerate(opened.seeds):
             named = f"{role.name}, " if len(roles) > 1 else ""
             of_seed = plus_minus(*mean_and_deviation(found.returns[place, :, team]))
-            of_best = "" if since is None else f" (the policy of step {since[place]:,})"
+            of_best = "" if since is None else f" ({when_saved(int(since[place]), opened.config.settings.warmup)})"
             say(f"{named}seed {seed}: return {of_seed} over {counted}{of_best}")
     by_chance = random_play(opened.config.task, max(episodes, RANDOM_EPISODES)) if len(roles) == 1 else []
     if by_chance:
@@ -190,6 +190,11 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
         say(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
     for line in told:
         say(line)
+
+
+def when_saved(step: int, warmup: int) -> str:
+    """The step of a policy, and whether it had been trained by then."""
+    return f"the policy of step {step:,}{', before its first update' if step <= warmup else ''}"
 
 
 def draw_without_a_screen() -> None:

@@ -139,7 +139,7 @@ def cells(comparison: Comparison) -> list[tuple[str, ...]]:
         (
             named(row.label, place),
             str(row.seeds),
-            str(row.draws),
+            str(row.draws) if row.draws > 1 else "-",
             str(row.iqm),
             plus_minus(row.mean, row.deviation),
             "-" if row.over_draws is None else str(row.over_draws),

@@ -32,6 +32,7 @@ from lare.tasks.load import shipped_tasks
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import env_spec
 from lare.tasks.trust import TRUSTED, unknown_module
+from lare.training.advice import SATURATION
 from lare.training.explain import explanation_of
 
 FILM, LARGEST_FILM = "film.gif", 64 << 20
@@ -110,6 +111,7 @@ def verdicts(runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> It
             latent=method.latent,
             untrained=run.untrained,
             before=before_training(run),
+            saturated=saturated(run),
             directory=str(run.directory),
             task=run.config.task.name if run.config.task.name in shipped_tasks() else "TASK.toml",
         )
@@ -133,6 +135,12 @@ def before_training(run: Run) -> float | None:
         if line["step"] <= run.config.settings.warmup and line.get(RETURN) is not None
     ]
     return float(np.mean(found)) if found else None
+
+
+def saturated(run: Run) -> int:
+    """How many seeds' policies choose the same bounds in all states at the end."""
+    found = curve(run, SATURATION)
+    return 0 if found is None else int(np.sum(found[1][:, -1] == 1))
 
 
 def labels(runs: Sequence[Run]) -> list[str]:

@@ -44,6 +44,8 @@ class Facts:
     """Why the policy was never trained; None if it was."""
     before: float | None = None
     """The return of the policy before its first update; None if it was not evaluated."""
+    saturated: int = 0
+    """How many seeds' policies choose the same action, at its bounds, in all states at the end."""
     directory: str = "RUN"
     task: str = "TASK"
     """The name of a shipped task, or a placeholder for a task file, which ends in `.toml`."""
@@ -191,11 +193,10 @@ def todo(run: Facts) -> list[str]:
             f"Next: it was better before, {shown(value)} at step {step:,}. `lare evaluate {run.directory} --best` plays the best "
             "policy of each seed."
         )
-    elif is_stuck(run):
+    elif (why := stuck(run)) is not None:
         found.append(
-            f"Next: it repeats one behaviour: the last {FEW} returns of a seed hardly differ, and those of random actions do. More "
-            "`--steps` alone will not change that. Bring observations to about -1 to 1, or try another `--algorithm` "
-            "(`lare algorithms`), or more random steps at first."
+            f"Next: {why}. More `--steps` alone will not change that. Bring observations to about -1 to 1, or try another "
+            "`--algorithm` (`lare algorithms`), or more random steps at first."
         )
     elif len(run.random) and not has_learned(run):
         good = (run.return_r2 or 0) > MOSTLY
@@ -235,11 +236,16 @@ def is_rising(run: Facts) -> bool:
     return bool(end - before > variation and last[-1] - last[0] > variation / 2)
 
 
-def is_stuck(run: Facts) -> bool:
-    """Whether no seed's return changes any more, compared with those of random actions, and they are no better than these."""
-    if not len(run.random) or run.returns.shape[1] < FEW or better_than_chance(run):
-        return False
-    return bool(np.all(np.ptp(run.returns[:, -FEW:], axis=1) < STUCK * deviation(run.random)))
+def stuck(run: Facts) -> str | None:
+    """Why the policy is known to repeat one behaviour, where it is no better than random actions; None if it is not known to."""
+    if not len(run.random) or better_than_chance(run):
+        return None
+    if run.saturated:
+        seeds = f" with {run.saturated} of {len(run.returns)} seeds" if len(run.returns) > 1 else ""
+        return f"the policy chooses the same action in every state{seeds}, with each entry at a bound"
+    if run.returns.shape[1] < FEW or np.any(np.ptp(run.returns[:, -FEW:], axis=1) >= STUCK * deviation(run.random)):
+        return None
+    return f"it repeats one behaviour: the last {FEW} returns of a seed hardly differ, and those of random actions do"
 
 
 def fell_from(run: Facts) -> tuple[int, float] | None:

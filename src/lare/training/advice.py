@@ -14,7 +14,9 @@ from lare.training.config import TrainConfig
 LARGE = 10.0
 """The largest root mean square of an entry of the observation that needs no remark."""
 ROWS = 1000
-"""So many stored observations of each environment are looked at."""
+"""So many stored observations of an environment are looked at."""
+SATURATION = "actor/saturation"
+"""The metric: see `saturation`."""
 BOUND = 0.99
 """An entry of an action is at a bound if it is larger than this part of it."""
 SAME = 5
@@ -50,18 +52,26 @@ def of_observations(run: Run, held: Replay, config: TrainConfig) -> list[str]:
     ]
 
 
-def of_actions(actions: Float[np.ndarray, "seeds steps action"], seeds: Sequence[int]) -> list[str]:
-    """A remark if a policy chooses the same bounds in all states; else nothing.
+def saturation(actions: Float[np.ndarray, "seeds steps action"]) -> Float[np.ndarray, " seeds"]:
+    """The share of an action's entries that are at the same bound in all states.
 
     Args:
         actions: those of each seed's policy, without noise, in some states; between -1 and 1.
-        seeds: the numbers of the seeds.
     """
     bound = np.where(np.abs(actions) > BOUND, np.sign(actions), 0)
-    constant = np.all((bound != 0) & (bound == bound[:, :1]), axis=(1, 2))
-    if not constant.any():
+    return np.mean((bound[:, 0] != 0) & np.all(bound == bound[:, :1], axis=1), axis=-1)
+
+
+def of_saturation(shares: Sequence[float], seeds: Sequence[int]) -> list[str]:
+    """A remark if a policy chooses the same bounds in all states; else nothing.
+
+    Args:
+        shares: the saturation of each seed's policy.
+        seeds: the numbers of the seeds.
+    """
+    stuck = [str(seed) for seed, share in zip(seeds, shares, strict=True) if share == 1]
+    if not stuck:
         return []
-    stuck = [str(seed) for seed, alike in zip(seeds, constant, strict=True) if alike]
     whose = (
         "The policy"
         if len(seeds) == 1

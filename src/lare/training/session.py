@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, Shaped
 
+from lare.algorithms.settings import OffPolicySettings
 from lare.algorithms.table import ALGORITHMS
 from lare.credit.methods import find_method
 from lare.data import replay
@@ -26,7 +27,7 @@ from lare.run.settings import ResolvedSettings
 from lare.source import source
 from lare.tasks.env import JaxEnv, Timestep
 from lare.tasks.table import env_spec, make_env
-from lare.training import first_fit, renew
+from lare.training import advice, first_fit, renew
 from lare.training.annotate import annotate
 from lare.training.collect_device import DeviceCollector
 from lare.training.collect_host import HostCollector, host_collector
@@ -140,12 +141,17 @@ class Session:
         if len(self.config.env.teams) == 1:
             self.keep_best(evaluation.returns[..., 0].mean(axis=1))
         measured = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest
+        if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
+            measured |= {advice.SATURATION: advice.saturation(self.actions_now(advice.ROWS))}
         return lines(self.run.seeds, self.step, measured, rate)
 
     def actions_now(self, steps: int) -> Float[np.ndarray, "seeds steps action"]:
-        """The actions of an off-policy algorithm's policies, without noise, in the newest states of the first environment."""
+        """The actions of an off-policy algorithm's policies, without noise, in the newest states of the first environment.
+
+        If fewer are stored, they are repeated: the shape, and so the compiled program, is always the same.
+        """
         held = self.learner.replay
-        rows = np.asarray(held.next_row)[:, :1] - 1 - np.arange(min(steps, int(np.min(held.next_row))))
+        rows = np.asarray(held.next_row)[:, :1] - 1 - np.arange(steps) % int(np.min(held.next_row))
         seen = in_first_environment(held.columns["observation"], rows % replay.capacity(held))
         available = np.ones((*rows.shape, 1, self.config.env.action_size), bool)
         action, _ = self.functions.act(self.actor, (), seen, available, None, np.zeros(rows.shape, bool))

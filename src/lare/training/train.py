@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from lare import compilation
-from lare.algorithms.settings import OffPolicySettings
 from lare.credit.closed_form import LARGEST_CHOICE
 from lare.credit.methods import Fit, Method, Reward, find_method
 from lare.errors import LareError, shortened
@@ -260,8 +259,8 @@ def finish(
                     sentences = explanation(session)
                     say(*sentences)
                     explained = bool(sentences)
-                if last and session.step > settings.warmup and isinstance(settings.hyperparameters, OffPolicySettings):
-                    say(*advice.of_actions(session.actions_now(advice.ROWS), run.seeds))
+                if last and advice.SATURATION in lines[0]:
+                    say(*advice.of_saturation([line[advice.SATURATION] for line in lines], run.seeds))
                 if last and not settings.untrained and (why := run.untrained):
                     say(why)
             if model is not None and due(session.step, settings.reflect_every, settings.steps):
