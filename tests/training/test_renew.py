@@ -24,13 +24,15 @@ WRONG = "def evaluation_func(observation, action):\n    return [observation[:, 1
 RIGHT = "def evaluation_func(observation, action):\n    return [np.square(action - observation[:, 0:1]), action]"
 
 
-@pytest.fixture(autouse=True)
-def without_pairs(monkeypatch):
+@pytest.fixture(autouse=True, scope="module")
+def without_pairs():
     """With pairs of entries, raw features nearly make up for the first function."""
-    monkeypatch.setattr("lare.credit.basis.MOST_PAIRED", 0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lare.credit.basis.MOST_PAIRED", 0)
+        yield
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def settings(small):
     changes = {"steps": 1800, "seeds": 2, "evaluate_every": 300, "reflect_every": 600}
     return small(method="lare-bayes", algorithm="td3", **changes)
@@ -41,9 +43,15 @@ def trained(settings, model, out, listeners=()):
     return lare.train(task, settings, function=verified(WRONG, task), model=model, out=out, listeners=listeners)
 
 
-def test_a_better_function_takes_its_place(settings, tmp_path):
+@pytest.fixture(scope="module")
+def renewed(settings, tmp_path_factory):
+    """A run whose function was replaced at step 600; what was said, and the model that was asked."""
     ear, model = Ear(), Says(RIGHT, WRONG)
-    run = trained(settings, model, tmp_path / "run", [ear])
+    return trained(settings, model, tmp_path_factory.mktemp("renewed") / "run", [ear]), ear, model
+
+
+def test_a_better_function_takes_its_place(renewed):
+    run, ear, model = renewed
     assert (run.function.source, run.since) == (RIGHT, 600)
     said = [line for line in ear.heard if line.startswith("reflection")]
     assert [line.endswith(("kept", "not better")) for line in said] == [False, True, False, True]
@@ -53,15 +61,15 @@ def test_a_better_function_takes_its_place(settings, tmp_path):
     )
     assert max(before) < 0.95
     assert min(after) > 0.999
-    again = open_run(tmp_path / "run")
+    again = open_run(run.directory)
     assert (again.function.source, again.since) == (RIGHT, 600)
-    assert "def evaluation_func" in (tmp_path / "run" / "latent_function-600.py").read_text()
+    assert "def evaluation_func" in (run.directory / "latent_function-600.py").read_text()
     assert any(line.startswith("The factors explain 100%") for line in explanation_of(again))
     assert len(again.function.exchanges) == 1
 
 
-def test_the_factors_of_all_stored_steps_are_computed_again(settings, tmp_path):
-    run = trained(settings, Says(RIGHT, WRONG), tmp_path / "run")
+def test_the_factors_of_all_stored_steps_are_computed_again(renewed):
+    run, _, _ = renewed
     _, learner, _, _ = load_learner(run)
     for seed in range(2):
         buffer = of_seed(learner.replay, seed)
@@ -77,17 +85,17 @@ def test_the_factors_of_all_stored_steps_are_computed_again(settings, tmp_path):
 
 
 @pytest.mark.long
-def test_a_run_that_is_stopped_after_a_reflection_goes_on_bit_for_bit(settings, tmp_path):
-    whole = trained(settings, Says(RIGHT, WRONG), tmp_path / "whole")
+def test_a_run_that_is_stopped_after_a_reflection_goes_on_bit_for_bit(settings, renewed, tmp_path):
+    whole, _, _ = renewed
     with pytest.raises(Interrupted):
         trained(settings, Says(RIGHT), tmp_path / "run", [At(708, lambda: signal.raise_signal(signal.SIGINT))])
     assert figures(lare.resume(tmp_path / "run", model=Says(WRONG), listeners=[])) == figures(whole)
 
 
 @pytest.mark.long
-def test_what_was_recorded_answers_again(settings, tmp_path):
+def test_what_was_recorded_answers_again(settings, renewed, tmp_path):
     """A recording of the exchanges of one run is the model of another, which is the same."""
-    first = trained(settings, Says(RIGHT, WRONG), tmp_path / "first")
+    first, _, _ = renewed
     talk = {
         "task": "Chase",
         "kind": "factors",
