@@ -61,7 +61,7 @@ CALLS = {
     "policy('left')": "an observation is 2 numbers: no array can be made of str",
     "policy(np.zeros((0, 2)))": f"{POLICY}the shape is (0, 2)",
     "lare.export('none', 'out')": "none is not a run: there is no config.json in it",
-    "lare.write_report([])": "say which runs to report on",
+    "lare.write_report([])": "say which runs: no run is given",
     "lare.load_function('none.py', task)": "the function file none.py does not exist",
     "lare.load_function(listening.__code__.co_argcount, task)": "a latent function is read from the path of a file, not from 0",
     "lare.load_function('none.py', 7)": "the function file none.py does not exist",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lare.credit.basis import Basis
-from lare.credit.judging import FIRST, features_of, growing, judge, predictions
+from lare.credit.judging import FIRST, features_of, growing, judge, predictions, r2_and_error
 from lare.credit.returns import FormFound
 
 BASIS = Basis(2, 3, extended=True)
@@ -43,6 +43,20 @@ def test_no_return_is_seen_before_it_is_predicted():
     known = next(end for _, end in growing(len(rows)) if end > 40) - FIRST
     np.testing.assert_array_equal(one[:known], other[:known])
     assert (one[known:] != other[known:]).all()
+
+
+@pytest.mark.parametrize("noise", [0.2, 0.7, 1.2])
+def test_the_error_of_r2_is_its_deviation_from_sample_to_sample(noise):
+    random = np.random.default_rng(0)
+    returns = random.normal(3, 2, size=(1000, 40))
+    found = np.array([r2_and_error(one, one + noise * random.normal(0, 2, 40)) for one in returns])
+    assert np.median(found[:, 1]) == pytest.approx(found[:, 0].std(), rel=0.15)
+    assert found[:, 0].mean() == pytest.approx(1 - noise**2 * 40 / 37, abs=0.03)
+
+
+@pytest.mark.parametrize("returns", [[], [5.0], [5.0] * 12, [1e6] * 11 + [1e6 + 1e-9]])
+def test_equal_returns_have_no_r2(returns):
+    assert np.isnan(r2_and_error(np.array(returns), np.zeros(len(returns)))).all()
 
 
 @pytest.mark.parametrize("form", ["sum", "average"])

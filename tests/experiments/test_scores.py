@@ -5,19 +5,19 @@ from pathlib import Path
 import pytest
 
 from lare.errors import LareError
-from lare.experiments.compare import find_all, find_runs
+from lare.experiments.compare import find_all
+from lare.experiments.find import run_directories
 from lare.experiments.scores import RETURN, by_label, differing, grouped
-from lare.run.directory import Run
+from lare.run.directory import Run, read_measured
 from toys import toy_spec
 
 
 def test_tasks_that_judge_differently_are_laid_side_by_side():
     """Reacher-v4 judges the observation before a step, the others the one after it: that makes no other method of one."""
     kept = Path(__file__).parents[2] / "benchmarks" / "results" / "reproduce" / "laptop"
-    runs = find_runs(
-        [kept / task / f"{name}-td3" for task in ("Reacher-v4", "Walker2d-v4") for name in ("dense", "rrdu")]
-    )
-    runs += find_runs([kept / task / "lare-rrdu-td3-draw0" for task in ("Reacher-v4", "Walker2d-v4")])
+    of_methods = [f"{name}-td3" for name in ("dense", "rrdu")] + ["lare-rrdu-td3-draw0"]
+    places = [kept / task / name for name in of_methods for task in ("Reacher-v4", "Walker2d-v4")]
+    runs = [read_measured(directory) for directory in run_directories(places)]
     groups, tasks = grouped(by_label(runs), RETURN)
     assert (tasks, [group.label for group in groups]) == (("Reacher-v4", "Walker2d-v4"), ["dense", "rrdu", "lare-rrdu"])
 
@@ -162,14 +162,18 @@ def test_runs_whose_step_sizes_fall_over_other_numbers_of_steps_are_told_apart(m
     assert differing([short, longer]) == ["steps (100: dense; 500: dense)"]
 
 
-def test_several_versions_of_the_package_are_named(made):
+def test_several_versions_and_machines_are_named(made):
     warmup = {"td3": {"warmup": 10}}
     one, other = made("a", [1.0], **warmup), made("b", [2.0], method="rd", **warmup)
     assert find_all([one.directory, other.directory], RETURN)[1] == []
     config = other.directory / "config.json"
     config.write_text(config.read_text().replace(other.config.lare, "0.2.0 (0123456789)"))
+    jax, machine = one.config.versions["jax"], one.config.machine
+    config.write_text(config.read_text().replace(f'"{jax}"', f'"9.{jax}"').replace(", cpu", ", gpu"))
     assert find_all([one.directory, other.directory], RETURN)[1] == [
-        f"the runs were trained by several versions of LaRe: {one.config.lare}, 0.2.0 (0123456789)"
+        f"the runs were trained by several versions of LaRe: {one.config.lare}; 0.2.0 (0123456789)",
+        f"the runs were trained with several versions of JAX: {jax}; 9.{jax}",
+        f"the runs were trained on several machines: {machine}; {machine.replace('cpu', 'gpu')}",
     ]
 
 

@@ -11,12 +11,10 @@ from lare.experiments.compare import (
     cells,
     cells_of_all,
     comparable,
-    find_all,
-    find_runs,
     what_scores_are,
     write_comparisons,
 )
-from lare.experiments.scores import RETURN, by_label
+from lare.experiments.scores import by_label
 from lare.experiments.statistics import over_all, too_few
 
 
@@ -43,11 +41,18 @@ def test_figures_by_hand(made):
     np.testing.assert_allclose(profile.value, [np.mean(np.array(values) > x) for x in profile.x])
 
 
-def test_the_curve_of_interquartile_means_is_rliables():
-    scores = np.random.default_rng(0).normal(size=(3, 2, 7))
-    _, metrics = statistics.rliable()
+@pytest.mark.parametrize(("runs", "tasks"), [(1, 1), (3, 1), (3, 2), (8, 3)])
+def test_what_is_bootstrapped_are_the_metrics_of_rliable(runs, tasks):
+    random = np.random.default_rng(0)
+    statistics.rliable()
+    from rliable import metrics
+
+    scores = random.normal(size=(runs, tasks, 7))
     want = [metrics.aggregate_iqm(scores[..., step]) for step in range(7)]
-    np.testing.assert_allclose(statistics.curve_of_iqm(scores), want)
+    np.testing.assert_allclose(statistics.interquartile_means(scores), want)
+    mine, first = random.integers(0, 5, (runs, tasks)), random.integers(0, 5, (4, tasks))  # with ties
+    want = metrics.probability_of_improvement(mine, first)
+    assert statistics.probability_of_improvement(mine.astype(float), first.astype(float)) == pytest.approx(want)
 
 
 def test_mann_and_whitneys_test_by_hand():
@@ -157,36 +162,12 @@ def test_something_else_than_the_return_is_compared(made):
         comparable([without], "credit/error")
 
 
-def test_runs_are_found_in_the_directory_of_a_sweep(made, tmp_path):
-    made("a", [1.0]), made("b", [2.0], method="rd"), made(".c.0123.new", [3.0])
-    found = find_runs([tmp_path / "runs"])
-    assert [run.config.settings.method for run in found] == ["dense", "rd"]
-    assert find_runs([tmp_path / "runs" / "Chase" / "a"])[0].directory == found[0].directory
-    assert [run.directory for run in find_runs([tmp_path / "runs" / "Chase"])] == [run.directory for run in found]
-    with pytest.raises(LareError, match=r"nothing is not a run, and contains none$"):
-        find_runs([tmp_path / "nothing"])
-
-
-def test_the_logs_of_a_sweep_are_no_runs(made):
-    """`runs/study/*/*-td3*` names them too."""
-    run = made("a-td3", [1.0])
-    log = run.directory.with_name("a-td3.log")
-    log.write_text("step 50")
-    assert list(find_all([run.directory, log], RETURN)[0]) == ["dense"]
-    with pytest.raises(
-        LareError,
-        match=r"b\.log is not a run, and contains none; give the directory of a run, or a \.csv file "
-        r"\(docs/sweeps\.md\)$",
-    ):
-        find_all([run.directory, log.rename(log.with_name("b.log"))], RETURN)
-
-
 def test_runs_without_an_evaluation_are_left_out_and_unfinished_ones_named(made):
     ended, begun, killed = (
         made(name, [1.0], method=method, steps=steps, td3={"warmup": 10})
         for name, method, steps in (("a", "dense", (50, 100)), ("b", "rd", (25, 50)), ("c", "dense", ()))
     )
-    found, remarks = comparable(find_runs([run.directory for run in (ended, begun, killed)]))
+    found, remarks = comparable([ended, begun, killed])
     assert [run.directory for run in found] == [ended.directory, begun.directory]
     assert remarks == [
         f"{begun.directory} has only reached step 50 of 100, so no run is compared at a later step",
@@ -251,22 +232,6 @@ def test_a_probability_of_one_has_its_chance_beside_it(made):
     assert (str(better.better), better.p) == ("1.000", pytest.approx(1 / 6))
     assert (str(worse.better), worse.p) == ("0.000", pytest.approx(1 / 6))
     assert cells(statistics.compare(by_label(runs)))[1][-1] == "0.17"
-
-
-def test_a_run_that_is_given_twice_counts_once(made):
-    first, second = made("a", [1.0]), made("b", [2.0], method="rd")
-    found = find_runs([second.directory, first.directory.parent])
-    assert [run.directory for run in found] == [second.directory, first.directory]
-
-
-def test_a_table_is_not_a_run(tmp_path):
-    (tmp_path / "results.csv").touch()
-    with pytest.raises(
-        LareError,
-        match=r"results.csv is not a run, and contains none; give the directory of a run, or a \.csv file "
-        r"\(docs/sweeps\.md\)$",
-    ):
-        find_runs([tmp_path / "results.csv"])
 
 
 def test_single_seeds_have_no_intervals(made):

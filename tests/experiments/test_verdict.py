@@ -36,10 +36,10 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             ],
         ),
         (
-            FLAT - 50,
+            FLAT - 51,
             {"return_r2": -3.0, "latent": True},
             [
-                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
+                "It has not learned yet. The return is 0 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from factors and raw entries, explain next to nothing of the score: R² of the last returns, "
                 "before they were learned from, is -3.00.",
                 "Next: another phi, because this one misses what the score depends on (`lare design Toy --reflect 2 --model "
@@ -48,10 +48,10 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             ],
         ),
         (
-            FLAT - 50,
+            FLAT - 51,
             {"return_r2": 0.9},
             [
-                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
+                "It has not learned yet. The return is 0 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from raw entries, explain nearly all of the score: R² of the last returns, before they were "
                 "learned from, is 0.90.",
                 "The proxy rewards predict returns well, so the algorithm may be the limit. Next: more `--steps`, or another "
@@ -62,10 +62,10 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             ],
         ),
         (
-            FLAT - 50,
+            FLAT - 51,
             {"return_r2": 0.0},
             [
-                "It has not learned yet. The return is 1 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
+                "It has not learned yet. The return is 0 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from raw entries, explain next to nothing of the score: R² of the last returns, before they "
                 "were learned from, is 0.00.",
                 "Next: a phi, because the raw entries do not show what the score depends on (`lare prompt Toy`).",
@@ -149,6 +149,17 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             ],
         ),
         (
+            FLAT - 50,
+            {},
+            [
+                "It may have learned, but the difference is less than two standard errors. The return is 1 after 8,000 steps; "
+                "random actions get 0 ± 1 in 3 episodes.",
+                "Next: `lare evaluate runs/x --episodes 50` tells more exactly; then more `--steps`, or another `--algorithm` "
+                "(`lare algorithms`).",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
+            ],
+        ),
+        (
             FLAT - 1000,
             {"saturated": 1},
             [
@@ -171,10 +182,10 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             ],
         ),
         (
-            np.vstack([FLAT - 50, FLAT - 50]),
+            np.vstack([FLAT - 51, FLAT - 51]),
             {"return_r2": -0.93, "usual_r2": 0.98, "latent": True},
             [
-                "It has not learned yet. The return is 1 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1 in 3 "
+                "It has not learned yet. The return is 0 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1 in 3 "
                 "episodes.",
                 "Its proxy rewards, from factors and raw entries, usually explain the score (median R² of returns: 0.98), but not "
                 "the last episodes (R² -0.93): the policy has changed, and the decoder has to adapt.",
@@ -208,7 +219,13 @@ def test_seeds_that_learned_are_counted_where_their_mean_says_too_little():
 def test_a_return_that_differs_by_less_than_its_own_error_is_no_better_and_no_worse():
     """Two errors of 3 and 4 make one of 5, so two standard errors are 10."""
     random = 3 * np.sqrt(3) * CHANCE
-    for last, begins in ((10.1, "It learned. "), (9.9, "It has not"), (-9.9, "It has not"), (-10.1, "It got worse")):
+    for last, begins in (
+        (10.1, "It learned. "),
+        (9.9, "It may"),
+        (4.9, "It has not"),
+        (-9.9, "It has not"),
+        (-10.1, "It got worse"),
+    ):
         assert said(np.full((1, 8), last), random, of_evaluation=4.0)[0].startswith(begins)
 
 

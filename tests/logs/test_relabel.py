@@ -27,7 +27,10 @@ def test_a_linear_score_is_found_and_told_from_unseen_returns(folder, tmp_path):
     assert (found.method, found.episodes, found.cut, found.held_out) == ("bayes", 120, 0, 12)
     assert found.return_r2 > 0.98
     assert any("Raw entries explain" in line for line in found.explanation)
-    assert "12 episodes held out, which nothing was fitted to, are predicted with an R² of" in found.words[1]
+    assert found.words[1] == (
+        f"The returns of 12 episodes held out, which nothing was fitted to, are predicted with an R² of {found.return_r2:.3f}, "
+        "with a standard error of less than 0.001."
+    )
     for old, new in zip(logged(120), read(tmp_path / "new"), strict=True):
         np.testing.assert_array_equal(new["paid"], old["rewards"])
         np.testing.assert_allclose(new["rewards"], old["rewards"], atol=0.5)
@@ -37,6 +40,8 @@ def test_a_linear_score_is_found_and_told_from_unseen_returns(folder, tmp_path):
 def test_a_score_of_noise_is_said_to_be_noise(tmp_path):
     found = lare.relabel(list(logged(200, noise=True)), tmp_path / "new")
     assert found.return_r2 < 0.2
+    assert f"with a standard error of {found.return_r2_error:.1g}." in found.words[1]
+    assert 0.05 < found.return_r2_error < 1
     assert any(line.startswith("Warning: that is no better than their mean.") for line in found.words)
 
 

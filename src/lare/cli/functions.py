@@ -177,6 +177,7 @@ def episodes_for(role: "TaskSpec", data: str | None, count: int, policy: "Policy
 
 def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes: "Sequence[Episode]") -> None:
     """Print how well the factors explain the returns of some episodes."""
+    from lare.credit.words import error_shown, r2_shown
     from lare.training.reflect import told_by_returns
 
     found = told_by_returns(function, role, episodes)
@@ -191,8 +192,9 @@ def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes:
     if math.isfinite(found.r2):
         say(
             f"Returns of episodes not seen yet, predicted by the factors: R² = {r2_shown(found.r2)} (1: exactly; 0: no better than "
-            "their mean). LaRe predicted each return from the episodes before it. The first predictions had few such episodes: if "
-            "the factors are right, R² rises with more."
+            f"their mean), with a standard error of {error_shown(found.r2_error)}. LaRe predicted each return from the episodes "
+            "before it. The first predictions had few such episodes: if the factors are right, R² usually rises with more. Rare "
+            "events need many."
         )
         if found.r2_of_lengths is not None:
             say(
@@ -201,7 +203,3 @@ def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes:
         say(f"Fitted to all {len(episodes)} episodes:")
     for line in found.sentences:
         say(line)
-
-
-def r2_shown(value: float) -> str:
-    return f"{value:.3f}" if value > 0.99 else f"{value:.2f}"

@@ -207,18 +207,21 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = False) ->
     """Draw a report of one or more runs: one self-contained HTML file.
 
     Args:
-        runs: run directories; their learning curves are drawn in one chart, named by method.
+        runs: run directories, or directories that contain some, such as that of a sweep; their learning curves are drawn in one
+            chart, named by method.
         out: the file to write; the default is report.html in the (first) run's directory.
         film: film an episode of each run too, and show it in the page. Without a graphics card that may take minutes.
     """
+    from lare.experiments.find import run_directories
     from lare.experiments.report import write_report
     from lare.run.directory import read_config
     from lare.tasks.trust import TRUSTED, unknown_module
 
     if film:
         draw_without_a_screen()
-    say(f"wrote {write_report(list(runs), out, film)}")
-    for module in sorted({one for run in runs if (one := unknown_module(read_config(run).task)) is not None}):
+    found = run_directories(runs)
+    say(f"wrote {write_report(found, out, film)}")
+    for module in sorted({one for run in found if (one := unknown_module(read_config(run).task)) is not None}):
         progress(
             f"the module {module} was not imported, so random play, credit and factors are left out: set {TRUSTED}={module} to "
             "allow the import"

@@ -87,7 +87,7 @@ def compare(
     found, remarks = page.find_all(runs, metric)
     for remark in remarks:
         progress(remark)
-    comparisons = page.write_comparisons(found, out, metric)
+    comparisons = page.write_comparisons(found, out, metric, remarks)
     for comparison in comparisons:
         if len(comparisons) > 1:
             say(f"\n{comparison.tasks[0]}")

@@ -36,6 +36,8 @@ class Judgement(NamedTuple):
 
     r2: float
     """NaN if all returns are equal or there are too few."""
+    r2_error: float
+    """The standard error of `r2` over the episodes; NaN like it."""
     r2_of_lengths: float | None
     """R^2 of predictions from the lengths of the episodes alone; None if they do not differ, or the score is an average."""
     form: FormFound | None
@@ -75,18 +77,32 @@ def judge(
         explanation = jax.tree.map(np.asarray, explained(means, returns, length, steps, form, basis=basis))
     decided = min(errors.values()) < BETTER * max(errors.values())
     return Judgement(
-        r2(returns, told[form]),
-        None if lengths is None else r2(returns, lengths),
+        *r2_and_error(returns[FIRST:], told[form]),
+        None if lengths is None else r2_and_error(returns[FIRST:], lengths)[0],
         FormFound(form == AVERAGE, decided) if len(forms) > 1 else None,
         explanation,
     )
 
 
-def r2(returns: Float[np.ndarray, " episodes"], predicted: Float[np.ndarray, " later_episodes"]) -> float:
-    """R^2 of all episodes but the first `FIRST`; NaN if their returns are equal or there are none."""
-    later = returns[FIRST:]
-    spread = float(np.sum((later - later.mean()) ** 2)) if len(later) else 0.0
-    return 1 - float(np.sum((later - predicted) ** 2)) / spread if spread > 0 else np.nan
+def r2_and_error(
+    returns: Float[np.ndarray, " episodes"], predicted: Float[np.ndarray, " episodes"]
+) -> tuple[float, float]:
+    """R^2 of predicted returns, and its standard error; NaN if the returns are equal or fewer than two.
+
+        e_k = (R_k - R_hat_k)^2,   d_k = (R_k - mean R)^2,   R^2 = 1 - sum e / sum d
+        error^2 = n / (n - 1) * sum_k (e_k - (1 - R^2) d_k)^2 / (sum d)^2
+
+    1 - R^2 is a ratio of two means, and the error is that of a linearised ratio (Cochran, Sampling Techniques, 3rd edition, 1977,
+    section 2.11).
+    """
+    if len(returns) < 2:
+        return np.nan, np.nan
+    errors, deviations = (returns - predicted) ** 2, (returns - returns.mean()) ** 2
+    if not deviations.sum() > 1e-10 * np.sum(returns**2):
+        return np.nan, np.nan
+    ratio = errors.sum() / deviations.sum()
+    variance = np.sum((errors - ratio * deviations) ** 2) / deviations.sum() ** 2
+    return float(1 - ratio), float(np.sqrt(len(returns) / (len(returns) - 1) * variance))
 
 
 def features_of(

@@ -144,3 +144,13 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
             f"(correlation {found.left[place]:+.2f}): a factor may be missing."
         )
     return said
+
+
+def r2_shown(value: float) -> str:
+    """An R^2 as text, with a third digit near 1."""
+    return f"{value:.3f}" if value > 0.99 else f"{value:.2f}"
+
+
+def error_shown(error: float) -> str:
+    """The standard error of an R^2 as text."""
+    return f"{error:.1g}" if error >= 0.001 else "less than 0.001"

@@ -6,11 +6,12 @@ from pathlib import Path
 
 from lare.errors import LareError, did_you_mean
 from lare.experiments import figures
+from lare.experiments.find import run_directories
 from lare.experiments.html import note, table, write_page
 from lare.experiments.own_results import read_results
 from lare.experiments.scores import REFERENCES, RETURN, SUMMED_RETURN, Measured, by_label, differing
 from lare.experiments.statistics import REPETITIONS, Comparison, Estimate, compare, over_all, plus_minus, too_few
-from lare.run.directory import CONFIG, Run, read_measured
+from lare.run.directory import Run, read_measured
 
 HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "above baseline [95%]", "p")
 HEAD_OF_ALL = ("all tasks", "seeds", "above baseline [95%]", "p")
@@ -23,9 +24,10 @@ def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | 
         LareError: there is nothing to compare, or a table cannot be read.
     """
     tables = [place for place in places if place.suffix == ".csv"]
-    logs = [place for place in places if place.suffix == ".log" and place.with_suffix("").is_dir()]  # of a sweep's runs
-    directories = [place for place in places if place not in tables + logs]
-    runs, remarks = comparable(find_runs(directories), metric) if directories or not tables else ([], [])
+    directories = [place for place in places if place not in tables]
+    runs, remarks = [], []
+    if directories or not tables:
+        runs, remarks = comparable([read_measured(one) for one in run_directories(directories)], metric)
     found: dict[str, list[Run | Measured]] = {label: list(of_label) for label, of_label in by_label(runs).items()}
     of_tables = [read_results(place, metric) for place in tables]
     if of_runs := {run.config.task.name for run in runs}:
@@ -43,9 +45,21 @@ def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | 
         remarks += other_ends(runs, of_tables, metric)
     if len(found) > 1 and (names := differing(runs)):
         remarks.append(f"the runs also differ in {', '.join(names)}")
-    if len(versions := dict.fromkeys(run.config.lare for run in runs)) > 1:
-        remarks.append(f"the runs were trained by several versions of LaRe: {', '.join(versions)}")
-    return found, remarks
+    return found, remarks + several_origins(runs)
+
+
+def several_origins(runs: Sequence[Run]) -> list[str]:
+    """Remarks if runs were trained by several versions, or on several machines."""
+    origins = {
+        "by several versions of LaRe": [run.config.lare for run in runs],
+        "with several versions of JAX": [run.config.versions["jax"] for run in runs],
+        "on several machines": [run.config.machine for run in runs],
+    }
+    return [
+        f"the runs were trained {what}: {'; '.join(some)}"
+        for what, each in origins.items()
+        if len(some := dict.fromkeys(each)) > 1
+    ]
 
 
 Tables = Sequence[Mapping[str, Sequence[Measured]]]
@@ -76,27 +90,6 @@ def other_ends(runs: Sequence[Run], tables: Tables, metric: str) -> list[str]:
                 f"{one.source} has no {metric} of {method} at step {last[one.task]:,} for every seed: no run is compared there"
             )
     return said
-
-
-def find_runs(places: Sequence[Path]) -> list[Run]:
-    """The given runs, and the runs in given directories, up to two levels down, as in the directory of a sweep.
-
-    Raises:
-        LareError: no directory is given, or one of them contains no run.
-    """
-    if not places:
-        raise LareError("say which runs to compare")
-    directories: dict[Path, Path] = {}
-    """By their resolved paths: a run that is given twice counts once, at its first place."""
-    for place in places:
-        # A name that begins with a dot is the directory of a run that was killed before its directory was complete.
-        found = sorted(path.parent for depth in ("", "[!.]*/", "[!.]*/[!.]*/") for path in place.glob(depth + CONFIG))
-        if not found:
-            hint = "; give the directory of a run, or a .csv file (docs/sweeps.md)" if place.is_file() else ""
-            raise LareError(f"{place} is not a run, and contains none{hint}")
-        for directory in found:
-            directories.setdefault(directory.resolve(), directory)
-    return [read_measured(directory) for directory in directories.values()]
 
 
 def comparable(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], list[str]]:
@@ -186,16 +179,16 @@ MEANINGS = (
 
 
 def write_comparisons(
-    runs: Mapping[str, Sequence[Run | Measured]], out: Path, metric: str = RETURN
+    runs: Mapping[str, Sequence[Run | Measured]], out: Path, metric: str = RETURN, remarks: Sequence[str] = ()
 ) -> list[Comparison]:
-    """Compare runs by their labels, and write the page.
+    """Compare runs by their labels, and write the page, with remarks on the runs at its end.
 
     Raises:
         LareError: the runs cannot be compared, or the file cannot be written.
     """
     found = comparisons(runs, metric)
     title = f"{', '.join(task for one in found for task in one.tasks)}: {len(runs)} contenders"
-    write_page(out, title, "\n".join(body(title, found)))
+    write_page(out, title, "\n".join([*body(title, found), *(note(f"Note: {remark}.") for remark in remarks)]))
     return found
 
 

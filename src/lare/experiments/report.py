@@ -18,6 +18,7 @@ from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
 from lare.experiments.credit import credit_of, factor_labels
 from lare.experiments.evaluation import random_returns
+from lare.experiments.find import run_directories
 from lare.experiments.html import factor_table, function_text, note, table, write_page
 from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN, RETURN_R2, RETURN_STD
 from lare.experiments.statistics import mean_and_deviation, plus_minus
@@ -60,8 +61,8 @@ def write_report(
     """
     every = [runs] if isinstance(runs, (Run, str, Path)) else list(runs)
     if not every:
-        raise LareError("say which runs to report on")
-    opened = [one if isinstance(one, Run) else read_run(Path(one)) for one in every]
+        raise LareError("say which runs: no run is given")
+    opened = [run for one in every for run in runs_at(one)]
     for run in opened:
         if not run.metrics():
             raise LareError(f"{run.directory} has no evaluation yet: there is nothing to report")
@@ -85,6 +86,11 @@ def write_report(
         parts.extend(details(name, run))
     parts.append(note(f"Drawn by LaRe {source()}."))
     return write_page(path, title, "\n".join(parts))
+
+
+def runs_at(place: Run | str | Path) -> list[Run]:
+    """A run, or the runs in a directory."""
+    return [place] if isinstance(place, Run) else [read_run(directory) for directory in run_directories([Path(place)])]
 
 
 def read_run(directory: Path) -> Run:

@@ -98,6 +98,8 @@ def learned(run: Facts) -> str:
         return f"It learned with {seeds} of {len(run.returns)} seeds. {reached}; {by_chance}."
     if run.last < run.random.mean() - 2 * noise(run):
         return f"It got worse than random actions. {reached}; {by_chance}."
+    if may_have_learned(run):
+        return f"It may have learned, but the difference is less than two standard errors. {reached}; {by_chance}."
     return f"It has not learned yet. {reached}; {by_chance}."
 
 
@@ -110,6 +112,12 @@ def successes(run: Facts) -> int:
 def has_learned(run: Facts) -> bool:
     """Whether the mean return is above random actions, and above the policy before training, by two standard errors."""
     return better_than_chance(run) and (run.before is None or run.last > run.before + 2 * noise(run))
+
+
+def may_have_learned(run: Facts) -> bool:
+    """Whether it is above both by one standard error, but not by two: more episodes can tell."""
+    bar = max(float(run.random.mean()), -np.inf if run.before is None else run.before)
+    return bar + noise(run) < run.last and not has_learned(run)
 
 
 def better_than_chance(run: Facts) -> bool:
@@ -200,9 +208,12 @@ def todo(run: Facts) -> list[str]:
         )
     elif len(run.random) and not has_learned(run):
         good = (run.return_r2 or 0) > MOSTLY
+        exactly = (
+            f"`lare evaluate {run.directory} --episodes 50` tells more exactly; then " if may_have_learned(run) else ""
+        )
         found.append(
             ("The proxy rewards predict returns well, so the algorithm may be the limit. " if good else "")
-            + "Next: more `--steps`, or another `--algorithm` (`lare algorithms`)."
+            + f"Next: {exactly}more `--steps`, or another `--algorithm` (`lare algorithms`)."
         )
         if good and not run.latent:
             found.append(

@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from lare.credit.judging import r2_and_error
 from lare.credit.methods import Reward, find_method
 from lare.credit.settings import CreditSettings
+from lare.credit.words import error_shown, r2_shown
 from lare.errors import LareError
 from lare.latent.function import LatentFunction
 from lare.logs.episode import Logged, Paid
@@ -48,6 +50,8 @@ class Relabelled:
     return_r2: float
     """R^2 of the returns of held-out episodes; NaN if these are fewer than 8, if all their returns are the same, or if r_hat is not
     in the unit of returns."""
+    return_r2_error: float
+    """The standard error of `return_r2` over these episodes; NaN like it."""
     return_correlation: float
     """Pearson's correlation of these returns with their predictions; NaN if there are fewer than 8, or one side never varies."""
     explanation: tuple[str, ...]
@@ -83,7 +87,10 @@ def predicted(found: Relabelled) -> list[str]:
         return [
             f"The {of}, which nothing was fitted to, and their predictions have a correlation of {found.return_correlation:.2f}."
         ]
-    said = [f"The {of}, which nothing was fitted to, are predicted with an R² of {found.return_r2:.2f}."]
+    said = [
+        f"The {of}, which nothing was fitted to, are predicted with an R² of {r2_shown(found.return_r2)}, with a "
+        f"standard error of {error_shown(found.return_r2_error)}."
+    ]
     if found.return_r2 < 0.1:
         said.append(
             "Warning: that is no better than their mean. These rewards say next to nothing: do not train on them."
@@ -102,12 +109,10 @@ class Tally:
     """True returns of the held-out episodes."""
     predicted: list[float] = field(default_factory=list)
 
-    def r2(self) -> float:
-        """1 - squared errors / squared deviations from the mean."""
-        returns, predicted = np.array(self.returns), np.array(self.predicted)
-        spread = np.sum((returns - returns.mean()) ** 2) if len(returns) else 0
-        told = len(returns) >= FEWEST and spread > 1e-10 * np.sum(returns**2)
-        return float(1 - np.sum((returns - predicted) ** 2) / spread) if told else math.nan
+    def r2_and_error(self) -> tuple[float, float]:
+        """R^2, and its standard error."""
+        known = len(self.returns) >= FEWEST
+        return r2_and_error(np.array(self.returns), np.array(self.predicted)) if known else (math.nan, math.nan)
 
     def correlation(self) -> float:
         """Pearson's correlation."""
@@ -173,9 +178,9 @@ def relabel(
         written = logs.write(out, pay(credit, logs, hold_out, seed, tally, seen, told), overwrite, about)
     finally:
         credit.close()
-    r2 = tally.r2() if credit.config.method.in_reward_units else math.nan
+    r2 = tally.r2_and_error() if credit.config.method.in_reward_units else (math.nan, math.nan)
     counted = tally.episodes, tally.steps, tally.cut, len(tally.returns)
-    return Relabelled(written, name, *counted, r2, tally.correlation(), explanation)
+    return Relabelled(written, name, *counted, *r2, tally.correlation(), explanation)
 
 
 def assigner(

@@ -78,8 +78,8 @@ class Settings(Checked):
     """For ippo: how long the decoder's first fit lasts. held-out (the default): until the error on held-out episodes stops falling.
     published: fit_updates, as in every later fit."""
     evaluate_every: Count | None = None
-    """Environment steps between two evaluations; a checkpoint is written at each. By default 5000 for td3, ddpg and sac, about
-    10,000 for qmix, 10 iterations for ippo, and 5 iterations for ppo."""
+    """Environment steps between two evaluations; the last step is followed by one, too. A checkpoint is written at each. By default
+    5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 iterations for ppo."""
     evaluation_episodes: Count | None = None
     """Episodes in one evaluation. By default 10; in JAX, 50 for ippo and 32 for qmix."""
     reflect_every: Count | None = None

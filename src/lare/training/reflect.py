@@ -74,6 +74,8 @@ class Told(NamedTuple):
 
     r2: float
     """R^2 of the returns, each predicted by the factors before it was seen; NaN if the returns are all the same."""
+    r2_error: float
+    """Its standard error over the episodes."""
     r2_of_lengths: float | None
     """The same, predicted by the lengths of the episodes alone; None if these do not matter."""
     sentences: list[str]
@@ -107,7 +109,7 @@ def told_by_returns(function: LatentFunction, role: TaskSpec, episodes: Sequence
     found = judge_rows(rows, alive, returns, basis, role.score)
     names = function.columns_by(role.judges)
     every = np.concatenate([z[there] for z, there in zip(factors, alive, strict=True)])
-    return Told(found.r2, found.r2_of_lengths, said_of(found, names, role, basis), ranges(names, every))
+    return Told(found.r2, found.r2_error, found.r2_of_lengths, said_of(found, names, role, basis), ranges(names, every))
 
 
 def factors_of(function: LatentFunction, role: TaskSpec, episode: Episode) -> Float[np.ndarray, "steps rows factors"]:
