@@ -22,6 +22,7 @@ from lare.credit.methods import Reward, find_method
 from lare.credit.settings import CreditSettings
 from lare.errors import LareError, shortened
 from lare.latent.function import LatentFunction
+from lare.plugs import saving
 from lare.plugs.config import CreditConfig, Space, check, layouts
 from lare.plugs.learner import CHUNK, PIECE, WAITING, Learner
 from lare.plugs.payment import payment
@@ -387,8 +388,6 @@ class CreditAssigner:
 
         A running episode is not saved. Raises `LareError` if the directory cannot be written.
         """
-        from lare.plugs import saving
-
         with self.lock:
             saving.save(self, Path(directory), episodes)
 
@@ -399,14 +398,12 @@ class CreditAssigner:
         Raises:
             LareError: the directory does not exist, is damaged, or was written by another version.
         """
-        from lare.plugs import saving
-
-        return saving.load(Path(directory))
+        credit = cls.__new__(cls)
+        saving.load(credit, Path(directory))
+        return credit
 
     def __getstate__(self) -> dict[str, Any]:
         """The state for another process, or for a model's file: decoder and `phi`, without steps and episodes."""
-        from lare.plugs import saving
-
         with self.lock:
             return {
                 "text": saving.text_of(self),
@@ -415,8 +412,6 @@ class CreditAssigner:
             }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        from lare.plugs import saving
-
         saving.restore(self, state["text"], state["arrays"], state["phi"])
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ DIRECTORY/
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -21,11 +21,13 @@ from lare.files import write_atomically
 from lare.foreign import read_json, read_text
 from lare.latent.function import LatentFunction
 from lare.latent.saved import load as load_function
-from lare.plugs.assigner import CreditAssigner
 from lare.plugs.layout import Layout
 from lare.plugs.store import Episode, Store
 from lare.run.checkpoint import DAMAGED, opened
 from lare.tasks.spec import TaskSpec
+
+if TYPE_CHECKING:
+    from lare.plugs.assigner import CreditAssigner
 
 FORMAT = 1
 TEXT, ARRAYS, FUNCTION = "assigner.json", "state.npz", "phi.py"
@@ -33,7 +35,7 @@ TRIED = ("tried/observation", "tried/action")
 """The steps on which `phi` is verified when it is loaded, because there may be no environment."""
 
 
-def text_of(credit: CreditAssigner) -> dict[str, Any]:
+def text_of(credit: "CreditAssigner") -> dict[str, Any]:
     """The arguments that it was made with, and its counts, as JSON."""
     return {
         "format": FORMAT,
@@ -56,13 +58,13 @@ def text_of(credit: CreditAssigner) -> dict[str, Any]:
     }
 
 
-def leaves(credit: CreditAssigner) -> dict[str, Any]:
+def leaves(credit: "CreditAssigner") -> dict[str, Any]:
     """The arrays of the decoder and the statistics, by their paths."""
     found, _ = jax.tree_util.tree_flatten_with_path((credit.learner.state, credit.learner.scale))
     return {f"learned{jax.tree_util.keystr(path)}": leaf for path, leaf in found}
 
 
-def arrays_of(credit: CreditAssigner, episodes: bool) -> dict[str, np.ndarray]:
+def arrays_of(credit: "CreditAssigner", episodes: bool) -> dict[str, np.ndarray]:
     """The learned state and, if `episodes` is true, the stored steps and episodes."""
     credit.learn()
     arrays = {name: np.asarray(leaf) for name, leaf in leaves(credit).items()}
@@ -83,7 +85,7 @@ def arrays_of(credit: CreditAssigner, episodes: bool) -> dict[str, np.ndarray]:
     return arrays
 
 
-def save(credit: CreditAssigner, directory: Path, episodes: bool) -> None:
+def save(credit: "CreditAssigner", directory: Path, episodes: bool) -> None:
     """Write a directory. Files of an earlier save are replaced, each as a whole."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -97,8 +99,8 @@ def save(credit: CreditAssigner, directory: Path, episodes: bool) -> None:
     write_atomically(directory / TEXT, lambda file: file.write(text))
 
 
-def load(directory: Path) -> CreditAssigner:
-    """Read a directory that `save` has written."""
+def load(credit: "CreditAssigner", directory: Path) -> None:
+    """Give an assigner, whose `__init__` has not been called, the state in a directory that `save` has written."""
     path = directory / TEXT
     try:
         text = read_json(read_text(path))
@@ -108,19 +110,17 @@ def load(directory: Path) -> CreditAssigner:
             raise LareError(f"{path} is not of format {FORMAT}: another version of LaRe has written it")
         tried = (arrays[TRIED[0]], arrays[TRIED[1]]) if set(TRIED) <= set(arrays) else None
         phi = load_function(directory / FUNCTION, TaskSpec(**text["task"]), steps=tried) if text["phi"] else None
-        credit = CreditAssigner.__new__(CreditAssigner)
         restore(credit, text, arrays, phi)
     except (*DAMAGED, TypeError, RecursionError) as error:
         raise LareError(
             f"{directory} holds no credit assigner, or one that is damaged or of another version: {shortened(error)}"
         ) from error
-    return credit
 
 
 def restore(
-    credit: CreditAssigner, text: dict[str, Any], arrays: dict[str, np.ndarray], phi: LatentFunction | None
+    credit: "CreditAssigner", text: dict[str, Any], arrays: dict[str, np.ndarray], phi: LatentFunction | None
 ) -> None:
-    """Give an assigner the state of a saved one."""
+    """Give an assigner, whose `__init__` has not been called, the state of a saved one."""
     observation, action = Layout(**text["observation"]), Layout(**text["action"])
     task = None if text["task"] is None else TaskSpec(**text["task"])
     credit.__init__(
