@@ -183,6 +183,9 @@ def test_verify_says_how_much_of_the_score_the_factors_explain(command, phi, spe
     assert found
     assert float(found[1]) > 0.9
     assert "\nFitted to all 30 episodes:\nThe factors explain " in out
+    assert "(before)" not in out
+    _, both, _ = command("verify", phi, "--task", spec_file(), "--fit", "30", "--judges", "both")
+    assert "before" in both.partition("Fitted to all 30 episodes:")[2]
 
 
 @pytest.mark.parametrize(

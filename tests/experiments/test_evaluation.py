@@ -116,6 +116,10 @@ def test_the_policy_of_a_choice_gives_what_the_environment_takes(small, tmp_path
     chosen = policy_of(run)(many)
     assert np.bincount(chosen).min() > 60
     np.testing.assert_array_equal(policy_of(run)(many), chosen)
+    # Without noise it makes the likeliest of them alone, and so do evaluations.
+    assert set(policy_of(run, deterministic=True)(many)) == {np.argmax(np.bincount(chosen))}
+    sampled, likeliest = (lare.evaluate_run(run, 4, deterministic=which)["Chase"] for which in (False, True))
+    assert not np.array_equal(sampled, likeliest)
 
 
 def test_many_agents_have_no_single_policy(small_many, tmp_path):

@@ -69,7 +69,8 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
                 "The score is treated as an average over the steps of an episode: so far, this predicts returns better than a sum. "
                 f"This may change. {SET_IT}",
                 "The factors explain 5% of the variation of the returns of 40 episodes.",
-                "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of.",
+                "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of, or the "
+                "episodes are too few or too much alike to show it.",
             ],
         ),
         (

@@ -11,6 +11,7 @@ from tyro.conf import Positional
 
 from lare.cli.terminal import Data, Kind, Task, progress, say, steps_of, write_new
 from lare.errors import LareError
+from lare.tasks.spec import Judges
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -102,6 +103,7 @@ def verify(
     data: Data = None,
     fit: int = 0,
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
+    judges: Judges | None = None,
 ) -> None:
     """Verify a function: what it contains, and what it does. It runs in a sandboxed process.
 
@@ -118,6 +120,7 @@ def verify(
         fit: number of episodes, 20 or more, whose returns the factors are fitted to: the first of --data, or episodes that are
             played with random actions, the same in every call.
         policy: a run whose policy plays the episodes for --fit, instead of random actions.
+        judges: which observation of a step the function judges, instead of the one that the task says.
     """
     from lare.cli.design import policy_that_plays
     from lare.credit.words import FEWEST
@@ -134,6 +137,7 @@ def verify(
     if policy is not None and (not fit or data is not None):
         raise LareError("--policy plays the episodes for --fit: give --fit a number of episodes, and no --data")
     spec = load_task(task) if data is None else read_task(task)
+    spec = spec if judges is None else spec.model_copy(update={"judges": judges})
     plays = policy_that_plays(policy, spec)
     if changed:
         say("note    the source was changed after it was saved: its hash differs")

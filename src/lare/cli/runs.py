@@ -136,7 +136,9 @@ def model_of(model: str | None, base_url: str | None, task: str) -> "Model | Non
     return LiveModel(model, base_url, None, Budget(REQUESTS, BUDGET), said=progress)
 
 
-def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: Path | None = None) -> None:
+def evaluate(
+    run: RunDirectory, episodes: int = 10, best: bool = False, deterministic: bool = False, video: Path | None = None
+) -> None:
     """Evaluate the policy of a run by its true return, from initial states that no evaluation of the run has used.
 
     Prints the mean return of the policy with its standard deviation, and the same of as many episodes of random actions, at
@@ -146,6 +148,7 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
         run: a run directory.
         episodes: number of episodes for each seed. Policies act as in training's evaluations.
         best: play the policy of each seed's best evaluation, instead of the last policy.
+        deterministic: always take the most likely action, where training's evaluations sample it (ppo with choices, ippo).
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
     import numpy as np
@@ -164,9 +167,9 @@ def evaluate(run: RunDirectory, episodes: int = 10, best: bool = False, video: P
         if env_spec(opened.config.task).agents == 1:
             draw_without_a_screen()
             progress("filming an episode; without a graphics card that may take minutes")
-        record_video(opened, video, best)
+        record_video(opened, video, best, deterministic)
         say(f"wrote {video}")
-    found = evaluation_of(opened, episodes, best)
+    found = evaluation_of(opened, episodes, best, deterministic)
     since = load_actor(opened, of_best=True)[2] if best else None
     counted = f"{episodes} episodes" if episodes != 1 else "1 episode"
     roles = opened.config.task.roles

@@ -128,7 +128,8 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
     )
     if found.by_factors < NEXT_TO_NOTHING:
         said.append(
-            "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of."
+            "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of, or the episodes "
+            "are too few or too much alike to show it."
         )
     else:
         said.append(

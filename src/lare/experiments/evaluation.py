@@ -2,6 +2,7 @@
 
 import time
 from contextlib import closing, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -31,7 +32,7 @@ RANDOM_EPISODES, PATIENCE = 10, 5.0
 
 
 def evaluate_run(
-    run: Run | str | Path, episodes: int = 10, best: bool = False
+    run: Run | str | Path, episodes: int = 10, best: bool = False, deterministic: bool = False
 ) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
     """True returns by team. If a task has a single team, its name is that of the task.
 
@@ -43,22 +44,24 @@ def evaluate_run(
         run: the run, or its directory.
         episodes: number of episodes for each seed.
         best: play the policy of each seed's best evaluation, instead of the last policy.
+        deterministic: always take the most likely action, where evaluations sample it.
 
     Raises:
         LareError: there is nothing to evaluate, or the task's environment has changed.
     """
     run = as_run(run)
-    returns = evaluation_of(run, episodes, best).returns
+    returns = evaluation_of(run, episodes, best, deterministic).returns
     return {role.name: returns[..., place] for place, role in enumerate(run.config.task.roles)}
 
 
-def evaluation_of(run: Run, episodes: int, best: bool = False) -> Evaluation:
+def evaluation_of(run: Run, episodes: int, best: bool = False, deterministic: bool = False) -> Evaluation:
     """All measurements of these episodes. Raises `LareError` like `evaluate_run`."""
     if not isinstance(episodes, int) or episodes < 1:
         raise LareError(f"episodes = {episodes}: a whole number, 1 or more")
     task, settings = run.config.task, run.config.settings
     check_against_environment(task)
     config, actor, _ = load_actor(run, best)
+    config = replace(config, deterministic=deterministic)
     env = make_env(task)
     if not isinstance(env, HostEnv):
         return DeviceCollector(env, config, run.seeds).evaluate(actor, episodes, number=1)

@@ -1,6 +1,7 @@
 """The policy of a finished (or stopped) run, to use in your own program."""
 
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +24,16 @@ from lare.training.streams import Stream, generator
 class Policy:
     """A policy: from one observation to one action of the environment, or from a batch of them to a batch.
 
-    It acts as in evaluations: PPO's choices are sampled, and all other actions are deterministic. A policy with a memory (`qmix`,
-    `vdn`) takes observations one at a time, in order, and `reset` begins a new episode.
+    It acts as in evaluations: PPO's choices are sampled (unless `deterministic` is true), and all other actions are deterministic.
+    A policy with a memory (`qmix`, `vdn`) takes observations one at a time, in order, and `reset` begins a new episode.
     """
 
-    def __init__(self, run: Run, place: int, best: bool):
+    def __init__(self, run: Run, place: int, best: bool, deterministic: bool = False):
         self.env = env_spec(run.config.task)
         if self.env.agents > 1:
             raise LareError(f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy")
-        self.config, actors, _ = load_actor(run, best)
+        config, actors, _ = load_actor(run, best)
+        self.config = replace(config, deterministic=deterministic)
         self.actor = jax.tree.map(lambda leaf: leaf[place : place + 1], actors)
         self.functions = compiled(self.config)
         self.random = generator(run.seeds[place], Stream.EVALUATION_NOISE, 0)
@@ -90,7 +92,9 @@ class Policy:
         return np.atleast_2d(rows), rows.ndim == 1
 
 
-def policy_of(run: Run | str | Path, seed: int | None = None, best: bool = False) -> Policy:
+def policy_of(
+    run: Run | str | Path, seed: int | None = None, best: bool = False, deterministic: bool = False
+) -> Policy:
     """The policy of a seed, from one observation to one action of the environment, or from a batch to a batch.
 
     It acts as in evaluations: PPO's choices are sampled, and all other actions are deterministic. Observations that are not one row
@@ -100,12 +104,13 @@ def policy_of(run: Run | str | Path, seed: int | None = None, best: bool = False
         run: the run, or its directory.
         seed: one of the run's seeds; the default is the first.
         best: return the policy of the seed's best evaluation, instead of the last policy.
+        deterministic: always take the most likely choice, which PPO's policy samples otherwise.
 
     Raises:
         LareError: it is a run of many agents, or has no such seed, or no checkpoint.
     """
     run = as_run(run)
-    return Policy(run, run.place_of(seed), best)
+    return Policy(run, run.place_of(seed), best, deterministic)
 
 
 def choices(run: Run) -> OneHot:

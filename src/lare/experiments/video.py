@@ -27,7 +27,7 @@ FRAME = {"width": 320, "height": 320}
 """Pixels of a MuJoCo film. The default, 480 by 480, takes twice the time and space."""
 
 
-def record_video(run: Run, path: str | Path, best: bool = False) -> None:
+def record_video(run: Run, path: str | Path, best: bool = False, deterministic: bool = False) -> None:
     """Film one episode of the first seed's policy, the last or the best, as a .gif, or as an .mp4 with the extra `lare-rl[video]`.
 
     A film of a particle task shows each agent's credit, as number and colour.
@@ -38,8 +38,8 @@ def record_video(run: Run, path: str | Path, best: bool = False) -> None:
     path = Path(path)
     check_video(path)
     if env_spec(run.config.task).agents > 1:
-        if best:
-            raise LareError("a film of many agents shows their credit, and so the last policy: leave best out")
+        if best or deterministic:
+            raise LareError("a film of many agents shows training with its credit: leave best and deterministic out")
         pictures = agents.frames(run, watch(run))
         if pictures is None:
             raise LareError(f"{run.config.task.name} steps on the host, where only single agents are filmed")
@@ -51,12 +51,12 @@ def record_video(run: Run, path: str | Path, best: bool = False) -> None:
         fps = environment.environment.metadata.get("render_fps", 30)
         # Browsers play a GIF at 50 frames a second at most, and a frame may take long where there is no graphics card.
         every = max(1, round(fps / 25)) if path.suffix == ".gif" else 1
-        write_video(path, list(drawn(run, environment, every, best)), every / fps)
+        policy = Policy(run, 0, best, deterministic)
+        write_video(path, list(drawn(run, environment, every, policy)), every / fps)
 
 
-def drawn(run: Run, environment: HostEnv, every: int, best: bool) -> Iterator[np.ndarray]:
+def drawn(run: Run, environment: HostEnv, every: int, policy: Policy) -> Iterator[np.ndarray]:
     """Pictures of an episode, one in `every` steps. Raises `LareError` if this machine cannot draw them."""
-    policy = Policy(run, 0, best)
     shown = environment.reset(episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
     ended, step = False, 0
     while not ended:

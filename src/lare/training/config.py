@@ -39,6 +39,8 @@ class TrainConfig:
     """Environment steps of the whole run."""
     fit_updates: int
     """Updates of the decoder in an iteration that fits it. Unused if the decoder is updated with every update of the algorithm."""
+    deterministic: bool = False
+    """Whether a policy acts without noise outside training, even if its algorithm says otherwise."""
 
     @property
     def noise(self) -> Noise:
@@ -48,7 +50,7 @@ class TrainConfig:
     @property
     def greedy(self) -> bool:
         """Whether the policy acts without noise outside training."""
-        return self.algorithm.greedy(self.env.discrete)
+        return self.deterministic or self.algorithm.greedy(self.env.discrete)
 
     @property
     def noise_size(self) -> int:
