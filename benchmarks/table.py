@@ -1,9 +1,9 @@
 """The kept runs as rows of a table: mean and standard deviation over seeds.
 
-    python benchmarks/table.py [--at STEPS] DIRECTORY ...
+    python benchmarks/table.py [--at STEPS] [--key METRIC] DIRECTORY ...
 
 A DIRECTORY is a run, or contains runs at any depth (`benchmarks/results/sweeps/closed-form`). With many agents, returns are the sum
-over the agents, as in the paper, and the row says so.
+over the agents, as in the paper, and the row says so; `--key evaluation/return` gives their mean.
 """
 
 import argparse
@@ -28,9 +28,9 @@ def usual_names(method: str, algorithm: str) -> tuple[str, ...]:
     return method, f"{method}-{algorithm}", f"{method}-{algorithm}-draw0"
 
 
-def row(directory: Path, at: int | None) -> str:
+def row(directory: Path, at: int | None, key: str | None) -> str:
     config, lines = read(directory)
-    key = "evaluation/summed_return" if "evaluation/summed_return" in lines[-1] else "evaluation/return"
+    key = key or ("evaluation/summed_return" if "evaluation/summed_return" in lines[-1] else "evaluation/return")
     last = lines[-1]["step"] if at is None else at
     end = [line for line in lines if line["step"] == last]
     late: dict[int, list[Any]] = {}
@@ -57,6 +57,7 @@ def described(directory: Path, config: dict[str, Any]) -> tuple[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--at", type=int)
+    parser.add_argument("--key")
     parser.add_argument("directories", type=Path, nargs="+")
     given = parser.parse_args()
     print(
@@ -68,7 +69,7 @@ def main() -> None:
         if not runs:
             parser.error(f"there is no run in {directory}")
         for run in runs:
-            print(row(run, given.at))
+            print(row(run, given.at, given.key))
 
 
 if __name__ == "__main__":

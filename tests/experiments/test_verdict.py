@@ -42,8 +42,8 @@ def said(returns, random=CHANCE, task="Toy", **facts):
                 "It has not learned yet. The return is 0 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from factors and raw entries, explain next to nothing of the score: R² of the last returns, "
                 "before they were learned from, is -3.00.",
-                "Next: another phi, because this one misses what the score depends on (`lare design Toy --reflect 2 --model "
-                "NAME`); or none (`--method bayes`).",
+                "Next: another phi (`lare design Toy --reflect 2 --model NAME`), or none (`--method bayes`), because phi misses "
+                "what the score depends on.",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),
@@ -68,7 +68,19 @@ def said(returns, random=CHANCE, task="Toy", **facts):
                 "It has not learned yet. The return is 0 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from raw entries, explain next to nothing of the score: R² of the last returns, before they "
                 "were learned from, is 0.00.",
-                "Next: a phi, because the raw entries do not show what the score depends on (`lare prompt Toy`).",
+                "Next: a phi (`lare prompt Toy`), because the raw entries do not show what the score depends on.",
+                "One seed says little: another one may reach a different return (`--seeds 3`).",
+            ],
+        ),
+        (
+            FLAT - 51,
+            {"return_r2": 0.0, "descends": True},
+            [
+                "It has not learned yet. The return is 0 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
+                "Its proxy rewards, from raw entries, explain next to nothing of the score: R² of the last returns, before they "
+                "were learned from, is 0.00.",
+                "Next: `--method bayes`, whose decoder needs no updates. If that explains the score, this decoder has not learned "
+                "it yet: more `--steps`. If not, the raw entries do not show what the score depends on: a phi (`lare prompt Toy`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
             ],
         ),

@@ -41,8 +41,7 @@ def decided(settings, task):
         (
             "CN-6",
             {"method": "stas", "rollout_steps": 10},
-            "stas looks at whole episodes of one length: episodes of CN-6 must have a fixed length, and rollout_steps must be a "
-            "multiple of it",
+            "stas looks at whole episodes: rollout_steps = 10 is not a multiple of their length, 25",
         ),
         (
             "Reacher-v4",
@@ -105,7 +104,9 @@ def test_credit_among_agents_is_not_judged_from_the_state(method, echo):
 @pytest.mark.parametrize("method", ["stas", "arel"])
 def test_who_looks_at_whole_episodes_wants_them_of_one_length(method, echo):
     with pytest.raises(
-        LareError, match=f"^{method} looks at whole episodes of one length: episodes of Echo must have a fixed length"
+        LareError,
+        match=f"^{method} looks at whole episodes of one length, and so it trains on LaRe's particle tasks only: episodes of Echo "
+        "could differ in length$",
     ):
         decide(Settings(method=method, rollout_steps=6), echo)
 

@@ -176,9 +176,12 @@ def evaluate(
     for team, role in enumerate(roles):
         for place, seed in enumerate(opened.seeds):
             named = f"{role.name}, " if len(roles) > 1 else ""
-            of_seed = plus_minus(*mean_and_deviation(found.returns[place, :, team]))
+            of_seed, summed = (
+                plus_minus(*mean_and_deviation(each[place, :, team])) for each in (found.returns, found.sums)
+            )
             of_best = "" if since is None else f" ({when_saved(int(since[place]), opened.config.settings.warmup)})"
-            say(f"{named}seed {seed}: return {of_seed} over {counted}{of_best}")
+            of_all = f"; summed over the agents {summed}" if env_spec(opened.config.task).agents > 1 else ""
+            say(f"{named}seed {seed}: return {of_seed} over {counted}{of_best}{of_all}")
     by_chance = random_play(opened.config.task, max(episodes, RANDOM_EPISODES)) if len(roles) == 1 else []
     if by_chance:
         returns = np.array([one.total for one in by_chance])

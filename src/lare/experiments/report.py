@@ -115,6 +115,7 @@ def verdicts(runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> It
             return_r2=None if predicted is None else last_known(predicted[1]),
             usual_r2=None if predicted is None else median_of_known(predicted[1]),
             latent=method.latent,
+            descends=method.descends,
             untrained=run.untrained,
             before=before_training(run),
             saturated=saturated(run),

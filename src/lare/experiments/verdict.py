@@ -40,6 +40,8 @@ class Facts:
     """The median of the same over all evaluations and seeds."""
     latent: bool = False
     """Whether the method has a phi."""
+    descends: bool = False
+    """Whether its decoder descends a gradient, and so may not have learned yet what it sees."""
     untrained: str | None = None
     """Why the policy was never trained; None if it was."""
     before: float | None = None
@@ -179,12 +181,7 @@ def todo(run: Facts) -> list[str]:
     """What to do next."""
     found = []
     if explains_nothing(run):
-        found.append(
-            f"Next: another phi, because this one misses what the score depends on (`lare design {run.task} --reflect 2 --model "
-            "NAME`); or none (`--method bayes`)."
-            if run.latent
-            else f"Next: a phi, because the raw entries do not show what the score depends on (`lare prompt {run.task}`)."
-        )
+        found.append(what_explains(run))
     elif is_rising(run):
         found.append(
             f"Next: it was still rising. To continue: `lare train --resume {run.directory} --steps {2 * int(run.steps[-1])}`."
@@ -225,6 +222,21 @@ def todo(run: Facts) -> list[str]:
     if len(run.returns) == 1:
         found.append("One seed says little: another one may reach a different return (`--seeds 3`).")
     return found
+
+
+def what_explains(run: Facts) -> str:
+    """What to try if proxy rewards explain next to nothing of the score."""
+    if run.latent:
+        why = "phi misses what the score depends on"
+        then = f"another phi (`lare design {run.task} --reflect 2 --model NAME`), or none (`--method bayes`)"
+    else:
+        why, then = "the raw entries do not show what the score depends on", f"a phi (`lare prompt {run.task}`)"
+    if not run.descends:
+        return f"Next: {then}, because {why}."
+    return (
+        f"Next: `--method {'lare-bayes' if run.latent else 'bayes'}`, whose decoder needs no updates. If that explains the score, "
+        f"this decoder has not learned it yet: more `--steps`. If not, {why}: {then}."
+    )
 
 
 def quarters(run: Facts) -> tuple[float, float, float] | None:

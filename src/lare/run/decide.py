@@ -69,10 +69,15 @@ def check_method(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> No
         raise LareError(f"{method.name} assigns credit among agents, and {task.name} is a task of one")
     if method.for_many_only and task.judged_from == "state":
         raise LareError(f"{method.name} assigns credit among agents, and {task.name} is judged from the global state")
-    if method.whole_episodes and not (env.fixed_length and resolved.rollout_steps % env.max_steps == 0):
+    if method.whole_episodes and not env.fixed_length:
         raise LareError(
-            f"{method.name} looks at whole episodes of one length: episodes of {task.name} must have a fixed length, and "
-            "rollout_steps must be a multiple of it"
+            f"{method.name} looks at whole episodes of one length, and so it trains on LaRe's particle tasks only: episodes of "
+            f"{task.name} could differ in length"
+        )
+    if method.whole_episodes and resolved.rollout_steps % env.max_steps:
+        raise LareError(
+            f"{method.name} looks at whole episodes: rollout_steps = {resolved.rollout_steps} is not a multiple of their length, "
+            f"{env.max_steps}"
         )
     check_credit(resolved, method, task, env)
     if resolved.reflect_every is not None and method.encoder is not Encoder.LATENT_AND_JUDGED:

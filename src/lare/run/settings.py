@@ -67,7 +67,8 @@ class Settings(Checked):
     for ippo and 8 for qmix."""
     rollout_steps: Count | None = None
     """Steps of each copy in an iteration, which collects, stores, fits and updates. By default 50 for algorithms that consume
-    transitions or sequences, 2000 over all copies for ppo, and an episode for ippo on particle tasks."""
+    transitions or sequences, and 2000 over all copies for ppo; for ippo an episode on particle tasks, and on other tasks 2050 over
+    all copies in JAX, 2000 on the host."""
     fit_every: Count | None = None
     """For ppo and ippo, and for every algorithm with diaster: iterations between two fits of the decoder. By default 10 for ippo,
     else 1."""

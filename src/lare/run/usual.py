@@ -19,7 +19,7 @@ MANY_AGENTS = CreditSettings(
     bottleneck=4,
     divergence=1e-3,
 )
-"""The default settings of decoders for many agents. The numbers are the published code's, except VIB's divergence."""
+"""The default settings of decoders for many agents. The numbers are those of LaRe's published code, except VIB's divergence."""
 
 
 Usual = Callable[[EnvSpec, int], dict[str, Any]]
