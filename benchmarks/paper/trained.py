@@ -12,9 +12,9 @@ from lare.experiments.statistics import (
     Band,
     Comparison,
     compare,
+    in_words,
     mann_whitney,
     mann_whitney_u,
-    mean_and_deviation,
     plus_minus,
     too_few,
 )
@@ -189,7 +189,7 @@ def mean_and_spread(runs: Sequence[Run], key: str, step: int) -> str:
             by_seed.setdefault(line["seed"], []).append(line[key])
     if not by_seed:
         return "-"
-    return plus_minus(*mean_and_deviation(np.array([np.mean(values) for values in by_seed.values()])))
+    return in_words(np.array([np.mean(values) for values in by_seed.values()]))
 
 
 def picture(found: Comparison, exhibit: Exhibit) -> str:

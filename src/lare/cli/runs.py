@@ -154,7 +154,7 @@ def evaluate(
     import numpy as np
 
     from lare.experiments.evaluation import RANDOM_EPISODES, evaluation_of, random_play
-    from lare.experiments.statistics import mean_and_deviation, plus_minus
+    from lare.experiments.statistics import in_words
     from lare.experiments.video import check_video, record_video
     from lare.run.directory import open_run
     from lare.tasks.table import env_spec
@@ -176,22 +176,20 @@ def evaluate(
     for team, role in enumerate(roles):
         for place, seed in enumerate(opened.seeds):
             named = f"{role.name}, " if len(roles) > 1 else ""
-            of_seed, summed = (
-                plus_minus(*mean_and_deviation(each[place, :, team])) for each in (found.returns, found.sums)
-            )
+            of_seed, summed = (in_words(each[place, :, team]) for each in (found.returns, found.sums))
             of_best = "" if since is None else f" ({when_saved(int(since[place]), opened.config.settings.warmup)})"
             of_all = f"; summed over the agents {summed}" if env_spec(opened.config.task).agents > 1 else ""
             say(f"{named}seed {seed}: return {of_seed} over {counted}{of_best}{of_all}")
     by_chance = random_play(opened.config.task, max(episodes, RANDOM_EPISODES)) if len(roles) == 1 else []
     if by_chance:
         returns = np.array([one.total for one in by_chance])
-        say(f"random actions: return {plus_minus(*mean_and_deviation(returns))} over {len(by_chance)} episodes")
+        say(f"random actions: return {in_words(returns)} over {len(by_chance)} episodes")
     for name, values in found.measures.items():
         for seed, of_seed in zip(opened.seeds, values, strict=True):
-            say(f"seed {seed}: {name} {plus_minus(*mean_and_deviation(of_seed))}")
+            say(f"seed {seed}: {name} {in_words(of_seed)}")
         if by_chance:
             of_chance = np.array([one.measures[name] for one in by_chance])
-            say(f"random actions: {name} {plus_minus(*mean_and_deviation(of_chance))}")
+            say(f"random actions: {name} {in_words(of_chance)}")
     if told := explanation_of(opened):
         say(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
     for line in told:
@@ -279,7 +277,7 @@ def cross_play(
     """
     from lare.experiments.agents import Match
     from lare.experiments.agents import cross_play as play
-    from lare.experiments.statistics import mean_and_deviation, plus_minus
+    from lare.experiments.statistics import in_words
     from lare.run.directory import open_run
 
     runs = open_run(first), open_run(second)
@@ -288,7 +286,7 @@ def cross_play(
     ours, theirs = (role.team for role in task.teams)
 
     def cell(match: Match) -> str:
-        return plus_minus(*mean_and_deviation(match.returns.ravel()))
+        return in_words(match.returns.ravel())
 
     rows = zip((first, second), (matches[:2], matches[2:]), strict=True)
     head = (f"{ours} of, against {theirs} of", str(first), str(second))

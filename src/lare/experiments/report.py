@@ -21,7 +21,7 @@ from lare.experiments.evaluation import random_returns
 from lare.experiments.find import run_directories
 from lare.experiments.html import factor_table, function_text, note, table, write_page
 from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN, RETURN_R2, RETURN_STD
-from lare.experiments.statistics import mean_and_deviation, plus_minus
+from lare.experiments.statistics import in_words
 from lare.experiments.verdict import Facts, last_known, median_of_known, verdict
 from lare.experiments.video import record_video
 from lare.latent.saved import read_source
@@ -176,7 +176,7 @@ def at_the_end(run: Run, key: str) -> str:
     """The last value: its mean over the seeds for which it is known, and their standard deviation."""
     found = curve(run, key)
     known = np.zeros(0) if found is None else found[1][:, -1][np.isfinite(found[1][:, -1])]
-    return plus_minus(*mean_and_deviation(known)) if len(known) else "-"
+    return in_words(known) if len(known) else "-"
 
 
 MEANINGS = {

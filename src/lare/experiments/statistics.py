@@ -73,6 +73,11 @@ def mean_and_deviation(values: Float[np.ndarray, " seeds"]) -> tuple[float, floa
     return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
 
 
+def in_words(values: Float[np.ndarray, " values"]) -> str:
+    """Mean ± standard deviation of some values; the mean alone of a single one."""
+    return plus_minus(*mean_and_deviation(values))
+
+
 @dataclass(frozen=True)
 class Row:
     """One method, over all tasks."""
