@@ -225,7 +225,9 @@ def test_seeds_that_learned_are_counted_where_their_mean_says_too_little():
     returns = np.vstack([FLAT, FLAT - 52, FLAT - 51])
     found = "The return is 16.7 ± 29.7 after 8,000 steps (mean over 3 seeds); random actions get 0 ± 1 in 3 episodes"
     assert said(returns)[0] == f"It learned with 1 of 3 seeds. {found}."
-    assert said(returns, before=51.0)[0] == f"It has not learned yet. {found}, the policy before training 51."
+    assert (
+        said(returns, before=np.full(3, 51.0))[0] == f"It has not learned yet. {found}, the policy before training 51."
+    )
 
 
 def test_a_return_that_differs_by_less_than_its_own_error_is_no_better_and_no_worse():
@@ -249,11 +251,26 @@ def test_a_policy_that_was_never_updated_has_learned_nothing():
 
 def test_better_than_chance_is_not_learned_if_the_policy_was_so_before_training():
     began = "after 8,000 steps; random actions get 0 ± 1 in 3 episodes, the policy before training"
-    assert said(FLAT, before=51.0)[:2] == [
+    assert said(FLAT, before=np.array([51.0]))[:2] == [
         f"It has not learned yet. The return is 51 {began} 51.",
         "Next: more `--steps`, or another `--algorithm` (`lare algorithms`).",
     ]
-    assert said(FLAT, before=30.0)[0] == f"It learned. The return is 51 {began} 30."
+    assert said(FLAT, before=np.array([30.0]))[0] == f"It learned. The return is 51 {began} 30."
+
+
+def test_each_seed_is_compared_with_its_own_policy_before_training():
+    """The untrained policy of the first seed was as good by chance: the mean of both hides that."""
+    ends, random = np.array([[-11.1], [-10.0]]) + np.zeros(8), -43 + 15 * CHANCE
+    assert said(ends, random, before=np.array([-10.3, -49.7]))[0].startswith("It learned with 1 of 2 seeds. ")
+    assert said(ends, random, before=np.array([-40.3, -49.7]))[0].startswith("It learned. ")
+
+
+def test_the_best_policy_is_one_that_was_trained():
+    lucky = np.array([[90.0, 80, 0, 0, 1, 0, 1, 0]])
+    assert "at step 1,000 (90)" in said(lucky)[1]
+    assert said(lucky, warmup=2000)[1] == "Next: more `--steps`, or another `--algorithm` (`lare algorithms`)."
+    assert "before, 92 at step 4,000" in said(FELL, warmup=2999)[1]
+    assert "before, 60 at step 5,000" in said(FELL, warmup=4000)[1]
 
 
 def test_without_random_play_the_return_alone_is_said():

@@ -42,7 +42,7 @@ FILM, LARGEST_FILM = "film.gif", 64 << 20
 COMMAND = re.compile(r"`([^`]*)`")
 """A command within a sentence."""
 
-TOP = "In public benchmarks, a million steps of TD3 on true rewards"
+TOP = "The highest published return of TD3 on true rewards within a million steps"
 """Explains the upper ends of `REFERENCES`."""
 
 
@@ -117,6 +117,7 @@ def verdicts(runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> It
             latent=method.latent,
             descends=method.descends,
             untrained=run.untrained,
+            warmup=run.config.settings.warmup,
             before=before_training(run),
             saturated=saturated(run),
             directory=str(run.directory),
@@ -134,14 +135,13 @@ def standard_error(run: Run) -> float:
     return float(np.sqrt(np.mean(of_seeds**2) / episodes / len(of_seeds)))
 
 
-def before_training(run: Run) -> float | None:
-    """The return of the policy before its first update, if it was evaluated."""
-    found = [
-        line[RETURN]
-        for line in run.metrics()
-        if line["step"] <= run.config.settings.warmup and line.get(RETURN) is not None
-    ]
-    return float(np.mean(found)) if found else None
+def before_training(run: Run) -> Float[np.ndarray, " seeds"] | None:
+    """The returns of the policies before their first update, means over the evaluations; None if they were not evaluated."""
+    found = curve(run, RETURN)
+    if found is None or not (before := found[0] <= run.config.settings.warmup).any():
+        return None
+    returns = found[1][:, before].mean(axis=1)
+    return returns if np.isfinite(returns).all() else None
 
 
 def saturated(run: Run) -> int:

@@ -44,8 +44,10 @@ class Facts:
     """Whether its decoder descends a gradient, and so may not have learned yet what it sees."""
     untrained: str | None = None
     """Why the policy was never trained; None if it was."""
-    before: float | None = None
-    """The return of the policy before its first update; None if it was not evaluated."""
+    warmup: int = 0
+    """The steps before the first update."""
+    before: Float[np.ndarray, " seeds"] | None = None
+    """The returns of the policies before their first update; None if they were not evaluated."""
     saturated: int = 0
     """How many seeds' policies choose the same action, at its bounds, in all states at the end."""
     directory: str = "RUN"
@@ -93,7 +95,7 @@ def learned(run: Facts) -> str:
     episodes = "1 episode" if len(run.random) == 1 else f"{len(run.random)} episodes"
     by_chance = f"random actions get {shown(float(run.random.mean()))} ± {shown(deviation(run.random))} in {episodes}"
     if run.before is not None:
-        by_chance += f", the policy before training {shown(run.before)}"
+        by_chance += f", the policy before training {shown(float(run.before.mean()))}"
     if has_learned(run):
         return f"It learned. {reached}; {by_chance}."
     if seeds := successes(run):
@@ -106,20 +108,28 @@ def learned(run: Facts) -> str:
 
 
 def successes(run: Facts) -> int:
-    """How many seeds end above the return before training, and above random actions by two standard deviations of their returns."""
+    """How many seeds end above their own return before training, and above random actions by two deviations of their returns."""
     bar = float(run.random.mean()) + 2 * max(deviation(run.random), 1e-9)
-    return int(np.sum(run.returns[:, -1] > max(bar, -np.inf if run.before is None else run.before)))
+    return int(np.sum(run.returns[:, -1] > np.maximum(bar, -np.inf if run.before is None else run.before)))
 
 
 def has_learned(run: Facts) -> bool:
-    """Whether the mean return is above random actions, and above the policy before training, by two standard errors."""
-    return better_than_chance(run) and (run.before is None or run.last > run.before + 2 * noise(run))
+    """Whether the mean return is above random actions, and above the policies before training, by two standard errors."""
+    return better_than_chance(run) and has_gained(run, 2)
 
 
 def may_have_learned(run: Facts) -> bool:
     """Whether it is above both by one standard error, but not by two: more episodes can tell."""
-    bar = max(float(run.random.mean()), -np.inf if run.before is None else run.before)
-    return bar + noise(run) < run.last and not has_learned(run)
+    return float(run.random.mean()) + noise(run) < run.last and has_gained(run, 1) and not has_learned(run)
+
+
+def has_gained(run: Facts, errors: int) -> bool:
+    """Whether the mean return is above that before training by so many standard errors of the difference, taken seed by seed."""
+    if run.before is None:
+        return True
+    gains = run.returns[:, -1] - run.before
+    error = max(math.sqrt(2) * run.of_evaluation, deviation(gains) / math.sqrt(len(gains)), 1e-9)
+    return bool(np.nanmean(gains) > errors * error)
 
 
 def better_than_chance(run: Facts) -> bool:
@@ -280,9 +290,9 @@ def fell_from(run: Facts) -> tuple[int, float] | None:
     if evaluations is None:
         return None
     _, end, variation = evaluations
-    mean = np.nanmean(run.returns, axis=0)
+    mean = np.nanmean(of_trained(run), axis=0)
     best = int(np.nanargmax(mean))
-    start = float(run.random.mean()) if len(run.random) else float(mean[0])
+    start = float(run.random.mean()) if len(run.random) else float(np.nanmean(run.returns[:, 0]))
     top = float(mean[best])
     if len(run.random) and top <= start + 2 * noise(run):
         return None
@@ -290,12 +300,18 @@ def fell_from(run: Facts) -> tuple[int, float] | None:
     return (int(run.steps[best]), top) if fell else None
 
 
+def of_trained(run: Facts) -> Float[np.ndarray, "seeds evaluations"]:
+    """The returns, -inf for policies before their first update."""
+    return np.where(run.steps > run.warmup, run.returns, -np.inf)
+
+
 def seed_above_chance(run: Facts) -> tuple[int, float] | None:
     """Step and value of the best evaluation of any seed, if it beats random actions and the mean at the end does not."""
     if not len(run.random) or better_than_chance(run):
         return None
-    place, best = np.unravel_index(np.nanargmax(run.returns), run.returns.shape)
-    top = float(run.returns[place, best])
+    found = of_trained(run)
+    place, best = np.unravel_index(np.nanargmax(found), found.shape)
+    top = float(found[place, best])
     above = top > run.random.mean() + 3 * max(deviation(run.random), 1e-9)
     return (int(run.steps[best]), top) if above else None
 
