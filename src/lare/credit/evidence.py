@@ -44,6 +44,9 @@ ROUNDING = 1e-10
 factorised if features are collinear."""
 GAIN = 1e-3
 """The iteration to the fixed point ends when a round changes the log evidence by less than this."""
+STRONG, OFF, QUIET = 100, 1e4, 1e-6
+"""In the third start of a fit, the first group may explain `STRONG` times its equal share, each other one 1/`OFF` of it, and the
+noise `QUIET` times the variance of the returns."""
 ENOUGH = 2
 """With more episodes than this for each feature, a fit is not made from the beginning again."""
 LEAST_NOISE = 1e-10
@@ -145,10 +148,11 @@ def fit(
 ) -> Posterior:
     """The posterior under the precisions that the iteration to the fixed point gives.
 
-    The evidence may have several maxima while episodes are few: one where all variation is noise, and one where none is and the
-    features interpolate the returns. An iteration that starts near such a maximum stays there, however many episodes follow. So
-    there are two iterations: from `start`, and from equal shares of the groups with half of the variation as noise. The one that
-    reaches the larger evidence is taken. With more than `ENOUGH` episodes for each feature the second one has a single round.
+    The evidence may have several maxima while episodes are few: one where all variation is noise, and one where none is. An
+    iteration that starts near such a maximum stays there, however many episodes follow. So there are three iterations: from
+    `start`; from equal shares of the groups with half of the variation as noise; and from the first group alone with almost no
+    noise. The one that reaches the largest evidence is taken. With more than `ENOUGH` episodes for each feature the others have a
+    single round.
 
     Args:
         sums: the sums over episodes.
@@ -161,8 +165,10 @@ def fit(
     known = start.beta > 0
     equal = given.equal, 2 * given.free / given.q
     before = tuple(jnp.where(known, old, new) for old, new in zip((start.alpha, start.beta), equal, strict=True))
-    starts = jax.tree.map(lambda *leaves: jnp.stack(leaves), before, equal)
-    most = jnp.stack([jnp.array(rounds), jnp.where(known & (given.free < ENOUGH * len(group)), rounds, 1)])
+    alone = (OFF * given.equal).at[0].set(given.equal[0] / STRONG), given.free / (QUIET * given.q)
+    starts = jax.tree.map(lambda *leaves: jnp.stack(leaves), before, equal, alone)
+    few = given.free < ENOUGH * len(group)
+    most = jnp.where(jnp.stack([jnp.array(True), known & few, ~known | few]), rounds, 1)
     of_each = jax.lax.map(lambda one: fixed_point(given, *one), (*starts, most))
     found = jax.tree.map(lambda leaf: leaf[jnp.argmax(jnp.nan_to_num(of_each.log_evidence, nan=-jnp.inf))], of_each)
     return in_return_units(sums, form, given, found, otherwise=start)
