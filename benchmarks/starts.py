@@ -38,7 +38,7 @@ def from_fewer(count: int, sums: Sums, basis: Basis, start: Posterior) -> Poster
     known = start.beta > 0
     equal = given.equal, 2 * given.free / given.q
     before = tuple(jnp.where(known, old, new) for old, new in zip((start.alpha, start.beta), equal, strict=True))
-    found = [evidence.fixed_point(given, *one, ROUNDS) for one in (before, equal)[:count]]
+    found = [evidence.fixed_point(given, alpha, beta, ROUNDS) for alpha, beta in (before, equal)[:count]]
     best = jnp.argmax(jnp.nan_to_num(jnp.array([one.log_evidence for one in found]), nan=-jnp.inf))
     chosen = jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *found)
     return evidence.in_return_units(sums, 0, given, chosen, otherwise=start)
