@@ -265,6 +265,14 @@ def test_each_seed_is_compared_with_its_own_policy_before_training():
     assert said(ends, random, before=np.array([-40.3, -49.7]))[0].startswith("It learned. ")
 
 
+def test_a_rule_of_ones_own_tells_rewards_from_the_algorithm():
+    advice = said(FLAT - 51, return_r2=0.9, task="mine.toml")[2]
+    assert advice == (
+        "The proxy rewards predict returns well, so the algorithm may be the limit (a rule of your own can tell: "
+        "docs/bring-your-own-task.md, section 4). Next: more `--steps`, or another `--algorithm` (`lare algorithms`)."
+    )
+
+
 def test_the_best_policy_is_one_that_was_trained():
     lucky = np.array([[90.0, 80, 0, 0, 1, 0, 1, 0]])
     assert "at step 1,000 (90)" in said(lucky)[1]

@@ -215,11 +215,16 @@ def todo(run: Facts) -> list[str]:
         )
     elif len(run.random) and not has_learned(run):
         good = (run.return_r2 or 0) > MOSTLY
+        own_rule = " (a rule of your own can tell: docs/bring-your-own-task.md, section 4)" if is_own(run) else ""
         exactly = (
             f"`lare evaluate {run.directory} --episodes 50` tells more exactly; then " if may_have_learned(run) else ""
         )
         found.append(
-            ("The proxy rewards predict returns well, so the algorithm may be the limit. " if good else "")
+            (
+                "The proxy rewards predict returns well, so the algorithm may be the limit" + own_rule + ". "
+                if good
+                else ""
+            )
             + f"Next: {exactly}more `--steps`, or another `--algorithm` (`lare algorithms`)."
         )
         if good and not run.latent:
@@ -227,11 +232,16 @@ def todo(run: Facts) -> list[str]:
                 f"If state and action have more than {MOST_PAIRED} entries together, a score that depends on products of them, "
                 "such as price times power, needs a phi (`lare prompt`)."
             )
-    if not found and run.task.endswith(".toml") and len(run.random) and has_learned(run):
+    if not found and is_own(run) and len(run.random) and has_learned(run):
         found.append("Next: better than random actions may be far from good: compare it with a rule of your own.")
     if len(run.returns) == 1:
         found.append("One seed says little: another one may reach a different return (`--seeds 3`).")
     return found
+
+
+def is_own(run: Facts) -> bool:
+    """Whether the task is one of the user's own."""
+    return run.task.endswith(".toml")
 
 
 def what_explains(run: Facts) -> str:
