@@ -99,7 +99,8 @@ def test_two_tasks_of_one_name_are_not_compared(made):
         ),
         (
             [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": (60, 70)})],
-            "the runs have no step in common at which all of them have a value of evaluation/return",
+            "the runs have no step in common at which all of them have a value of evaluation/return: {runs}/Chase/a from 50 to "
+            "100; {runs}/Chase/b from 60 to 70",
         ),
         (
             [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": ()})],

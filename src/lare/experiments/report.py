@@ -241,7 +241,7 @@ def learning(task: str, runs: dict[str, Run], random: Float[np.ndarray, " episod
         if max(len(run.seeds) for run in runs.values()) > 1
         else "Band of the return: ± one standard deviation over the episodes of an evaluation.",
         *(["Grey area: the first steps, of random actions, before the first update."] if random_until else []),
-        *([f"{TOP} reach up to {REFERENCES[task][1]:,g}."] if task in REFERENCES else []),
+        *([f"{TOP} is about {REFERENCES[task][1]:,g}."] if task in REFERENCES else []),
     ]
     yield note(" ".join(explained))
 

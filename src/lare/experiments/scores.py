@@ -222,7 +222,9 @@ def grouped(runs: Mapping[str, Sequence[Run | Measured]], key: str) -> tuple[lis
             curves[place] = one.source, values
     steps = sorted(set.intersection(*(set(values) for _, values in curves.values())))
     if not steps:
-        raise LareError(f"the runs have no step in common at which all of them have a value of {key}")
+        sources = {source: (min(values), max(values)) for source, values in curves.values()}
+        spans = "; ".join(f"{source} from {first:,} to {last:,}" for source, (first, last) in sources.items())
+        raise LareError(f"the runs have no step in common at which all of them have a value of {key}: {spans}")
     return [group_of(label, tasks, curves, steps) for label in found], tasks
 
 

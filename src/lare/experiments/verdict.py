@@ -270,13 +270,15 @@ def quarters(run: Facts) -> tuple[float, float, float] | None:
 
 
 def is_rising(run: Facts) -> bool:
-    """Whether the last quarter is higher than the one before by more than evaluations vary, and rises by half of that itself."""
+    """Whether the last quarter is higher than the one before by more than evaluations vary, and by the error of the return at the
+    end; and whether it rises by half of that variation itself.
+    """
     found = quarters(run)
     if found is None:
         return False
     before, end, variation = found
     last = np.nanmean(run.returns, axis=0)[-max(2, run.returns.shape[1] // 4) :]
-    return bool(end - before > variation and last[-1] - last[0] > variation / 2)
+    return bool(end - before > max(variation, error_at_the_end(run)) and last[-1] - last[0] > variation / 2)
 
 
 def stuck(run: Facts) -> str | None:
