@@ -24,6 +24,7 @@ from lare.credit import evidence
 from lare.credit.basis import Basis, expand
 from lare.credit.closed_form import ROUNDS
 from lare.credit.evidence import Posterior, Sums
+from lare.credit.judging import r2_and_error
 from measure import write
 from stored import of_each_seed
 
@@ -35,13 +36,9 @@ EPISODES = 60
 def from_fewer(count: int, sums: Sums, basis: Basis, start: Posterior) -> Posterior:
     """A fit from the first one or two of the three starts."""
     given = evidence.problem(sums, 0, basis.group)
-    known = start.beta > 0
-    equal = given.equal, 2 * given.free / given.q
-    before = tuple(jnp.where(known, old, new) for old, new in zip((start.alpha, start.beta), equal, strict=True))
-    found = [evidence.fixed_point(given, alpha, beta, ROUNDS) for alpha, beta in (before, equal)[:count]]
-    best = jnp.argmax(jnp.nan_to_num(jnp.array([one.log_evidence for one in found]), nan=-jnp.inf))
-    chosen = jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *found)
-    return evidence.in_return_units(sums, 0, given, chosen, otherwise=start)
+    first = jax.tree.map(lambda leaf: leaf[:count], evidence.starts(given, start))
+    of_each = jax.lax.map(lambda one: evidence.fixed_point(given, *one, ROUNDS), first)
+    return evidence.in_return_units(sums, 0, given, evidence.most_likely(of_each), otherwise=start)
 
 
 def from_three(sums: Sums, basis: Basis, start: Posterior) -> Posterior:
@@ -86,10 +83,6 @@ def episodes(directory: str) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]
         yield means, {name: np.add.reduceat(one, begins) for name, one in truths.items()}, length, basis
 
 
-def r2(returns: np.ndarray, guesses: np.ndarray) -> float:
-    return float(1 - np.sum((returns - guesses) ** 2) / np.sum((returns - returns.mean()) ** 2))
-
-
 def main(directory: str) -> None:
     table: dict[str, dict[str, Any]] = {}
     fits = 0
@@ -104,7 +97,7 @@ def main(directory: str) -> None:
                 fewer = list(WAYS)[:2]
                 row = table.setdefault(score, {way: [] for way in WAYS} | {"caught": dict.fromkeys(fewer, 0)})
                 for way, found in of_way.items():
-                    row[way].append([r2(returns[a:b], found[a:b, 0]) for a, b in RANGES])
+                    row[way].append([r2_and_error(returns[a:b], found[a:b, 0])[0] for a, b in RANGES])
                 evidences = {way: found[10:, 1] for way, found in of_way.items()}
                 for way in fewer:
                     row["caught"][way] += int(np.sum(evidences["three starts"] - evidences[way] > 1))

@@ -36,8 +36,9 @@ def test_a_verdict_stands_on_top(runs, tmp_path):
     verdicts = re.findall(r'<p class="verdict"><strong>(.*?)\.</strong> (.*?)</p>', page)
     assert [name for name, _ in verdicts] == ["bayes", "episodic"]
     assert "random actions get " in verdicts[0][1]
-    assert "training on the return at the end alone gives here" in verdicts[0][1]
-    assert "than training on the return at the end alone gives here" not in verdicts[1][1]
+    compared = "training on the return at the end alone gives here"
+    assert re.search(f"(more than|less than|about as much as) {compared}", verdicts[0][1])
+    assert compared not in verdicts[1][1]
     assert page.index("verdict") < page.index("<table>") < page.index("<svg")
     assert "<code>" in page
 

@@ -162,16 +162,27 @@ def fit(
         rounds: the maximum number of rounds of each iteration.
     """
     given = problem(sums, form, group)
+    known, few = start.beta > 0, given.free < ENOUGH * len(group)
+    most = jnp.where(jnp.stack([jnp.array(True), known & few, ~known | few]), rounds, 1)
+    of_each = jax.lax.map(lambda one: fixed_point(given, *one), (*starts(given, start), most))
+    found = most_likely(of_each)
+    return in_return_units(sums, form, given, found, otherwise=start)
+
+
+def starts(given: Problem, start: Posterior) -> tuple[Float[Array, "3 groups"], Float[Array, "3"]]:
+    """The precisions alpha and beta of the three starts of `fit`. The first two are the same without an earlier fit."""
     known = start.beta > 0
     equal = given.equal, 2 * given.free / given.q
     before = tuple(jnp.where(known, old, new) for old, new in zip((start.alpha, start.beta), equal, strict=True))
     alone = (OFF * given.equal).at[0].set(given.equal[0] / STRONG), given.free / (QUIET * given.q)
-    starts = jax.tree.map(lambda *leaves: jnp.stack(leaves), before, equal, alone)
-    few = given.free < ENOUGH * len(group)
-    most = jnp.where(jnp.stack([jnp.array(True), known & few, ~known | few]), rounds, 1)
-    of_each = jax.lax.map(lambda one: fixed_point(given, *one), (*starts, most))
-    found = jax.tree.map(lambda leaf: leaf[jnp.argmax(jnp.nan_to_num(of_each.log_evidence, nan=-jnp.inf))], of_each)
-    return in_return_units(sums, form, given, found, otherwise=start)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), before, equal, alone)
+
+
+def most_likely(of_each: Posterior) -> Posterior:
+    """The posterior with the largest evidence, of some that are stacked. Of several that differ by less than `GAIN`, the first."""
+    evidence = jnp.nan_to_num(of_each.log_evidence, nan=-jnp.inf)
+    best = jnp.argmax(evidence > jnp.max(evidence) - GAIN)  # the first that is true
+    return jax.tree.map(lambda leaf: leaf[best], of_each)
 
 
 def in_return_units(

@@ -220,11 +220,7 @@ def todo(run: Facts) -> list[str]:
             f"`lare evaluate {run.directory} --episodes 50` tells more exactly; then " if may_have_learned(run) else ""
         )
         found.append(
-            (
-                "The proxy rewards predict returns well, so the algorithm may be the limit" + own_rule + ". "
-                if good
-                else ""
-            )
+            (f"The proxy rewards predict returns well, so the algorithm may be the limit{own_rule}. " if good else "")
             + f"Next: {exactly}more `--steps`, or another `--algorithm` (`lare algorithms`)."
         )
         if good and not run.latent:

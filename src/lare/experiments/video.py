@@ -39,7 +39,9 @@ def record_video(run: Run, path: str | Path, best: bool = False, deterministic: 
     check_video(path)
     if env_spec(run.config.task).agents > 1:
         if best or deterministic:
-            raise LareError("a film of many agents shows training with its credit: leave best and deterministic out")
+            raise LareError(
+                "many agents are filmed as they act in training, with their credit: leave best and deterministic out"
+            )
         pictures = agents.frames(run, watch(run))
         if pictures is None:
             raise LareError(f"{run.config.task.name} steps on the host, where only single agents are filmed")
