@@ -36,8 +36,9 @@ EPISODES = 60
 def from_fewer(count: int, sums: Sums, basis: Basis, start: Posterior) -> Posterior:
     """A fit from the first one or two of the three starts."""
     given = evidence.problem(sums, 0, basis.group)
-    first = jax.tree.map(lambda leaf: leaf[:count], evidence.starts(given, start))
-    of_each = jax.lax.map(lambda one: evidence.fixed_point(given, *one, ROUNDS), first)
+    alpha, beta = evidence.starts(given, start)
+    first = alpha[:count], beta[:count]
+    of_each = jax.lax.map(lambda one: evidence.fixed_point(given, one[0], one[1], ROUNDS), first)
     return evidence.in_return_units(sums, 0, given, evidence.most_likely(of_each), otherwise=start)
 
 
