@@ -23,8 +23,8 @@ def made(tmp_path):
         config = describe(spec, settings, ())
         (directory / "config.json").write_text(config.model_dump_json())
         lines = [
-            {"step": step, "seed": seed, "evaluation/return": value * share, "critic/loss": 1.0}
-            for step, share in zip(steps, (0.5, 1.0), strict=bool(steps))
+            {"step": step, "seed": seed, "evaluation/return": value * place / len(steps), "critic/loss": 1.0}
+            for place, step in enumerate(steps, 1)
             for seed, value in zip(settings.all_seeds, returns, strict=True)
         ]
         (directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))

@@ -88,6 +88,9 @@ def test_draws_are_told_apart_from_seeds(made):
     assert row.over_draws.value == pytest.approx(51)
     assert (row.over_draws.low, row.over_draws.high) == (pytest.approx(50, abs=0.5), pytest.approx(52, abs=0.5))
     assert row.iqm.high - row.iqm.low == pytest.approx(100)
+    head, (shown,) = cells(statistics.compare(by_label(runs)))
+    assert dict(zip(head, shown, strict=True))["draws"] == "3"
+    assert "draws" not in cells(statistics.compare(by_label(runs[:1])))[0]
 
 
 def test_several_tasks_are_laid_between_fixed_ends(made, tmp_path):
@@ -129,6 +132,40 @@ def test_tasks_without_a_common_scale_are_compared_together_by_the_order_of_thei
     assert over_all(other) == []  # no dense on Depot
     assert over_all(found[:1]) == []
     assert "All tasks" not in (tmp_path / "page.html").read_text()
+
+
+def test_the_difference_from_the_baseline_has_an_interval_of_both_methods(made):
+    """Each method scores 0 or 10 more, so the difference of two draws is 10 less to 10 more than that of the means."""
+    runs = [made("a", [0.0, 10.0]), made("b", [100.0, 110.0], method="rd"), made("c", [1.0], method="rrd")]
+    first, second, single = statistics.compare(by_label(runs)).rows
+    assert (first.difference, single.difference) == (None, None)
+    assert second.difference == statistics.Estimate(100.0, 90.0, 110.0)
+
+
+def test_scores_are_compared_at_a_step_and_over_the_last_quarter(made, command, tmp_path):
+    """Five evaluations: the scores are a fifth, two fifths, ... of the last one."""
+    steps = (20, 40, 60, 80, 100)
+    runs = [made("a", [5.0, 15.0], steps=steps), made("b", [10.0, 20.0], method="rd", steps=steps)]
+    labels = by_label(runs)
+    late = statistics.compare(labels, late=True)
+    assert [row.mean for row in late.rows] == pytest.approx([9.0, 13.5])  # steps 80 and 100
+    assert what_scores_are(late) == (
+        "Scores are true returns on Chase averaged over the evaluations after three quarters of 100 steps."
+    )
+    early = statistics.compare(labels, step=60)
+    assert [row.mean for row in early.rows] == pytest.approx([6.0, 9.0])
+    assert list(early.curves["rd"].x) == [20, 40, 60]
+    assert what_scores_are(early) == "Scores are true returns on Chase at step 60."
+    with pytest.raises(
+        LareError,
+        match=r"^not all runs have a value of evaluation/return at step 50: all have one at 20, 40, 60, 80, 100$",
+    ):
+        statistics.compare(labels, step=50)
+    places = [run.directory for run in runs]
+    status, out, _ = command("compare", *places, "--at", 80, "--late", "--out", tmp_path / "late.html")
+    assert status == 0
+    assert "after three quarters of 80 steps" in out
+    assert "after three quarters of 80 steps" in (tmp_path / "late.html").read_text()
 
 
 def test_a_missing_table_over_all_tasks_is_said(made, command):
@@ -231,13 +268,14 @@ def test_a_probability_of_one_has_its_chance_beside_it(made):
     assert first.p is None
     assert (str(better.better), better.p) == ("1.000", pytest.approx(1 / 6))
     assert (str(worse.better), worse.p) == ("0.000", pytest.approx(1 / 6))
-    assert cells(statistics.compare(by_label(runs)))[1][-1] == "0.17"
+    head, rows = cells(statistics.compare(by_label(runs)))
+    assert (head[-1], rows[1][-1]) == ("p", "0.17")
 
 
 def test_single_seeds_have_no_intervals(made):
     compared = statistics.compare(by_label([made("a", [-347.3176]), made("b", [2.0], method="rd")]))
-    assert cells(compared) == [
-        ("dense (baseline)", "1", "-", "-347.3", "-347.3", "-", "-", "-"),
-        ("rd", "1", "-", "2.000", "2.000", "-", "-", "-"),
+    assert cells(compared)[1] == [
+        ("dense (baseline)", "1", "-347.3", "-347.3", "-", "-", "-"),
+        ("rd", "1", "2.000", "2.000", "-", "-", "-"),
     ]
     assert what_scores_are(compared).endswith(" at step 100, the last at which all runs were evaluated.")

@@ -349,12 +349,23 @@ def test_such_a_report_prints_the_latent_function_that_is_in_use(run, neighbour)
 
 
 def test_the_command_says_what_a_report_leaves_out(run, neighbour, command):
-    status, _, noted = command("report", run({"environment": "a_neighbours_file:X-v0"}))
-    assert (status, noted) == (
-        0,
+    place = run({"environment": "a_neighbours_file:X-v0"})
+    left_out = (
         "the module a_neighbours_file was not imported, so random play, credit and factors are left out: "
-        "set LARE_TRUST=a_neighbours_file to allow the import\n",
+        "set LARE_TRUST=a_neighbours_file to allow the import\n"
     )
+    status, _, noted = command("report", place)
+    assert (status, noted) == (0, left_out)
+    (place / "report.html").write_text("complete")
+    status, _, noted = command("report", place)
+    assert (status, noted) == (
+        2,
+        f"lare: {place}/report.html would be replaced by a page without random play, credit and factors, because the module "
+        "a_neighbours_file is not imported: set LARE_TRUST=a_neighbours_file, or write another file with --out\n",
+    )
+    assert (place / "report.html").read_text() == "complete"
+    status, _, noted = command("report", place, "--out", place / "poorer.html")
+    assert (status, noted) == (0, left_out)
 
 
 def test_what_is_installed_or_here_already_is_no_neighbours_file(run):

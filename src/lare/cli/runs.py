@@ -224,8 +224,15 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = False) ->
     if film:
         draw_without_a_screen()
     found = run_directories(runs)
+    unknown = sorted({one for run in found if (one := unknown_module(read_config(run).task)) is not None})
+    usual = found[0] / "report.html"
+    if unknown and out is None and usual.exists():
+        raise LareError(
+            f"{usual} would be replaced by a page without random play, credit and factors, because the module {unknown[0]} is not "
+            f"imported: set {TRUSTED}={','.join(unknown)}, or write another file with --out"
+        )
     say(f"wrote {write_report(found, out, film)}")
-    for module in sorted({one for run in found if (one := unknown_module(read_config(run).task)) is not None}):
+    for module in unknown:
         progress(
             f"the module {module} was not imported, so random play, credit and factors are left out: set {TRUSTED}={module} to "
             "allow the import"

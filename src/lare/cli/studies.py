@@ -71,6 +71,8 @@ def sweep(
 def compare(
     runs: RunDirectories,
     metric: Annotated[str, tyro.conf.arg(metavar="KEY")] = "evaluation/return",
+    at: Annotated[int | None, tyro.conf.arg(metavar="STEP")] = None,
+    late: bool = False,
     out: Path = Path("compare.html"),
 ) -> None:
     """Compare methods by their runs: interquartile means with bootstrap intervals, profiles, probability of improvement.
@@ -79,6 +81,8 @@ def compare(
         runs: run directories, directories that contain some, such as that of a sweep, or .csv files with results of other programs
             (docs/sweeps.md). The first method is the baseline that the others are compared with.
         metric: the key of metrics.jsonl to compare.
+        at: the step at which runs are compared; by default the last one at which all were evaluated.
+        late: compare means over the evaluations after three quarters of the steps, which vary less than the last one.
         out: the page to write.
     """
     from lare.experiments import compare as page
@@ -87,11 +91,11 @@ def compare(
     found, remarks = page.find_all(runs, metric)
     for remark in remarks:
         progress(remark)
-    comparisons = page.write_comparisons(found, out, metric, remarks)
+    comparisons = page.write_comparisons(found, out, metric, remarks, at, late)
     for comparison in comparisons:
         if len(comparisons) > 1:
             say(f"\n{comparison.tasks[0]}")
-        show(page.HEAD, page.cells(comparison))
+        show(*page.cells(comparison))
         say(f"{page.what_scores_are(comparison)} {too_few(comparison)}".rstrip())
     if rows := page.cells_of_all(comparisons):
         say("\nAll tasks: each run is compared with the runs on the same task.")

@@ -13,7 +13,8 @@ from lare.experiments.scores import REFERENCES, RETURN, SUMMED_RETURN, Measured,
 from lare.experiments.statistics import REPETITIONS, Comparison, Estimate, compare, over_all, plus_minus, too_few
 from lare.run.directory import Run, read_measured
 
-HEAD = ("method", "seeds", "draws", "IQM [95%]", "mean ± sd", "mean [95%], draws", "above baseline [95%]", "p")
+HEAD = ("method", "seeds", "IQM [95%]", "mean ± sd", "minus baseline [95%]", "above baseline [95%]", "p")
+OF_DRAWS = ("draws", "mean [95%], draws")
 HEAD_OF_ALL = ("all tasks", "seeds", "above baseline [95%]", "p")
 
 
@@ -126,20 +127,21 @@ def comparable(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], li
     return found, remarks
 
 
-def cells(comparison: Comparison) -> list[tuple[str, ...]]:
-    """The table, as text."""
-    return [
+def cells(comparison: Comparison) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """The head of the table and its rows, as text. It has columns for draws if a method has several."""
+    draws = any(row.draws > 1 for row in comparison.rows)
+    rows = [
         (
             named(row.label, place),
             str(row.seeds),
-            str(row.draws) if row.draws > 1 else "-",
             str(row.iqm),
             plus_minus(row.mean, row.deviation),
-            "-" if row.over_draws is None else str(row.over_draws),
-            *shown(row.better, row.p),
+            *shown(row.difference, row.better, row.p),
+            *((str(row.draws), shown(row.over_draws)[0]) if draws else ()),
         )
         for place, row in enumerate(comparison.rows)
     ]
+    return (*HEAD, *OF_DRAWS) if draws else HEAD, rows
 
 
 def cells_of_all(found: Sequence[Comparison]) -> list[tuple[str, ...]]:
@@ -154,14 +156,17 @@ def named(label: str, place: int) -> str:
     return label if place else f"{label} (baseline)"
 
 
-def shown(better: Estimate | None, p: float | None) -> tuple[str, str]:
-    return "-" if better is None else str(better), "-" if p is None else f"{p:.2g}"
+def shown(*found: Estimate | float | None) -> tuple[str, ...]:
+    """Estimates and probabilities as text; "-" for those that are not known."""
+    return tuple("-" if one is None else f"{one:.2g}" if isinstance(one, float) else str(one) for one in found)
 
 
 def what_scores_are(comparison: Comparison) -> str:
     """What the scores are, in a sentence or two."""
-    step = int(comparison.curves[comparison.rows[0].label].x[-1])
-    when = f"at step {step:,}, the last at which all runs were evaluated"
+    steps = f"{int(comparison.curves[comparison.rows[0].label].x[-1]):,}"
+    last = "" if comparison.step else ", the last at which all runs were evaluated"
+    late = f"averaged over the evaluations after three quarters of {steps} steps"
+    when = late if comparison.late else f"at step {steps}{last}"
     what = "true returns" if comparison.metric == RETURN else comparison.metric
     if not comparison.normalised:
         return f"Scores are {what} on {comparison.tasks[0]} {when}."
@@ -171,36 +176,44 @@ def what_scores_are(comparison: Comparison) -> str:
 
 MEANINGS = (
     "IQM: interquartile mean over seeds and tasks; of fewer than four scores it is the mean. sd: standard deviation over the "
-    "seeds (n - 1). Above baseline: the probability that a run scores more than one of the baseline, the first method; of a "
-    "single seed it is not given, and one that is 0 or 1 on every task has no interval. If the score is an error or a loss, a low "
+    "seeds (n - 1). Minus baseline: the IQM minus that of the baseline, the first method. Above baseline: the probability that a "
+    "run scores more than one of the baseline; one that is 0 or 1 on every task has no interval. Neither is given for a single "
+    "seed. If the score is an error or a loss, a low "
     "probability is good. p: the probability of at least so many won pairs of runs by chance or, if fewer than half were won, of "
     "so many lost ones (exact Mann-Whitney test, one-sided: a two-sided p is twice as large)."
 )
 
 
 def write_comparisons(
-    runs: Mapping[str, Sequence[Run | Measured]], out: Path, metric: str = RETURN, remarks: Sequence[str] = ()
+    runs: Mapping[str, Sequence[Run | Measured]],
+    out: Path,
+    metric: str = RETURN,
+    remarks: Sequence[str] = (),
+    step: int | None = None,
+    late: bool = False,
 ) -> list[Comparison]:
-    """Compare runs by their labels, and write the page, with remarks on the runs at its end.
+    """Compare runs by their labels (`compare`), and write the page, with remarks on the runs at its end.
 
     Raises:
         LareError: the runs cannot be compared, or the file cannot be written.
     """
-    found = comparisons(runs, metric)
+    found = comparisons(runs, metric, step, late)
     title = f"{', '.join(task for one in found for task in one.tasks)}: {len(runs)} contenders"
     write_page(out, title, "\n".join([*body(title, found), *(note(f"Note: {remark}.") for remark in remarks)]))
     return found
 
 
-def comparisons(runs: Mapping[str, Sequence[Run | Measured]], metric: str = RETURN) -> list[Comparison]:
+def comparisons(
+    runs: Mapping[str, Sequence[Run | Measured]], metric: str = RETURN, step: int | None = None, late: bool = False
+) -> list[Comparison]:
     """One comparison over all tasks; one of each task if their scores have no common scale."""
     by_task: dict[str, dict[str, list[Run | Measured]]] = {}
     for label, of_label in runs.items():
         for one in of_label:
             by_task.setdefault(task_of(one), {}).setdefault(label, []).append(one)
     if len(by_task) == 1 or (metric == RETURN and all(task in REFERENCES for task in by_task)):
-        return [compare(runs, metric)]
-    return [compare(by_task[task], metric) for task in sorted(by_task)]
+        return [compare(runs, metric, step, late)]
+    return [compare(by_task[task], metric, step, late) for task in sorted(by_task)]
 
 
 def task_of(one: Run | Measured) -> str:
@@ -213,7 +226,8 @@ def body(title: str, found: Sequence[Comparison]) -> Iterable[str]:
     for comparison in found:
         if len(found) > 1:
             yield f"<h2>{escape(comparison.tasks[0])}</h2>"
-        yield table(HEAD, cells(comparison), range(1, len(HEAD)))
+        head, rows = cells(comparison)
+        yield table(head, rows, range(1, len(head)))
         yield note(f"{what_scores_are(comparison)} {too_few(comparison)}".rstrip())
         score = (
             "score" if comparison.normalised else "true return" if comparison.metric == RETURN else comparison.metric

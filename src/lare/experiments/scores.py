@@ -73,6 +73,8 @@ class Group:
     draws: tuple[int, ...]
     steps: tuple[int, ...]
     scores: Float[np.ndarray, "draws seeds tasks steps"]
+    compared: Float[np.ndarray, "draws seeds tasks"]
+    """The scores at the last of the steps, or their means over the last quarter of the steps."""
 
 
 def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
@@ -181,8 +183,20 @@ def other_functions(runs: Sequence[Run]) -> list[str]:
     return [f"phi on {task} ({names})" for task, names in told]
 
 
-def grouped(runs: Mapping[str, Sequence[Run | Measured]], key: str) -> tuple[list[Group], tuple[str, ...]]:
-    """The curves by label, and the tasks. Raises `LareError` if their table would be incomplete."""
+def grouped(
+    runs: Mapping[str, Sequence[Run | Measured]], key: str, step: int | None = None, late: bool = False
+) -> tuple[list[Group], tuple[str, ...]]:
+    """The curves by label, and the tasks.
+
+    Args:
+        runs: by label.
+        key: the metric.
+        step: the step at which runs are compared. By default the last one at which all of them have a value.
+        late: compare means over the evaluations after three quarters of that step.
+
+    Raises:
+        LareError: the table of the runs would be incomplete, or not all of them have a value at `step`.
+    """
     found = {
         label: [one if isinstance(one, Measured) else measured(one, key) for one in of_label]
         for label, of_label in runs.items()
@@ -225,10 +239,20 @@ def grouped(runs: Mapping[str, Sequence[Run | Measured]], key: str) -> tuple[lis
         sources = {source: (min(values), max(values)) for source, values in curves.values()}
         spans = "; ".join(f"{source} from {first:,} to {last:,}" for source, (first, last) in sources.items())
         raise LareError(f"the runs have no step in common at which all of them have a value of {key}: {spans}")
-    return [group_of(label, tasks, curves, steps) for label in found], tasks
+    if step is not None:
+        if step not in steps:
+            raise LareError(f"not all runs have a value of {key} at step {step:,}: all have one at {spans_of(steps)}")
+        steps = [one for one in steps if one <= step]
+    return [group_of(label, tasks, curves, steps, late) for label in found], tasks
 
 
-def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[int]) -> Group:
+def spans_of(steps: Sequence[int]) -> str:
+    """Steps in words: all of a few, or the first three and the last of many."""
+    named = [f"{step:,}" for step in steps]
+    return ", ".join(named if len(named) <= 6 else [*named[:3], "...", named[-1]])
+
+
+def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[int], late: bool) -> Group:
     draws, seeds = (sorted({key[place] for key in curves if key[0] == label}) for place in (2, 3))
 
     def values(draw: int, seed: int, task: str) -> list[float]:
@@ -242,8 +266,9 @@ def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[
         low, high = REFERENCES[task] if len(tasks) > 1 else (0.0, 1.0)
         return [(found[step] - low) / (high - low) for step in steps]
 
-    scores = [[[values(draw, seed, task) for task in tasks] for seed in seeds] for draw in draws]
-    return Group(label, tuple(seeds), tuple(draws), tuple(steps), np.array(scores))
+    scores = np.array([[[values(draw, seed, task) for task in tasks] for seed in seeds] for draw in draws])
+    first = next(place for place, step in enumerate(steps) if 4 * step > 3 * steps[-1]) if late else -1
+    return Group(label, tuple(seeds), tuple(draws), tuple(steps), scores, scores[..., first:].mean(axis=-1))
 
 
 def curve(lines: Sequence[Mapping[str, Any]], seed: int, key: str) -> dict[int, float]:

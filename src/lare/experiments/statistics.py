@@ -1,8 +1,8 @@
 """Honest statistics of few runs (Agarwal et al., "Deep RL at the edge of the statistical precipice", NeurIPS 2021), by rliable.
 
-The scores (see `scores.py`) are those of the last evaluation that all runs have. Intervals have 95%, by stratified bootstrap over
-the seeds. A method that was trained on several draws of the language model has a second interval, over the draws, each of which
-is a mean over its seeds.
+The scores (see `scores.py`) are those of the last evaluation that all runs have, unless the user asks for another step, or for
+means over the last quarter of the steps. Intervals have 95%, by stratified bootstrap over the seeds. A method that was trained on
+several draws of the language model has a second interval, over the draws, each of which is a mean over its seeds.
 """
 
 import contextlib
@@ -92,12 +92,14 @@ class Row:
     """Standard deviation over the seeds of their means over the tasks; None if there is one seed."""
     over_draws: Estimate | None
     """The mean, and its interval over the draws; None if there is one draw."""
+    difference: Estimate | None
+    """The interquartile mean minus that of the first method; None for the first method, and for single seeds."""
     better: Estimate | None
-    """Probability that a run scores more than a run of the first method; None for the first method, and for single seeds."""
+    """Probability that a run scores more than a run of the first method; None like `difference`."""
     p: float | None
     """Probability of at least so many won pairs of runs by chance, or of so few if fewer than half were won (`mann_whitney`).
 
-    None like `better`, and for more than `MOST_SPLITS` ways to split the runs, where the interval says enough.
+    None like `difference`, and for more than `MOST_SPLITS` ways to split the runs, where the interval says enough.
     """
 
 
@@ -125,6 +127,10 @@ class Comparison:
     """The scores themselves, by label."""
     metric: str
     """The key of the metric that is compared."""
+    step: int | None
+    """The step at which runs are compared, if the user has given one."""
+    late: bool
+    """Whether scores are means over the last quarter of the steps."""
 
 
 def too_few(comparison: Comparison) -> str:
@@ -140,19 +146,22 @@ def too_few(comparison: Comparison) -> str:
     )
 
 
-def compare(runs: Mapping[str, Sequence[Run | Measured]], key: str = RETURN) -> Comparison:
+def compare(
+    runs: Mapping[str, Sequence[Run | Measured]], key: str = RETURN, step: int | None = None, late: bool = False
+) -> Comparison:
     """Compare runs by their labels, on the tasks that all of them were trained on.
 
     Args:
         runs: for each label, one run for each task, seed and draw; see `by_label` and `read_results`.
         key: the metric to compare, a key of metrics.jsonl.
+        step, late: what a score is (`grouped`).
 
     Raises:
         LareError: the table of runs is incomplete, or rliable is not installed.
     """
-    groups, tasks = grouped(runs, key)
+    groups, tasks = grouped(runs, key, step, late)
     by_seed = {group.label: group.scores.mean(axis=0) for group in groups}
-    last = {label: scores[..., -1] for label, scores in by_seed.items()}
+    last = {group.label: group.compared.mean(axis=0) for group in groups}
     names = tuple(last)
     taus = np.linspace(min(map(np.min, last.values())), max(map(np.max, last.values())), 101)
     steps = np.array(groups[0].steps, float)
@@ -164,19 +173,31 @@ def compare(runs: Mapping[str, Sequence[Run | Measured]], key: str = RETURN) -> 
         len(tasks) > 1,
         {group.label: group for group in groups},
         key,
+        step,
+        late,
     )
 
 
 def row(group: Group, last: Mapping[str, Scores], first: str) -> Row:
     mine = last[group.label]
     (iqm,) = estimates(mine[..., None], interquartile_means)
-    over_draws = better = p = None
+    over_draws = difference = better = p = None
     if len(group.draws) > 1:
-        (over_draws,) = estimates(group.scores[..., -1].mean(axis=1), lambda scores: np.array([np.mean(scores)]))
+        (over_draws,) = estimates(group.compared.mean(axis=1), lambda scores: np.array([np.mean(scores)]))
     if group.label != first:
+        difference = of_iqms(mine, last[first])
         better, p = improvement(mine, last[first])
     mean, deviation = mean_and_deviation(mine.mean(axis=1))
-    return Row(group.label, len(group.seeds), len(group.draws), iqm, mean, deviation, over_draws, better, p)
+    return Row(group.label, len(group.seeds), len(group.draws), iqm, mean, deviation, over_draws, difference, better, p)
+
+
+def of_iqms(mine: Scores, first: Others) -> Estimate | None:
+    """The difference of two interquartile means; its bootstrap draws the runs of each method. None for single seeds."""
+    if min(len(mine), len(first)) < 2:
+        return None
+    return estimates((mine, first), lambda *both: np.subtract(*(interquartile_means(one[..., None]) for one in both)))[
+        0
+    ]
 
 
 def improvement(mine: Scores, first: Others) -> tuple[Estimate | None, float | None]:
@@ -207,7 +228,7 @@ def over_all(found: Sequence[Comparison]) -> list[OverAll]:
     last: dict[str, Scores] = {}
     for label in found[0].groups if len(found) > 1 else ():
         groups = [one.groups.get(label) for one in found]
-        scores = [group.scores[..., -1].mean(axis=0) for group in groups if group is not None]
+        scores = [group.compared.mean(axis=0) for group in groups if group is not None]
         if len(scores) == len(found) and len(set(map(len, scores))) == 1:
             last[label] = np.concatenate(scores, axis=1)
     firsts = {one.rows[0].label for one in found}
