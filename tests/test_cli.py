@@ -182,10 +182,13 @@ def test_verify_says_how_much_of_the_score_the_factors_explain(command, phi, spe
     )
     assert found
     assert float(found[1]) > 0.9
-    assert "\nFitted to all 30 episodes:\nThe factors explain " in out
+    assert (
+        "\nFitted to all 30 episodes (such shares may be high where R² is low, because these returns were seen):\nThe f"
+        in out
+    )
     assert "(before)" not in out
     _, both, _ = command("verify", phi, "--task", spec_file(), "--fit", "30", "--judges", "both")
-    assert "before" in both.partition("Fitted to all 30 episodes:")[2]
+    assert "before" in both.partition("Fitted to all 30 episodes")[2]
 
 
 @pytest.mark.parametrize(

@@ -95,6 +95,18 @@ def test_what_the_factors_leave_goes_with_the_entry_that_is_missing():
     assert np.abs(left[[0, 2]]).max() < 0.4
 
 
+def test_the_entries_share_what_a_fit_on_everything_explains():
+    """Two entries that pay twice as much as the factor, by a line and by a pair with a third entry."""
+    basis = Basis(1, 3, extended=True)
+    found = explain(*summed(basis, lambda u: u[:, 0] + 2 * u[:, 1] + 2 * u[:, 2] * u[:, 3], noise=0.01), 0, basis)
+    line, one, other = np.asarray(found.of_entries)
+    assert float(found.by_all) > 0.98
+    assert one == pytest.approx(other, abs=0.1)
+    assert 0.5 < float(found.by_all) - float(found.by_factors) < 0.95
+    assert line + one + other == pytest.approx(float(found.by_all) - float(found.by_factors), abs=0.1)
+    assert min(line, one + other) > 0.2
+
+
 def test_factors_that_tell_nothing():
     basis = Basis(2, 1, extended=False)
     found = explain(*summed(basis, np.array([0, 0, 1.0])), 0, basis)
@@ -106,6 +118,7 @@ def test_without_factors_the_entries_tell():
     found = explain(*summed(Basis(0, 3, extended=False), np.array([1.0, 0, 0])), 0, Basis(0, 3, extended=False))
     assert (float(found.by_factors), found.share.shape, found.slope.shape) == (0, (0,), (0,))
     assert float(found.by_all) > 0.98
+    np.testing.assert_allclose(found.of_entries, [found.by_all, 0, 0], atol=0.02)
 
 
 def test_an_entry_that_never_varies_goes_with_nothing():

@@ -44,6 +44,11 @@ def with_function(run, *digests):
     return Run(run.directory, run.config.model_copy(update={"function_sha256": digests}), ())
 
 
+def test_a_method_has_one_label_on_tasks_that_are_trained_by_other_algorithms(made):
+    runs = [made("a", [1.0], algorithm="td3"), made("a", [2.0], "Depot", algorithm="ddpg")]
+    assert list(by_label(runs)) == ["dense"]
+
+
 def test_runs_of_two_functions_are_told_apart_by_them(made):
     """Whatever their seeds are; and not where two draws of the language model make up one row."""
     first, second = made("a", [1.0], method="lare-rd"), made("b", [2.0], method="lare-rd", seed=1)

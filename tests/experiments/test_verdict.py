@@ -25,7 +25,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
     [
         (
             np.vstack([RISING, RISING + 2]),
-            {"return_r2": 0.97, "latent": True, "at_the_end": 12.0},
+            {"return_r2": 0.97, "seen": "factors and raw entries", "at_the_end": 12.0},
             [
                 "It learned. The return is 71 ± 1.41 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1 in 3 "
                 "episodes.",
@@ -37,7 +37,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
         ),
         (
             FLAT - 51,
-            {"return_r2": -3.0, "latent": True},
+            {"return_r2": -3.0, "seen": "factors and raw entries"},
             [
                 "It has not learned yet. The return is 0 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from factors and raw entries, explain next to nothing of the score: R² of the last returns, "
@@ -149,7 +149,7 @@ def said(returns, random=CHANCE, task="Toy", **facts):
         ),
         (
             FLAT / 100 - 52,
-            {"return_r2": 0.99, "latent": True},
+            {"return_r2": 0.99, "seen": "factors and raw entries"},
             [
                 "It got worse than random actions. The return is -51.5 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from factors and raw entries, explain nearly all of the score: R² of the last returns, before "
@@ -195,12 +195,12 @@ def said(returns, random=CHANCE, task="Toy", **facts):
         ),
         (
             np.vstack([FLAT - 51, FLAT - 51]),
-            {"return_r2": -0.93, "usual_r2": 0.98, "latent": True},
+            {"return_r2": -0.93, "usual_r2": 0.98, "seen": "factors and raw entries"},
             [
                 "It has not learned yet. The return is 0 after 8,000 steps (mean over 2 seeds); random actions get 0 ± 1 in 3 "
                 "episodes.",
-                "Its proxy rewards, from factors and raw entries, usually explain the score (median R² of returns: 0.98), but not "
-                "the last episodes (R² -0.93): the policy has changed, and the decoder has to adapt.",
+                "Its proxy rewards, from factors and raw entries, usually explain nearly all of the score (median R² of returns: "
+                "0.98), but not the last episodes (R² -0.93): perhaps the policy has changed, and the decoder has not adapted yet.",
                 "Next: more `--steps`, or another `--algorithm` (`lare algorithms`).",
             ],
         ),
@@ -270,6 +270,21 @@ def test_a_rule_of_ones_own_tells_rewards_from_the_algorithm():
     assert advice == (
         "The proxy rewards predict returns well, so the algorithm may be the limit (a rule of your own can tell: "
         "docs/bring-your-own-task.md, section 4). Next: more `--steps`, or another `--algorithm` (`lare algorithms`)."
+    )
+
+
+def test_the_verdict_names_what_the_decoder_sees_and_how_much_of_the_score_that_explains():
+    told = said(FLAT - 51, return_r2=-1.15, usual_r2=0.24, seen="factors")[1]
+    assert told == (
+        "Its proxy rewards, from factors, usually explain a part of the score (median R² of returns: 0.24), but not the last "
+        "episodes (R² -1.15): perhaps the policy has changed, and the decoder has not adapted yet."
+    )
+
+
+def test_returns_do_not_show_how_rewards_are_divided_among_agents():
+    assert said(FLAT - 51, return_r2=0.9, many=True)[2].startswith(
+        "The proxy rewards predict returns well, so the algorithm may be the limit, or how the rewards are divided among the "
+        "agents, which returns do not show. Next: "
     )
 
 

@@ -8,7 +8,7 @@ from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from lare.errors import LareError
 from lare.latent.function import verified
 from lare.llm.prompts import candidate
-from lare.tasks.documentation import without_clause
+from lare.tasks.documentation import plain, without_clause
 from lare.tasks.draft import bodies
 from lare.tasks.load import load_task
 from lare.tasks.new import draft
@@ -117,6 +117,18 @@ def test_entries_keep_their_lines_and_are_counted_once(tmp_path):
     assert task.observation == "3 entries.\n0: floor\n1 to 2: waiting people, by floor"
 
 
+def test_the_cells_of_a_table_have_the_titles_of_its_head():
+    text = """
+    | Num | Observation | Min | Max | Reward |
+    |:---:|-------------|-----|-----|--------|
+    | 0   | height      | 0   | 1   | none   |
+    | 1   | speed       |     | 3   |        |
+    The rest.
+    | 2 | no head |
+    """
+    assert plain(text) == ["0: height; Min 0; Max 1; none", "1: speed; Max 3", "The rest.", "2: no head"]
+
+
 def test_a_size_that_the_text_states_is_not_repeated():
     texts = {"observation": "3 entries: speeds", "action": "31 entries: forces"}
     heads = {"observation": "3 entries.", "action": "3 entries, each between -1 and 1."}
@@ -136,10 +148,9 @@ def test_whatever_speaks_of_rewards_is_left_out(tmp_path):
     assert task.action == "1 entry, between -2 and 2.\n1: The second row; -"
     assert drafted.left_out == (
         "You get a reward of 1 for each catch.",
-        "Num: Action; Reward",
         '0: guess a \\o/ """; no cost',
     )
-    assert "3 sentences or rows" in drafted.toml
+    assert "2 sentences or rows" in drafted.toml
     assert drafted.unused == ("rewards",)
 
 
@@ -297,7 +308,7 @@ def test_agents_of_a_continuous_environment_document_themselves_in_a_module():
     drafted = draft("pettingzoo/pettingzoo.sisl.multiwalker_v9:parallel_env")
     assert drafted.missing == ("action",)
     assert 'action = """\n4 entries, each between -1 and 1.\nFILL IN' in drafted.toml
-    assert "0: Hull angle; [0, 2*pi]" in drafted.toml
+    assert "0: Hull angle; Values [0, 2*pi]" in drafted.toml
     assert "max_episode_steps" not in drafted.toml
 
 

@@ -22,6 +22,7 @@ def found(**changes):
         "varied": np.array([True, True]),
         "by_factors": 0.9,
         "by_all": 0.97,
+        "of_entries": np.zeros(2),
         "slope": np.array([1.0, 2.0]),
         "uncertainty": np.diag([0.01, 0.01]),
         "linear": np.array([0.81, 1.0]),
@@ -156,6 +157,30 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
             ["Raw entries explain 97% of the variation of the mean reward of a step in 40 episodes."],
         ),
         (found(), None, [], [], ["Raw entries explain 97% of the variation of the returns of 40 episodes."]),
+        (
+            found(of_entries=np.array([0.2, 0.77])),
+            None,
+            [],
+            ENTRIES,
+            [
+                "Raw entries explain 97% of the variation of the returns of 40 episodes. The largest shares: entry 1 (the foot) "
+                "77%, entry 0 20%."
+            ],
+        ),
+        (
+            found(by_factors=0.8, left=np.zeros(2), of_entries=np.array([0.02, 0.4])),
+            None,
+            FACTORS,
+            ENTRIES,
+            [
+                "The factors explain 80% of the variation of the returns of 40 episodes, raw entries another 17%.",
+                SHARES,
+                "- cost: 65%, +2 ± 0.1",
+                "- speed: 25%, +1 ± 0.1",
+                "In a fit on factors and raw entries, these entries have the largest shares: entry 1 (the foot) 40%. phi may lack "
+                "a factor that is computed from them.",
+            ],
+        ),
         (found(episodes=19), None, FACTORS, ENTRIES, []),
         (
             found(by_all=np.nan),

@@ -6,9 +6,10 @@ beta of the noise of a step, a fit explains the share
     1 - (1 / beta) / (q / (N - 1))
 
 of the variation. This is an R^2 that is corrected for the degrees of freedom of the fit. A factor's part of this share is
-proportional to the covariance of its features with the prediction, the sum of their mu_i (S mu)_i. The parts of all factors add
-up to the share. A part is negative if the factor offsets others: if it pays less in episodes in which they pay more. The
-correlation of the residual of a fit on the factors alone with the mean of raw entry j over an episode is
+proportional to the covariance of its features with the prediction, the sum of their mu_i (S mu)_i. The parts of all factors add up
+to the share. A part is negative if the factor offsets others: if it pays less in episodes in which they pay more. The parts of raw
+entries are those of a fit on factors and entries together. The correlation of the residual of a fit on the factors alone with the
+mean of raw entry j over an episode is
 
     (p - S mu)_j / sqrt(S_jj (q - 2 mu . p + mu . S mu))
 
@@ -63,6 +64,8 @@ class Explanation(NamedTuple):
     """Share of the returns' variation that the factors explain, with their shapes and pairs; 0 if there are no factors."""
     by_all: Float[Array, ""]
     """Share of the variation that factors and raw entries explain together."""
+    of_entries: Float[Array, " entries"]
+    """The part of `by_all` that each raw entry has, with its shapes and half of its pairs."""
     slope: Float[Array, " factors"]
     """How much a step's reward rises if a factor rises by one standard deviation: the slope of the line that is closest to its
     effect in the fit on factors; 0 if its mean has not varied. If the score is an average: the rise for a step of an episode of
@@ -107,36 +110,47 @@ def explain(sums: Sums, steps: Steps, form: Int[Array, ""] | int, basis: Basis) 
     """Explain returns by sums over the features of a basis, in float64."""
     group, of_factors = basis.group, basis.of_factors
     whole = evidence.fit(sums, form, group, evidence.unknown(basis.size, len(basis.sizes)), ROUNDS)
-    by_all = explained(sums, form, group, whole)
+    by_all, shaped = explained(sums, form, group, whole), int(basis.extended)
+    part, waves = parts(sums, form, group, whole, by_all)[~of_factors], shaped * basis.frequencies_of_entries
+    of_entries = jnp.add(*of_each(part, basis.used_entries, waves, shaped * basis.paired_entries))
     of_steps, none = (form == SUM) & lengths_differ(sums), jnp.zeros(0)
     if not of_factors.any():
         left = jnp.zeros(basis.used_entries)
         return Explanation(
-            sums.episodes, of_steps, none > 0, jnp.zeros(()), by_all, none, jnp.zeros((0, 0)), none, none, none, left
+            sums.episodes,
+            of_steps,
+            none > 0,
+            jnp.zeros(()),
+            by_all,
+            of_entries,
+            none,
+            jnp.zeros((0, 0)),
+            none,
+            none,
+            none,
+            left,
         )
     alone, numbers = restricted(sums, np.flatnonzero(of_factors)), group[of_factors]
     fitted = evidence.fit(alone, form, numbers, evidence.unknown(len(numbers), int(numbers.max()) + 1), ROUNDS)
     sigma = evidence.covariance(alone, form, numbers, fitted)
-    given = evidence.problem(alone, form, numbers)
-    unit = jnp.where(given.unit > 0, given.unit, 1)
-    part = fitted.weight / unit * (given.s @ (fitted.weight / unit))
     by_factors = explained(alone, form, numbers, fitted)
-    own, paired = of_each(part, basis)
-    scale = by_factors / jnp.where(jnp.sum(part) > 0, jnp.sum(part), 1)
+    part = parts(alone, form, numbers, fitted, by_factors)
+    own, paired = of_each(part, basis.factors, shaped * FREQUENCIES, shaped * basis.factors)
     slope, uncertainty, linear = effects(fitted.weight, sigma, steps, basis)
     # r_hat of an average is divided by T
     length = jnp.where(form == AVERAGE, sums.steps / jnp.maximum(sums.episodes, 1), 1)
     return Explanation(
         sums.episodes,
         of_steps,
-        jnp.diagonal(given.s)[: basis.factors] > SAME**2 * sums.steps,
+        jnp.diagonal(evidence.problem(alone, form, numbers).s)[: basis.factors] > SAME**2 * sums.steps,
         by_factors,
         jnp.maximum(by_all, by_factors),
+        of_entries,
         slope / length,
         uncertainty / length**2,
         linear,
-        scale * (own + paired),
-        scale * paired,
+        own + paired,
+        paired,
         residual(sums, form, basis, fitted, of_factors),
     )
 
@@ -164,15 +178,31 @@ def explained(
     return jnp.where((given.free > 1) & (given.unit > 0), jnp.clip(share, 0, 1), jnp.nan)
 
 
-def of_each(part: Float[Array, " features"], basis: Basis) -> tuple[Float[Array, " factors"], Float[Array, " factors"]]:
-    """The sums of the features' parts for each factor: of its own features, and of its pairs. A pair gives half to each factor."""
-    total = part[: basis.factors]
-    if not basis.extended:
-        return total, jnp.zeros_like(total)
-    one, other = np.triu_indices(basis.factors, 1)
-    pairs = part[basis.factors * SHAPED :] / 2
-    own = jnp.sum(part[: basis.factors * SHAPED].reshape(SHAPED, basis.factors), axis=0)
-    return own, jnp.zeros_like(total).at[one].add(pairs).at[other].add(pairs)
+def parts(
+    sums: Sums,
+    form: Int[Array, ""] | int,
+    group: Int[np.ndarray, " features"],
+    known: Posterior,
+    share: Float[Array, ""],
+) -> Float[Array, " features"]:
+    """The part of the explained share that each feature has."""
+    given = evidence.problem(sums, form, group)
+    weight = known.weight / jnp.where(given.unit > 0, given.unit, 1)
+    part = weight * (given.s @ weight)
+    return share * part / jnp.where(jnp.sum(part) > 0, jnp.sum(part), 1)
+
+
+def of_each(
+    part: Float[Array, " features"], inputs: int, frequencies: int, paired: int
+) -> tuple[Float[Array, " inputs"], Float[Array, " inputs"]]:
+    """The sums of the features' parts for each factor, or for each entry: of its own features, and of its pairs.
+
+    A pair gives half to each of its inputs. Either all of the inputs are paired, or none.
+    """
+    single, (one, other) = 1 + 2 * frequencies, np.triu_indices(paired, 1)
+    own = jnp.sum(part[: single * inputs].reshape(single, inputs), axis=0)
+    pairs = part[single * inputs :] / 2
+    return own, jnp.zeros_like(own).at[one].add(pairs).at[other].add(pairs)
 
 
 def effects(

@@ -15,6 +15,8 @@ NOTICEABLE = 0.05
 """The form of a factor's effect is only reported if its share of the variation is larger than this."""
 STRAIGHT = 0.8
 """The effect of a factor is curved if the closest line has less than this part of its variance."""
+MUCH = 0.1
+"""The raw entries that explain most are named if they add more than this share of the variation to what the factors explain."""
 STRIKING = 0.3
 """A raw entry is reported if its correlation with the residual of the factors is larger than this."""
 FORMS = ("a sum", "an average")
@@ -120,7 +122,8 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
         )
     what = f"the mean reward of a step in {count} episodes" if found.of_steps else f"the returns of {count} episodes"
     if not factors:
-        return [*said, f"Raw entries explain {found.by_all:.0%} of the variation of {what}."]
+        shares = f" The largest shares: {named}." if (named := largest(found, entries)) else ""
+        return [*said, f"Raw entries explain {found.by_all:.0%} of the variation of {what}.{shares}"]
     more = float(found.by_all - found.by_factors)
     said.append(
         f"The factors explain {found.by_factors:.0%} of the variation of {what}"
@@ -137,6 +140,11 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
             "below 0%: it offsets others), and by how much a step's reward rises with one standard deviation of it:"
         )
         said += factor_lines(found, factors)
+    if entries and more > MUCH and (named := largest(found, entries)):
+        said.append(
+            f"In a fit on factors and raw entries, these entries have the largest shares: {named}. phi may lack a factor that is "
+            "computed from them."
+        )
     if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:
         place = int(np.argmax(np.abs(found.left)))
         way = "large" if found.left[place] > 0 else "small"
@@ -145,6 +153,13 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
             f"(correlation {found.left[place]:+.2f}): a factor may be missing."
         )
     return said
+
+
+def largest(found: Explanation, entries: list[str]) -> str:
+    """The three raw entries with the largest shares, and these; empty if none is noticeable."""
+    order = np.argsort(-np.asarray(found.of_entries))[:3]
+    noticeable = [place for place in order if found.of_entries[place] > NOTICEABLE]
+    return ", ".join(f"{entries[place]} {found.of_entries[place]:.0%}" for place in noticeable)
 
 
 def r2_shown(value: float) -> str:

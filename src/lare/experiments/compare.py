@@ -178,9 +178,9 @@ MEANINGS = (
     "IQM: interquartile mean over seeds and tasks; of fewer than four scores it is the mean. sd: standard deviation over the "
     "seeds (n - 1). Minus baseline: the IQM minus that of the baseline, the first method. Above baseline: the probability that a "
     "run scores more than one of the baseline; one that is 0 or 1 on every task has no interval. Neither is given for a single "
-    "seed. If the score is an error or a loss, a low "
-    "probability is good. p: the probability of at least so many won pairs of runs by chance or, if fewer than half were won, of "
-    "so many lost ones (exact Mann-Whitney test, one-sided: a two-sided p is twice as large)."
+    "seed. If the score is an error or a loss, a low probability is good. p: the probability of at least so many won pairs of runs "
+    "by chance or, if fewer than half were won, of so many lost ones (exact Mann-Whitney test, one-sided: a two-sided p is twice "
+    "as large). If a method has several draws of the language model, the mean over the draws of a seed counts as one run."
 )
 
 

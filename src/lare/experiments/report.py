@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from lare.credit.methods import find_method
+from lare.credit.methods import Encoder, find_method
 from lare.errors import LareError
 from lare.experiments import figures
 from lare.experiments.agents_report import agents_details
@@ -20,7 +20,7 @@ from lare.experiments.credit import credit_of, factor_labels
 from lare.experiments.evaluation import random_returns
 from lare.experiments.find import run_directories
 from lare.experiments.html import factor_table, function_text, note, table, write_page
-from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN, RETURN_R2, RETURN_STD
+from lare.experiments.scores import CORRELATION, ERROR, REFERENCES, RETURN, RETURN_R2, RETURN_STD, SUMMED_RETURN
 from lare.experiments.statistics import in_words
 from lare.experiments.verdict import Facts, last_known, median_of_known, verdict
 from lare.experiments.video import record_video
@@ -38,6 +38,9 @@ from lare.training.explain import explanation_of
 
 FILM, LARGEST_FILM = "film.gif", 64 << 20
 """The film in a run's directory, and the largest size in bytes at which a page shows it."""
+
+SEEN: dict[Encoder | None, str] = {Encoder.LATENT: "factors", Encoder.LATENT_AND_JUDGED: "factors and raw entries"}
+"""The inputs of the decoders that see factors."""
 
 COMMAND = re.compile(r"`([^`]*)`")
 """A command within a sentence."""
@@ -114,7 +117,8 @@ def verdicts(runs: dict[str, Run], random: Float[np.ndarray, " episodes"]) -> It
             at_the_end=next((at_the_end[one] for one in without if one != name), None),
             return_r2=None if predicted is None else last_known(predicted[1]),
             usual_r2=None if predicted is None else median_of_known(predicted[1]),
-            latent=method.latent,
+            seen=SEEN.get(method.encoder, "raw entries"),
+            many=SUMMED_RETURN in run.metrics()[-1],
             descends=method.descends,
             untrained=run.untrained,
             warmup=run.config.settings.warmup,

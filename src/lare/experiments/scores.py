@@ -78,13 +78,16 @@ class Group:
 
 
 def by_label(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """The runs by label: the method, the algorithm if there are several, and the settings in which runs of a method differ on a
+    """The runs by label: the method, the algorithm if a task has several, and the settings in which runs of a method differ on a
     task.
 
     Runs with equal labels are told apart by their functions and, if a seed is in two of them, by their directories.
     """
     plans = [run.config.settings.in_force(run.config.task) for run in runs]
-    several = len({plan["algorithm"] for plan in plans}) > 1
+    algorithms: dict[str, set[str]] = {}
+    for run, plan in zip(runs, plans, strict=True):
+        algorithms.setdefault(run.config.task.name, set()).add(plan["algorithm"])
+    several = any(len(some) > 1 for some in algorithms.values())
     values: dict[tuple[str, str, str, str], set[str]] = {}  # by method, algorithm, setting and task
     for run, plan in zip(runs, plans, strict=True):
         for name in plan.keys() - ignored(plan):

@@ -38,8 +38,10 @@ class Facts:
     """How well returns were predicted before anything was fitted to them; None if the method predicts none."""
     usual_r2: float | None = None
     """The median of the same over all evaluations and seeds."""
-    latent: bool = False
-    """Whether the method has a phi."""
+    seen: str = "raw entries"
+    """The inputs of the decoder: `factors`, `raw entries`, or both."""
+    many: bool = False
+    """Whether there are many agents."""
     descends: bool = False
     """Whether its decoder descends a gradient, and so may not have learned yet what it sees."""
     untrained: str | None = None
@@ -53,6 +55,11 @@ class Facts:
     directory: str = "RUN"
     task: str = "TASK"
     """The name of a shipped task, or a placeholder for a task file, which ends in `.toml`."""
+
+    @property
+    def latent(self) -> bool:
+        """Whether the method has a phi."""
+        return "factors" in self.seen
 
     @property
     def last(self) -> float:
@@ -166,17 +173,21 @@ def told(run: Facts) -> list[str]:
     """Whether the proxy rewards explain the score."""
     if run.return_r2 is None or not np.isfinite(run.return_r2):
         return []
-    share, by = run.return_r2, "factors and raw entries" if run.latent else "raw entries"
-    if not explains_nothing(run) and share < NEXT_TO_NOTHING:
+    share, usual = run.return_r2, run.usual_r2
+    if not explains_nothing(run) and usual is not None and share < NEXT_TO_NOTHING:
         return [
-            f"Its proxy rewards, from {by}, usually explain the score (median R² of returns: {run.usual_r2:.2f}), but not the last "
-            f"episodes (R² {share:.2f}): the policy has changed, and the decoder has to adapt."
+            f"Its proxy rewards, from {run.seen}, usually explain {part(usual)} of the score (median R² of returns: {usual:.2f}), "
+            f"but not the last episodes (R² {share:.2f}): perhaps the policy has changed, and the decoder has not adapted yet."
         ]
-    how = "next to nothing" if share < NEXT_TO_NOTHING else "nearly all" if share > MOSTLY else "a part"
     return [
-        f"Its proxy rewards, from {by}, explain {how} of the score: R² of the last returns, before they were learned from, "
-        f"is {share:.2f}."
+        f"Its proxy rewards, from {run.seen}, explain {part(share)} of the score: R² of the last returns, before they were learned "
+        f"from, is {share:.2f}."
     ]
+
+
+def part(r2: float) -> str:
+    """How much of the score an R^2 of returns is, in words."""
+    return "next to nothing" if r2 < NEXT_TO_NOTHING else "nearly all" if r2 > MOSTLY else "a part"
 
 
 def explains_nothing(run: Facts) -> bool:
@@ -219,8 +230,13 @@ def todo(run: Facts) -> list[str]:
         exactly = (
             f"`lare evaluate {run.directory} --episodes 50` tells more exactly; then " if may_have_learned(run) else ""
         )
+        division = ", or how the rewards are divided among the agents, which returns do not show" if run.many else ""
         found.append(
-            (f"The proxy rewards predict returns well, so the algorithm may be the limit{own_rule}. " if good else "")
+            (
+                f"The proxy rewards predict returns well, so the algorithm may be the limit{division}{own_rule}. "
+                if good
+                else ""
+            )
             + f"Next: {exactly}more `--steps`, or another `--algorithm` (`lare algorithms`)."
         )
         if good and not run.latent:

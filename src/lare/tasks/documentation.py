@@ -44,14 +44,18 @@ def plain(text: str) -> list[str]:
     """Lines of text and rows of tables, without markup."""
     lines: list[str] = []
     paragraph: list[str] = []
+    table: list[str] = []
     for line in [*text.splitlines(), ""]:
         stripped = line.strip()
+        if table and not stripped.startswith("|"):
+            lines += rows(table)
+            table = []
         if stripped.startswith("|") or NOISE.match(stripped):
             if paragraph:
                 lines += SENTENCE.split(" ".join(paragraph))
                 paragraph = []
             if stripped.startswith("|"):
-                lines.append(row(stripped))
+                table.append(stripped)
         elif stripped.startswith(("- ", "* ")) or NUMBERED.match(stripped):
             if paragraph:
                 lines += SENTENCE.split(" ".join(paragraph))
@@ -64,13 +68,30 @@ def plain(text: str) -> list[str]:
     ]
 
 
-def row(line: str) -> str:
-    """A row of a table: its first cell, a colon, and the other cells. Empty if the row is only a separator."""
-    cells = [cell.strip() for cell in line.strip("|").split("|")]
-    cells = [cell for cell in cells if cell]
-    if not cells or all(re.fullmatch(r":?-+:?", cell) for cell in cells):
-        return ""
-    return f"{cells[0]}: {'; '.join(cells[1:])}" if len(cells) > 1 else cells[0]
+def rows(table: list[str]) -> list[str]:
+    """The rows of a table as text: the first cell, a colon, and the other cells.
+
+    From the third cell on, each has the title of its column before it, if the table has a head and the title does not mention
+    rewards.
+    """
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in table]
+    head: list[str] = []
+    if len(cells) > 1 and is_separator(cells[1]):
+        head = ["" if place < 2 or LEAKS.search(title) else f"{title} " for place, title in enumerate(cells[0])]
+        cells = cells[1:]
+    return [row(one, head) for one in cells if not is_separator(one)]
+
+
+def row(cells: list[str], titles: list[str]) -> str:
+    """A row as text, without its empty cells."""
+    titles = titles + [""] * (len(cells) - len(titles))
+    first, *others = [f"{title}{cell}" for title, cell in zip(titles, cells, strict=False) if cell] or [""]
+    return f"{first}: {'; '.join(others)}" if others else first
+
+
+def is_separator(cells: list[str]) -> bool:
+    """Whether a row of a table only separates its head from its body, or is empty."""
+    return all(re.fullmatch(r":?-*:?", cell) for cell in cells)
 
 
 def without_rewards(lines: list[str]) -> tuple[str, tuple[str, ...]]:

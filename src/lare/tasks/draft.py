@@ -9,9 +9,7 @@ import gymnasium
 from lare.tasks.spaces import OneHot
 from lare.tasks.spec import FILL_IN
 
-JUDGES = (
-    'judges = "after" # a step is judged by the observation after it; "before": the one in which the agent acts; "both"'
-)
+JUDGES = 'judges = "after" # the observation that shows what a step earned: "after" the action, "before" it, or "both"'
 SCORE = (
     '# score = "average" # only if episodes differ in length. "sum": steps or events add up; '
     '"average": how good steps were on average'
@@ -54,7 +52,7 @@ def warning(
         "# know only these texts.",
         *(fewer if left_out else []),
         *sections,
-        "# Take out anything else that reveals the reward. Describe the goal, not how it is rewarded.",
+        "# Take out every sentence that still reveals the reward. Describe the goal, not how it is rewarded.",
     ]
 
 
