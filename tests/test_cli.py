@@ -17,6 +17,7 @@ from lare.source import source
 from lare.tasks.load import read_task, shipped_tasks
 from toys import PHI
 
+DRAWING = "drawing, which takes up to a minute for each run\n"
 TINY = (
     "--steps 200 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1 "
     "--method lare-linear --td3.warmup 100 --td3.hidden 8 8"
@@ -451,9 +452,9 @@ def test_from_training_to_report(command, spec_file, phi):
     _, out, _ = command("evaluate", run, "--episodes", 2, "--best")
     assert re.match(r"seed 0: return -\S+ ± \S+ over 2 episodes \(the policy of step [12]00", out)
 
-    assert command("report", run) == (0, f"wrote {run / 'report.html'}\n", "")
+    assert command("report", run) == (0, f"wrote {run / 'report.html'}\n", DRAWING)
     assert "f_near" in (run / "report.html").read_text(encoding="utf-8")
-    assert command("report", run, run, "--out", "both.html") == (0, "wrote both.html\n", "")
+    assert command("report", run, run, "--out", "both.html") == (0, "wrote both.html\n", DRAWING)
     assert command("evaluate", run, "--video", "film.avi") == (
         2,
         "",
@@ -478,5 +479,5 @@ def test_from_training_to_report(command, spec_file, phi):
 
     # What was measured can be drawn without the checkpoint.
     shutil.rmtree(run / "checkpoint")
-    assert command("report", run, "--out", "without.html") == (0, "wrote without.html\n", "")
+    assert command("report", run, "--out", "without.html") == (0, "wrote without.html\n", DRAWING)
     assert "Its checkpoint is not there any more" in Path("without.html").read_text(encoding="utf-8")

@@ -351,6 +351,7 @@ def test_such_a_report_prints_the_latent_function_that_is_in_use(run, neighbour)
 def test_the_command_says_what_a_report_leaves_out(run, neighbour, command):
     place = run({"environment": "a_neighbours_file:X-v0"})
     left_out = (
+        "drawing, which takes up to a minute for each run\n"
         "the module a_neighbours_file was not imported, so random play, credit and factors are left out: "
         "set LARE_TRUST=a_neighbours_file to allow the import\n"
     )

@@ -231,6 +231,7 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = False) ->
             f"{usual} would be replaced by a page without random play, credit and factors, because the module {unknown[0]} is not "
             f"imported: set {TRUSTED}={','.join(unknown)}, or write another file with --out"
         )
+    progress("drawing, which takes up to a minute for each run")
     say(f"wrote {write_report(found, out, film)}")
     for module in unknown:
         progress(
