@@ -99,7 +99,7 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
         found: the explanation of one team's score.
         form: the form as which the score is treated; None if it is given or makes no difference.
         factors: names of the factors; empty for a method without factors.
-        entries: names of the raw entries.
+        entries: names of the raw entries; empty if they have none. Then nothing is said of single entries.
     """
     count = int(found.episodes)
     if count < FEWEST:
@@ -156,8 +156,8 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
 
 
 def largest(found: Explanation, entries: list[str]) -> str:
-    """The three raw entries with the largest shares, and these; empty if none is noticeable."""
-    order = np.argsort(-np.asarray(found.of_entries))[:3]
+    """The three raw entries with the largest shares, and these; empty if none is noticeable, or if they have no names."""
+    order = np.argsort(-np.asarray(found.of_entries))[:3] if entries else ()
     noticeable = [place for place in order if found.of_entries[place] > NOTICEABLE]
     return ", ".join(f"{entries[place]} {found.of_entries[place]:.0%}" for place in noticeable)
 
