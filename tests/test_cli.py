@@ -446,9 +446,10 @@ def test_from_training_to_report(command, spec_file, phi):
 
     status, out, err = command("evaluate", run, "--episodes", 2)
     assert (status, err) == (0, "")
-    evaluated, by_chance = out.splitlines()
+    evaluated, by_chance, difference = out.splitlines()
     assert re.fullmatch(r"seed 0: return -\S+ ± \S+ over 2 episodes", evaluated)
     assert re.fullmatch(r"random actions: return -\S+ ± \S+ over 10 episodes", by_chance)
+    assert re.fullmatch(r"difference: \S+ ± \S+ \(± is its standard error\)", difference)
     _, out, _ = command("evaluate", run, "--episodes", 2, "--best")
     assert re.match(r"seed 0: return -\S+ ± \S+ over 2 episodes \(the policy of step [12]00", out)
 

@@ -71,6 +71,8 @@ TRANSLATED = [
     "x, y = o[:, 0:1], o[:, 1:2]\nreturn [np.maximum(x, y), np.minimum(x, 0.0), np.sign(y), np.floor(x), np.cos(x) * np.sin(y)]",
     "def near(x, size=1.0):\n    return np.exp(-np.square(x) / size)\nreturn [near(o[:, 0:1]), near(o[:, 1:2], size=2.0)]",
     "return [o[:, i][:, None] for i in range(2)]",
+    "t = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.0]])\nx = (o[:, 0:3] > 0) @ t\n"
+    "return [x[:, 0:1], x[:, 1:2], (o[:, :3] @ t[:, 0])[:, None], np.dot(o[:, :3], [1.0, 2.0, 3.0])[:, None]]",
     "return [np.round(o[:, 0:1] * 4), np.around(o[:, 1:2], 2), o[:, 2:3].round(decimals=1), np.rint(a[:, 0:1])]",
     "weights = np.arange(6) + np.arange(1, 4, 0.5)\nreturn [np.sum(o * weights, axis=1, keepdims=True)]",
 ]
@@ -109,6 +111,12 @@ def test_recorded_functions_have_a_translation(task, draw):
         ("return [o[:, 0:1] - np.mean(o[:, 0:1])]", "a reduction over all axes"),
         ("return [o[:, 0:1] - np.mean(o[:, 0:1], axis=0)]", "a reduction over the batch"),
         ("return [o[0:1, 0:1] + o[:, 0:1]]", "an index along the batch"),
+        (
+            "return [np.array([[1.0], [2.0], [3.0], [4.0]]) @ o[:, 0:1]]",
+            r"a product \(@\) whose second part is computed",
+        ),
+        ("return [o @ np.array([[1.0], [2.0]])]", r"a product \(@\) that is not of a row and a table"),
+        ("return [o[:, 0:1] % 2.0]", "the operator %"),
         ("return [o[:, 9:10]]", r"factors that are not \(batch, 1\)"),
         ("return [o[:, 9][:, None]]", "an index beyond the end"),
         ("return [o[:, 0]]", r"factors that are not \(batch, 1\)"),

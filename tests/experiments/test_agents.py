@@ -123,7 +123,8 @@ def test_cross_play_on_the_command_line(runs, command):
 def test_evaluate_on_the_command_line(runs, command, tmp_path):
     status, out, err = command("evaluate", runs[0].directory, "--episodes", 3, "--video", "film.gif")
     assert (status, err) == (0, "")
-    first, *lines = out.splitlines()
+    first, *lines, last = out.splitlines()
+    assert last == "The policy samples its actions, as in training; --deterministic plays the most likely ones."
     assert [line.split(": ")[0] for line in lines] == [
         f"CompetitivePP-6-{team}, seed {seed}" for team in ("predator", "prey") for seed in runs[0].seeds
     ]

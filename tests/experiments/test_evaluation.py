@@ -9,7 +9,7 @@ import pytest
 import lare
 from lare.errors import LareError
 from lare.experiments import evaluation
-from lare.experiments.evaluation import evaluate_run, random_play
+from lare.experiments.evaluation import above_chance, evaluate_run, random_play
 from lare.experiments.policy import policy_of
 from lare.experiments.statistics import mean_and_deviation, plus_minus
 from lare.experiments.video import check_video, write_video
@@ -46,6 +46,16 @@ def test_a_video_that_could_not_be_written_is_not_begun(tmp_path, name, message)
         check_video(tmp_path / name)
 
 
+def test_the_error_of_a_difference_is_the_larger_of_two():
+    """Over the seeds, or over the episodes, and that of random actions."""
+    random = np.array([0.0, 2.0])  # variance 2
+    apart = np.array([[10.0, 10.0], [14.0, 14.0]])  # seeds with variance 8, which do not vary from episode to episode
+    assert above_chance(apart, random) == pytest.approx((11.0, np.sqrt(2 / 2 + 8 / 2)))
+    alike = np.array([[10.0, 14.0], [10.0, 14.0]])
+    assert above_chance(alike, random) == pytest.approx((11.0, np.sqrt(2 / 2 + 8 / 4)))
+    assert above_chance(np.array([[10.0]]), random) is None
+
+
 def test_measures_of_random_play_stand_beside_those_of_the_policy(small, tmp_path, command):
     task = toy_spec(measures=("distance",))
     lare.train(task, small(method="dense", steps=60, seeds=1), out=tmp_path / "run", listeners=[])
@@ -53,8 +63,8 @@ def test_measures_of_random_play_stand_beside_those_of_the_policy(small, tmp_pat
     assert (status, err) == (0, "")
     random = np.array([one.measures["distance"] for one in random_play(task)])
     shown = plus_minus(*mean_and_deviation(random))
-    assert [line.split()[:3] for line in out.splitlines()[2:3]] == [["seed", "0:", "distance"]]
-    assert out.splitlines()[3] == f"random actions: distance {shown}"
+    assert [line.split()[:3] for line in out.splitlines()[3:4]] == [["seed", "0:", "distance"]]
+    assert out.splitlines()[4] == f"random actions: distance {shown}"
     assert random.std() > 0
 
 

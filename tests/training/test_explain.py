@@ -145,8 +145,22 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
                 SHARES,
                 "- speed: 90%, +3 ± 0.02 (before: +1 ± 0.1; after: +2 ± 0.1)",
                 "In brackets are the parts of the states before and after the step. If their ± are as large as the numbers, the "
-                "fit cannot tell the two apart, and only their sum counts. If they are about equal and opposite, the change of the "
-                "factor is paid.",
+                "fit cannot tell the two apart, and only their sum counts. If they are much larger than their sum, the change of "
+                "the factor in a step is paid.",
+            ],
+        ),
+        (
+            found(by_factors=0.99, by_all=0.99, slope=np.array([-20.5, 20.1])),
+            None,
+            ["ready (before)", "ready (after)"],
+            [],
+            [
+                "The factors explain 99% of the variation of the returns of 40 episodes.",
+                SHARES,
+                "- ready: 90%, its change in a step is paid (before: -20.5 ± 0.1; after: +20.1 ± 0.1)",
+                "In brackets are the parts of the states before and after the step. If their ± are as large as the numbers, the "
+                "fit cannot tell the two apart, and only their sum counts. If they are much larger than their sum, the change of "
+                "the factor in a step is paid.",
             ],
         ),
         (

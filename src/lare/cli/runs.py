@@ -153,8 +153,9 @@ def evaluate(
     """
     import numpy as np
 
-    from lare.experiments.evaluation import RANDOM_EPISODES, evaluation_of, random_play
-    from lare.experiments.statistics import in_words
+    from lare.algorithms.table import ALGORITHMS
+    from lare.experiments.evaluation import RANDOM_EPISODES, above_chance, evaluation_of, random_play
+    from lare.experiments.statistics import in_words, plus_minus
     from lare.experiments.video import check_video, record_video
     from lare.run.directory import open_run
     from lare.tasks.table import env_spec
@@ -184,6 +185,12 @@ def evaluate(
     if by_chance:
         returns = np.array([one.total for one in by_chance])
         say(f"random actions: return {in_words(returns)} over {len(by_chance)} episodes")
+        if (difference := above_chance(found.returns[:, :, 0], returns)) is not None:
+            say(f"difference: {plus_minus(*difference)} (± is its standard error)")
+    if not (
+        deterministic or ALGORITHMS[opened.config.settings.algorithm].greedy(env_spec(opened.config.task).discrete)
+    ):
+        say("The policy samples its actions, as in training; --deterministic plays the most likely ones.")
     for name, values in found.measures.items():
         for seed, of_seed in zip(opened.seeds, values, strict=True):
             say(f"seed {seed}: {name} {in_words(of_seed)}")

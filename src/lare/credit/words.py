@@ -17,6 +17,9 @@ STRAIGHT = 0.8
 """The effect of a factor is curved if the closest line has less than this part of its variance."""
 MUCH = 0.1
 """The raw entries that explain most are named if they add more than this share of the variation to what the factors explain."""
+KNOWN, CANCELLED = 3.0, 0.1
+"""The change of a factor is paid if its effects before and after a step are each larger than so many of their deviations, and their
+sum is smaller than this part of the larger one."""
 STRIKING = 0.3
 """A raw entry is reported if its correlation with the residual of the factors is larger than this."""
 FORMS = ("a sum", "an average")
@@ -66,8 +69,8 @@ def factor_lines(found: Explanation, names: list[str]) -> list[str]:
     if any(len(some) == 2 and found.varied[some].all() for some in places.values()):
         lines.append(
             "In brackets are the parts of the states before and after the step. If their ± are as large as the numbers, the fit "
-            "cannot tell the two apart, and only their sum counts. If they are about equal and opposite, the change of the factor "
-            "is paid."
+            "cannot tell the two apart, and only their sum counts. If they are much larger than their sum, the change of the "
+            "factor in a step is paid."
         )
     return lines
 
@@ -83,7 +86,18 @@ def factor_line(found: Explanation, name: str, places: list[int]) -> str:
     effects = [effect(found, [place]) if place in varied else SAME_MEAN for place in places]
     parts = f" (before: {effects[0]}; after: {effects[1]})" if len(places) == 2 else ""
     remark = next((said for place in varied if (said := form_of_effect(found, place))), "")
-    return f"- {name}: {found.share[varied].sum():z.0%}, {effect(found, varied)}{parts}{remark}"
+    sum_of_both = "its change in a step is paid" if is_change(found, varied) else effect(found, varied)
+    return f"- {name}: {found.share[varied].sum():z.0%}, {sum_of_both}{parts}{remark}"
+
+
+def is_change(found: Explanation, places: list[int]) -> bool:
+    """Whether the effects before and after a step cancel, so that only the change of the factor matters.
+
+    Their sum says nothing then: it is small, and its sign may come from a difference between the two standard deviations.
+    """
+    slope, deviation = found.slope[places], np.sqrt(np.diagonal(found.uncertainty)[places])
+    known = np.all(np.abs(slope) > KNOWN * deviation)
+    return bool(len(places) == 2 and known and abs(slope.sum()) < CANCELLED * np.abs(slope).max())
 
 
 def effect(found: Explanation, places: list[int]) -> str:

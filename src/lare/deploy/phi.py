@@ -25,6 +25,7 @@ ARITHMETIC: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
     ast.Mult: ("multiply", operator.mul),
     ast.Div: ("divide", operator.truediv),
     ast.Pow: ("power", operator.pow),
+    ast.MatMult: ("matmul", operator.matmul),
     ast.Lt: ("less", operator.lt),
     ast.Gt: ("greater", operator.gt),
     ast.LtE: ("less_equal", operator.le),
@@ -33,6 +34,8 @@ ARITHMETIC: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
     ast.BitAnd: ("logical_and", operator.and_),
     ast.BitOr: ("logical_or", operator.or_),
 }
+WRITTEN = {ast.Mod: "%", ast.FloorDiv: "//", ast.NotEq: "!=", ast.BitXor: "^"}
+"""Operators that are not translated, as they are written."""
 CONSTANTS = {"np.pi": math.pi, "np.e": math.e, "np.newaxis": None, "np.inf": math.inf}
 CASTS = frozenset({"float", "np.float32", "np.float64"})
 OF_CONSTANTS = frozenset("sqrt exp log tanh cos sin abs square maximum minimum sum mean max min prod".split())
@@ -201,7 +204,7 @@ class Walk:
 
     def operation(self, op: ast.AST, left: Any, right: Any) -> Any:
         if type(op) not in ARITHMETIC:
-            raise Untranslatable(f"an operator: {type(op).__name__}")
+            raise Untranslatable(f"the operator {WRITTEN.get(type(op), type(op).__name__)}")
         name, of_constants = ARITHMETIC[type(op)]
         if not (is_rows(left) or is_rows(right)):
             check_size(name, left, right)

@@ -118,6 +118,16 @@ def norm(x: Rows, ord: Any = None, axis: Any = None, keepdims: bool = False) -> 
     return together("Sqrt", reduction("ReduceSum")(together("Mul", x, x), axis, keepdims))
 
 
+def matmul(x: Any, table: Any) -> Rows:
+    """`numpy.matmul` of vectors, one in each row, and a constant vector or matrix."""
+    array = None if is_rows(table) else constant(table).astype(np.float32)
+    if not is_rows(x) or array is None:
+        raise Untranslatable("a product (@) whose second part is computed from the batch")
+    if len(x.shape) != 1 or array.ndim not in (1, 2) or len(array) != x.shape[0]:
+        raise Untranslatable("a product (@) that is not of a row and a table")
+    return x.made("MatMul", x.as_numbers().name, array, shape=array.shape[1:])
+
+
 def position(operation: str) -> Callable[..., Rows]:
     """`numpy.argmax` or `argmin`."""
 
@@ -306,6 +316,8 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "any": reduction("ReduceMax", "bool"),
     "all": reduction("ReduceMin", "bool"),
     "linalg.norm": norm,
+    "matmul": matmul,
+    "dot": matmul,
     "argmax": position("ArgMax"),
     "argmin": position("ArgMin"),
     "clip": clip,

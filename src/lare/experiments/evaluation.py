@@ -76,6 +76,24 @@ def evaluation_of(run: Run, episodes: int, best: bool = False, deterministic: bo
     return together(parts)
 
 
+def above_chance(
+    returns: Float[np.ndarray, "seeds episodes"], random: Float[np.ndarray, " more_episodes"]
+) -> tuple[float, float] | None:
+    """How much higher the mean return is than that of random actions, and the standard error of this difference.
+
+        error^2 = var(random) / n + max(var over the seeds / seeds, mean var over the episodes / (seeds episodes))
+
+    None for a single episode, which has no error. The verdict of a report uses the same error.
+    """
+    seeds, episodes = returns.shape
+    if min(episodes, len(random)) < 2:
+        return None
+    of_episodes = np.mean(returns.var(axis=1, ddof=1)) / returns.size
+    of_seeds = returns.mean(axis=1).var(ddof=1) / seeds if seeds > 1 else 0.0
+    error = np.sqrt(random.var(ddof=1) / len(random) + max(of_episodes, of_seeds))
+    return float(returns.mean() - random.mean()), float(error)
+
+
 def random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
     """The returns of `random_play`."""
     return np.array([one.total for one in random_play(task)])
