@@ -116,20 +116,8 @@ def explain(sums: Sums, steps: Steps, form: Int[Array, ""] | int, basis: Basis) 
     of_steps, none = (form == SUM) & lengths_differ(sums), jnp.zeros(0)
     if not of_factors.any():
         left = jnp.zeros(basis.used_entries)
-        return Explanation(
-            sums.episodes,
-            of_steps,
-            none > 0,
-            jnp.zeros(()),
-            by_all,
-            of_entries,
-            none,
-            jnp.zeros((0, 0)),
-            none,
-            none,
-            none,
-            left,
-        )
+        of_none = none, jnp.zeros((0, 0)), none, none, none
+        return Explanation(sums.episodes, of_steps, none > 0, jnp.zeros(()), by_all, of_entries, *of_none, left)
     alone, numbers = restricted(sums, np.flatnonzero(of_factors)), group[of_factors]
     fitted = evidence.fit(alone, form, numbers, evidence.unknown(len(numbers), int(numbers.max()) + 1), ROUNDS)
     sigma = evidence.covariance(alone, form, numbers, fitted)
