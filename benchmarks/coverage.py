@@ -1,9 +1,10 @@
-"""How often the 95% interval of an interquartile mean contains the true one, for several numbers of seeds on one task.
+"""How often the 95% intervals of an interquartile mean, and of a difference of two, contain the true value, by the number of seeds.
 
     python benchmarks/coverage.py
 
-Draws scores from a normal and from an exponential distribution, 5,000 times each. Counts the bootstrap intervals of `lare compare`
-(percentiles of 2,000 samples) that contain the interquartile mean of the distribution. Writes results/coverage.json.
+Draws scores of one task from a normal and from an exponential distribution, 5,000 times each. Counts the bootstrap intervals of
+`lare compare` (percentiles of 2,000 samples) that contain the interquartile mean of the distribution and, for two methods with the
+same distribution, 0. Writes results/coverage.json.
 """
 
 import json
@@ -30,13 +31,21 @@ DISTRIBUTIONS: dict[str, tuple[Scores, float]] = {
 """How scores are drawn, and their interquartile mean."""
 
 
-def coverage(drawn: Scores, true: float, seeds: int, random: np.random.Generator) -> float:
-    inside = 0
-    for scores in drawn(random, (CASES, seeds)):
-        samples = scores[random.integers(0, seeds, (seeds, REPETITIONS))]
-        low, high = np.percentile(interquartile_means(samples[:, None]), (2.5, 97.5))
-        inside += low <= true <= high
-    return inside / CASES
+def coverage(drawn: Scores, true: float, seeds: int, random: np.random.Generator) -> dict[str, float]:
+    of_one = of_two = 0
+    for scores, others in zip(drawn(random, (CASES, seeds)), drawn(random, (CASES, seeds)), strict=True):
+        means, of_others = (
+            interquartile_means(each[random.integers(0, seeds, (seeds, REPETITIONS))][:, None])
+            for each in (scores, others)
+        )
+        of_one += holds(means, true)
+        of_two += holds(means - of_others, 0.0)
+    return {"mean": of_one / CASES, "difference": of_two / CASES}
+
+
+def holds(samples: Float[np.ndarray, " samples"], true: float) -> bool:
+    low, high = np.percentile(samples, (2.5, 97.5))
+    return bool(low <= true <= high)
 
 
 def main() -> None:

@@ -177,9 +177,9 @@ def test_several_versions_and_machines_are_named(made):
     jax, machine = one.config.versions["jax"], one.config.machine
     config.write_text(config.read_text().replace(f'"{jax}"', f'"9.{jax}"').replace(", cpu", ", gpu"))
     assert find_all([one.directory, other.directory], RETURN)[1] == [
-        f"the runs were trained by several versions of LaRe: {one.config.lare}; 0.2.0 (0123456789)",
-        f"the runs were trained with several versions of JAX: {jax}; 9.{jax}",
-        f"the runs were trained on several machines: {machine}; {machine.replace('cpu', 'gpu')}",
+        f"the runs were trained by several versions of LaRe ({one.config.lare}: dense; 0.2.0 (0123456789): rd)",
+        f"the runs were trained with several versions of JAX ({jax}: dense; 9.{jax}: rd)",
+        f"the runs were trained on several machines ({machine}: dense; {machine.replace('cpu', 'gpu')}: rd)",
     ]
 
 

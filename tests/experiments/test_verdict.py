@@ -54,8 +54,8 @@ def said(returns, random=CHANCE, task="Toy", **facts):
                 "It has not learned yet. The return is 0 after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Its proxy rewards, from raw entries, explain nearly all of the score: R² of the last returns, before they were "
                 "learned from, is 0.90.",
-                "The proxy rewards predict returns well, so the algorithm may be the limit. Next: more `--steps`, or another "
-                "`--algorithm` (`lare algorithms`).",
+                "The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit. Next: more "
+                "`--steps`, or another `--algorithm` (`lare algorithms`).",
                 "If state and action have more than 12 entries together, a score that depends on products of them, such as price "
                 "times power, needs a phi (`lare prompt`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
@@ -225,8 +225,9 @@ def test_seeds_that_learned_are_counted_where_their_mean_says_too_little():
     returns = np.vstack([FLAT, FLAT - 52, FLAT - 51])
     found = "The return is 16.7 ± 29.7 after 8,000 steps (mean over 3 seeds); random actions get 0 ± 1 in 3 episodes"
     assert said(returns)[0] == f"It learned with 1 of 3 seeds. {found}."
-    assert (
-        said(returns, before=np.full(3, 51.0))[0] == f"It has not learned yet. {found}, the policy before training 51."
+    before = np.array([51.0, 51.5, 51.0])
+    assert said(returns, before=before)[0] == (
+        f"It has not learned yet. {found}, the policies of the seeds before training 51, 51.5, 51."
     )
 
 
@@ -265,11 +266,19 @@ def test_each_seed_is_compared_with_its_own_policy_before_training():
     assert said(ends, random, before=np.array([-40.3, -49.7]))[0].startswith("It learned. ")
 
 
+def test_a_higher_evaluation_is_named_although_the_last_ones_vary_too_much_to_say_that_the_policy_fell():
+    ends = np.array([[0.0, 20, 60, 50, 88, 60, 85, 60]])
+    assert said(ends, task="mine.toml")[1] == (
+        "Next: better than random actions may be far from good: compare it with a rule of your own. The best evaluation was 88, at "
+        "step 5,000: `lare evaluate runs/x --best` plays its policy on other episodes."
+    )
+
+
 def test_a_rule_of_ones_own_tells_rewards_from_the_algorithm():
     advice = said(FLAT - 51, return_r2=0.9, task="mine.toml")[2]
     assert advice == (
-        "The proxy rewards predict returns well, so the algorithm may be the limit (a rule of your own can tell: "
-        "docs/bring-your-own-task.md, section 4). Next: more `--steps`, or another `--algorithm` (`lare algorithms`)."
+        "The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit (a rule of your own "
+        "can tell: docs/bring-your-own-task.md, section 4). Next: more `--steps`, or another `--algorithm` (`lare algorithms`)."
     )
 
 
@@ -283,8 +292,8 @@ def test_the_verdict_names_what_the_decoder_sees_and_how_much_of_the_score_that_
 
 def test_returns_do_not_show_how_rewards_are_divided_among_agents():
     assert said(FLAT - 51, return_r2=0.9, many=True)[2].startswith(
-        "The proxy rewards predict returns well, so the algorithm may be the limit, or how the rewards are divided among the "
-        "agents, which returns do not show. Next: "
+        "The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit, or how the rewards are "
+        "divided among the agents, which returns do not show. Next: "
     )
 
 

@@ -198,7 +198,8 @@ def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes:
             f"Returns of episodes not seen yet, predicted by the factors: R² = {r2_shown(found.r2)} (1: exactly; 0: no better than "
             f"their mean), with a standard error of {error_shown(found.r2_error)}. LaRe predicted each return from the episodes "
             "before it. The first predictions had few such episodes: if the factors are right, R² usually rises with more. Rare "
-            "events need many. If R² remains below about 0.8, phi lacks something that the score depends on, or the score is noisy."
+            "events need many. If R² remains below about 0.8, phi lacks something that the score depends on, or a part of the "
+            "score is noise or is decided by the initial state."
         )
         if found.r2_of_lengths is not None:
             say(

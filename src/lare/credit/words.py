@@ -17,7 +17,7 @@ STRAIGHT = 0.8
 """The effect of a factor is curved if the closest line has less than this part of its variance."""
 MUCH = 0.1
 """The raw entries that explain most are named if they add more than this share of the variation to what the factors explain."""
-KNOWN, CANCELLED = 3.0, 0.1
+KNOWN, CANCELLED = 2.0, 0.1
 """The change of a factor is paid if its effects before and after a step are each larger than so many of their deviations, and their
 sum is smaller than this part of the larger one."""
 STRIKING = 0.3

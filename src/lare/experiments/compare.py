@@ -50,17 +50,21 @@ def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | 
 
 
 def several_origins(runs: Sequence[Run]) -> list[str]:
-    """Remarks if runs were trained by several versions, or on several machines."""
+    """Remarks if runs were trained by several versions, or on several machines, with the methods of each."""
     origins = {
         "by several versions of LaRe": [run.config.lare for run in runs],
         "with several versions of JAX": [run.config.versions["jax"] for run in runs],
         "on several machines": [run.config.machine for run in runs],
     }
-    return [
-        f"the runs were trained {what}: {'; '.join(some)}"
-        for what, each in origins.items()
-        if len(some := dict.fromkeys(each)) > 1
-    ]
+    remarks = []
+    for what, each in origins.items():
+        methods: dict[str, dict[str, None]] = {}
+        for run, one in zip(runs, each, strict=True):
+            methods.setdefault(one, {})[run.config.settings.method] = None
+        if len(methods) > 1:
+            told = "; ".join(f"{one}: {', '.join(names)}" for one, names in methods.items())
+            remarks.append(f"the runs were trained {what} ({told})")
+    return remarks
 
 
 Tables = Sequence[Mapping[str, Sequence[Measured]]]

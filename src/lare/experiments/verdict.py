@@ -102,7 +102,8 @@ def learned(run: Facts) -> str:
     episodes = "1 episode" if len(run.random) == 1 else f"{len(run.random)} episodes"
     by_chance = f"random actions get {shown(float(run.random.mean()))} ± {shown(deviation(run.random))} in {episodes}"
     if run.before is not None:
-        by_chance += f", the policy before training {shown(float(run.before.mean()))}"
+        policy = "the policy before training" if len(run.before) == 1 else "the policies of the seeds before training"
+        by_chance += f", {policy} {', '.join(shown(float(one)) for one in run.before)}"
     if has_learned(run):
         return f"It learned. {reached}; {by_chance}."
     if seeds := successes(run):
@@ -231,12 +232,9 @@ def todo(run: Facts) -> list[str]:
             f"`lare evaluate {run.directory} --episodes 50` tells more exactly; then " if may_have_learned(run) else ""
         )
         division = ", or how the rewards are divided among the agents, which returns do not show" if run.many else ""
+        limit = f"The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit{division}"
         found.append(
-            (
-                f"The proxy rewards predict returns well, so the algorithm may be the limit{division}{own_rule}. "
-                if good
-                else ""
-            )
+            (f"{limit}{own_rule}. " if good else "")
             + f"Next: {exactly}more `--steps`, or another `--algorithm` (`lare algorithms`)."
         )
         if good and not run.latent:
@@ -245,7 +243,10 @@ def todo(run: Facts) -> list[str]:
                 "such as price times power, needs a phi (`lare prompt`)."
             )
     if not found and is_own(run) and len(run.random) and has_learned(run):
-        found.append("Next: better than random actions may be far from good: compare it with a rule of your own.")
+        found.append(
+            "Next: better than random actions may be far from good: compare it with a rule of your own."
+            + higher_before(run)
+        )
     if len(run.returns) == 1:
         found.append("One seed says little: another one may reach a different return (`--seeds 3`).")
     return found
@@ -322,6 +323,18 @@ def fell_from(run: Facts) -> tuple[int, float] | None:
         return None
     fell = top - end > max(0.15 * abs(top - start), 2 * variation, 2 * math.sqrt(2) * error_at_the_end(run))
     return (int(run.steps[best]), top) if fell else None
+
+
+def higher_before(run: Facts) -> str:
+    """A sentence on the best evaluation, if it is higher than the last one by a tenth of what was learned."""
+    mean = np.nanmean(of_trained(run), axis=0)
+    best = int(np.nanargmax(mean))
+    if mean[best] - run.last <= 0.1 * (run.last - run.random.mean()):
+        return ""
+    return (
+        f" The best evaluation was {shown(float(mean[best]))}, at step {int(run.steps[best]):,}: `lare evaluate {run.directory} "
+        "--best` plays its policy on other episodes."
+    )
 
 
 def of_trained(run: Facts) -> Float[np.ndarray, "seeds evaluations"]:
