@@ -292,8 +292,8 @@ def test_the_verdict_names_what_the_decoder_sees_and_how_much_of_the_score_that_
 
 def test_returns_do_not_show_how_rewards_are_divided_among_agents():
     assert said(FLAT - 51, return_r2=0.9, many=True)[2].startswith(
-        "The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit, or how the rewards are "
-        "divided among the agents, which returns do not show. Next: "
+        "The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit, or how the rewards "
+        "are divided among the agents, which returns do not show. Next: "
     )
 
 
