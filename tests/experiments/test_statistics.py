@@ -168,6 +168,14 @@ def test_scores_are_compared_at_a_step_and_over_the_last_quarter(made, command, 
     assert "after three quarters of 80 steps" in (tmp_path / "late.html").read_text()
 
 
+def test_the_page_says_where_its_runs_come_from(made, tmp_path):
+    runs = [made("a", [1.0, 2.0]), made("b", [3.0, 4.0], method="rd")]
+    write_comparisons(by_label(runs), tmp_path / "page.html")
+    config = runs[0].config
+    said = f"LaRe {config.lare}, JAX {config.versions['jax']}, {config.machine}, 10 episodes in each evaluation."
+    assert f"Runs: {said}" in (tmp_path / "page.html").read_text()
+
+
 def test_a_missing_table_over_all_tasks_is_said(made, command):
     runs = [made("a", [1.0, 3.0]), made("b", [2.0, 4.0], method="rd"), made("c", [7.0, 9.0], "Depot", method="rd")]
     status, out, _ = command("compare", *(run.directory for run in runs))

@@ -180,11 +180,12 @@ def what_scores_are(comparison: Comparison) -> str:
 
 MEANINGS = (
     "IQM: interquartile mean over seeds and tasks; of fewer than four scores it is the mean. sd: standard deviation over the "
-    "seeds (n - 1). Minus baseline: the IQM minus that of the baseline, the first method. Above baseline: the probability that a "
-    "run scores more than one of the baseline; one that is 0 or 1 on every task has no interval. Neither is given for a single "
-    "seed. If the score is an error or a loss, a low probability is good. p: the probability of at least so many won pairs of runs "
-    "by chance or, if fewer than half were won, of so many lost ones (exact Mann-Whitney test, one-sided: a two-sided p is twice "
-    "as large). If a method has several draws of the language model, the mean over the draws of a seed counts as one run."
+    "seeds (n - 1). Minus baseline: the IQM minus that of the baseline, the first method; of two or three seeds its interval is "
+    "too narrow. Above baseline: the probability that a run scores more than one of the baseline; one that is 0 or 1 on every "
+    "task has no interval. Neither is given for a single seed. If the score is an error or a loss, a low probability is good. p: "
+    "the probability of at least so many won pairs of runs by chance or, if fewer than half were won, of so many lost ones (exact "
+    "Mann-Whitney test, one-sided: a two-sided p is twice as large). If a method has several draws of the language model, the "
+    "mean over the draws of a seed counts as one run."
 )
 
 
@@ -203,8 +204,22 @@ def write_comparisons(
     """
     found = comparisons(runs, metric, step, late)
     title = f"{', '.join(task for one in found for task in one.tasks)}: {len(runs)} contenders"
-    write_page(out, title, "\n".join([*body(title, found), *(note(f"Note: {remark}.") for remark in remarks)]))
+    notes = [*(f"Note: {remark}." for remark in remarks), *origin([one for some in runs.values() for one in some])]
+    write_page(out, title, "\n".join([*body(title, found), *map(note, notes)]))
     return found
+
+
+def origin(every: Sequence[Run | Measured]) -> list[str]:
+    """What all runs have in common of their versions, machines and evaluations, in a sentence; remarks tell where they differ."""
+    configs = [one.config for one in every if isinstance(one, Run)]
+    facts = [
+        {f"LaRe {config.lare}" for config in configs},
+        {f"JAX {config.versions['jax']}" for config in configs},
+        {config.machine for config in configs},
+        {f"{config.settings.evaluation_episodes} episodes in each evaluation" for config in configs},
+    ]
+    told = [one for fact in facts if len(fact) == 1 for one in fact]
+    return [f"Runs: {', '.join(told)}."] if told else []
 
 
 def comparisons(
@@ -238,6 +253,7 @@ def body(title: str, found: Sequence[Comparison]) -> Iterable[str]:
         )
         yield f"<h{level}>Learning</h{level}>"
         yield figures.bands(comparison.curves, "environment steps", f"IQM of the {score}", True)
+        yield note("Lines: IQM over the seeds. Bands: its 95% intervals.")
         yield f"<h{level}>Performance profiles</h{level}>"
         yield figures.bands(comparison.profiles, f"x ({score})", "share of runs that score more", False)
     if rows := cells_of_all(found):
