@@ -164,8 +164,8 @@ def said(returns, random=CHANCE, task="Toy", **facts):
             FLAT - 50,
             {},
             [
-                "It may have learned, but the difference is less than two standard errors. The return is 1 after 8,000 steps; "
-                "random actions get 0 ± 1 in 3 episodes.",
+                "It may have learned, but the difference from random actions is less than two standard errors. The return is 1 "
+                "after 8,000 steps; random actions get 0 ± 1 in 3 episodes.",
                 "Next: `lare evaluate runs/x --episodes 50` tells more exactly; then more `--steps`, or another `--algorithm` "
                 "(`lare algorithms`).",
                 "One seed says little: another one may reach a different return (`--seeds 3`).",
@@ -257,6 +257,15 @@ def test_better_than_chance_is_not_learned_if_the_policy_was_so_before_training(
         "Next: more `--steps`, or another `--algorithm` (`lare algorithms`).",
     ]
     assert said(FLAT, before=np.array([30.0]))[0] == f"It learned. The return is 51 {began} 30."
+
+
+def test_the_verdict_names_the_difference_that_is_in_doubt():
+    """The return is far above the mean of random actions, and hardly above that of the policy before training."""
+    first, advice, *_ = said(FLAT, 40 * CHANCE, before=np.array([50.0]), of_evaluation=0.6)
+    assert first.startswith(
+        "It may have learned, but the difference from the policy before training is less than two standard errors. "
+    )
+    assert advice == "Next: more `--steps`, or another `--algorithm` (`lare algorithms`)."
 
 
 def test_each_seed_is_compared_with_its_own_policy_before_training():

@@ -111,7 +111,8 @@ def learned(run: Facts) -> str:
     if run.last < run.random.mean() - 2 * noise(run):
         return f"It got worse than random actions. {reached}; {by_chance}."
     if may_have_learned(run):
-        return f"It may have learned, but the difference is less than two standard errors. {reached}; {by_chance}."
+        other = "the policy before training" if better_than_chance(run) else "random actions"
+        return f"It may have learned, but the difference from {other} is less than two standard errors. {reached}; {by_chance}."
     return f"It has not learned yet. {reached}; {by_chance}."
 
 
@@ -229,7 +230,9 @@ def todo(run: Facts) -> list[str]:
         good = (run.return_r2 or 0) > MOSTLY
         own_rule = " (a rule of your own can tell: docs/bring-your-own-task.md, section 4)" if is_own(run) else ""
         exactly = (
-            f"`lare evaluate {run.directory} --episodes 50` tells more exactly; then " if may_have_learned(run) else ""
+            f"`lare evaluate {run.directory} --episodes 50` tells more exactly; then "
+            if may_have_learned(run) and not better_than_chance(run)
+            else ""
         )
         division = ", or how the rewards are divided among the agents, which returns do not show" if run.many else ""
         limit = f"The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit{division}"
