@@ -11,6 +11,8 @@ from lare.experiments.compare import (
     cells,
     cells_of_all,
     comparable,
+    said_of,
+    smallest_p,
     what_scores_are,
     write_comparisons,
 )
@@ -276,8 +278,13 @@ def test_a_probability_of_one_has_its_chance_beside_it(made):
     assert first.p is None
     assert (str(better.better), better.p) == ("1.000", pytest.approx(1 / 6))
     assert (str(worse.better), worse.p) == ("0.000", pytest.approx(1 / 6))
-    head, rows = cells(statistics.compare(by_label(runs)))
+    compared = statistics.compare(by_label(runs))
+    head, rows = cells(compared)
     assert (head[-1], rows[1][-1]) == ("p", "0.17")
+    assert smallest_p(compared) == "With so few runs, p is at least 0.17."
+    assert said_of(compared).endswith("not in 95 of 100. With so few runs, p is at least 0.17.")
+    many = by_label([made("d", [1.0, 2, 3, 4]), made("e", [1.0, 2, 3, 4], method="rd")])
+    assert smallest_p(statistics.compare(many)) == ""
 
 
 def test_single_seeds_have_no_intervals(made):

@@ -259,6 +259,13 @@ def test_better_than_chance_is_not_learned_if_the_policy_was_so_before_training(
     assert said(FLAT, before=np.array([30.0]))[0] == f"It learned. The return is 51 {began} 30."
 
 
+def test_a_seed_has_learned_if_it_gained_more_than_its_evaluation_errs():
+    ends, random = np.array([[-10.1], [-10.0]]) + np.zeros(8), -43 + 15 * CHANCE
+    before = np.array([-10.3, -49.7])
+    assert said(ends, random, before=before)[0].startswith("It learned with 2 of 2 seeds. ")
+    assert said(ends, random, before=before, of_evaluation=0.2)[0].startswith("It learned with 1 of 2 seeds. ")
+
+
 def test_the_verdict_names_the_difference_that_is_in_doubt():
     """The return is far above the mean of random actions, and hardly above that of the policy before training."""
     first, advice, *_ = said(FLAT, 40 * CHANCE, before=np.array([50.0]), of_evaluation=0.6)

@@ -86,7 +86,6 @@ def compare(
         out: the page to write.
     """
     from lare.experiments import compare as page
-    from lare.experiments.statistics import too_few
 
     found, remarks = page.find_all(runs, metric)
     for remark in remarks:
@@ -96,7 +95,7 @@ def compare(
         if len(comparisons) > 1:
             say(f"\n{comparison.tasks[0]}")
         show(*page.cells(comparison))
-        say(f"{page.what_scores_are(comparison)} {too_few(comparison)}".rstrip())
+        say(page.said_of(comparison))
     if rows := page.cells_of_all(comparisons):
         say("\nAll tasks: each run is compared with the runs on the same task.")
         show(page.HEAD_OF_ALL, rows)

@@ -1,5 +1,6 @@
 """A comparison of methods as a page: the table, and the figures that rliable's authors recommend."""
 
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -178,6 +179,22 @@ def what_scores_are(comparison: Comparison) -> str:
     return f"Scores are true returns {when}, scaled linearly between two fixed returns. {'; '.join(ends)}."
 
 
+def smallest_p(comparison: Comparison) -> str:
+    """The smallest p that so few runs can have, in a sentence; empty if it is at most 2.5%, or if no p is given."""
+    seeds = [row.seeds for row in comparison.rows]
+    ways = [
+        math.comb(seeds[0] + one, one) for one, row in zip(seeds, comparison.rows, strict=True) if row.p is not None
+    ]
+    if not ways or (least := 1 / max(ways) ** len(comparison.tasks)) <= 0.025:
+        return ""
+    return f"With so few runs, p is at least {least:.2g}."
+
+
+def said_of(comparison: Comparison) -> str:
+    """What scores are, and what so few runs cannot tell."""
+    return " ".join(filter(None, (what_scores_are(comparison), too_few(comparison), smallest_p(comparison))))
+
+
 MEANINGS = (
     "IQM: interquartile mean over seeds and tasks; of fewer than four scores it is the mean. sd: standard deviation over the "
     "seeds (n - 1). Minus baseline: the IQM minus that of the baseline, the first method; of two or three seeds its interval is "
@@ -247,7 +264,7 @@ def body(title: str, found: Sequence[Comparison]) -> Iterable[str]:
             yield f"<h2>{escape(comparison.tasks[0])}</h2>"
         head, rows = cells(comparison)
         yield table(head, rows, range(1, len(head)))
-        yield note(f"{what_scores_are(comparison)} {too_few(comparison)}".rstrip())
+        yield note(said_of(comparison))
         score = (
             "score" if comparison.normalised else "true return" if comparison.metric == RETURN else comparison.metric
         )

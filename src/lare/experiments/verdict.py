@@ -117,9 +117,13 @@ def learned(run: Facts) -> str:
 
 
 def successes(run: Facts) -> int:
-    """How many seeds end above their own return before training, and above random actions by two deviations of their returns."""
+    """How many seeds end above random actions by two deviations of their returns, and above their own return before training by two
+    standard errors of the difference, from episode to episode.
+    """
     bar = float(run.random.mean()) + 2 * max(deviation(run.random), 1e-9)
-    return int(np.sum(run.returns[:, -1] > np.maximum(bar, -np.inf if run.before is None else run.before)))
+    of_seed = math.sqrt(2 * len(run.returns)) * run.of_evaluation
+    before = -np.inf if run.before is None else run.before + 2 * of_seed
+    return int(np.sum(run.returns[:, -1] > np.maximum(bar, before)))
 
 
 def has_learned(run: Facts) -> bool:
