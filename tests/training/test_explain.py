@@ -58,7 +58,7 @@ FACTORS, ENTRIES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
                 "- cost: 65%, +2 ± 0.1",
                 "- speed: 25%, +1 ± 0.1",
                 "Returns are higher than the factors predict when entry 1 (the foot) is small (correlation -0.80): "
-                "a factor may be missing.",
+                "a factor may be missing, or the task's `judges` may be wrong.",
             ],
         ),
         (

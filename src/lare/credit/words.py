@@ -162,9 +162,11 @@ def words(found: Explanation, form: FormFound | None, factors: list[str], entrie
     if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:
         place = int(np.argmax(np.abs(found.left)))
         way = "large" if found.left[place] > 0 else "small"
+        both = any(name.endswith(" (after)") for name in factors)
+        other_states = "" if both else ", or the task's `judges` may be wrong"
         said.append(
             f"Returns are higher than the factors predict when {entries[place]} is {way} "
-            f"(correlation {found.left[place]:+.2f}): a factor may be missing."
+            f"(correlation {found.left[place]:+.2f}): a factor may be missing{other_states}."
         )
     return said
 

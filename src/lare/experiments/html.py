@@ -68,5 +68,9 @@ def note(text: str) -> str:
 
 def function_text(model: str, digest: str, source: str) -> str:
     """The source of a latent function, and who wrote it."""
-    by = "Its file names no model" if model.startswith("none: written by hand") else f"By {model}"
+    by = (
+        "Written by hand, or from a file that names no language model"
+        if model.startswith("none: written by hand")
+        else f"By {model}"
+    )
     return note(f"{by}. SHA-256 {digest}.") + f"<pre>{escape(source)}</pre>"

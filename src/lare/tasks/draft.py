@@ -15,6 +15,8 @@ SCORE = (
     '"average": how good steps were on average'
 )
 
+MEASURES = '# measures = ["distance"] # keys of the last step\'s info to report beside the return'
+
 WANTED = {
     "description": "what is to be solved, and what the goal is; not a word about the reward",
     "observation": "what each entry of the observation means, with its unit",

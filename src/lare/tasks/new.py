@@ -7,7 +7,7 @@ import gymnasium
 
 from lare.errors import LareError
 from lare.tasks.documentation import ENDINGS, ending, plain, sections_of, without_rewards
-from lare.tasks.draft import JUDGES, SCORE, Draft, bodies, bounds, entries, flattened, warning
+from lare.tasks.draft import JUDGES, MEASURES, SCORE, Draft, bodies, bounds, entries, flattened, warning
 from lare.tasks.environment import make
 from lare.tasks.spaces import OneHot
 from lare.tasks.spec import PETTINGZOO
@@ -83,6 +83,7 @@ def write(environment_id: str, environment: gymnasium.Env) -> Draft:
         f"action_size = {action_size}",
         JUDGES,
         SCORE,
+        MEASURES,
         *(
             []
             if limit
