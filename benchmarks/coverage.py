@@ -7,15 +7,14 @@ Draws scores of one task from a normal and from an exponential distribution, 5,0
 same distribution, 0. Writes results/coverage.json.
 """
 
-import json
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from lare.experiments.statistics import REPETITIONS, interquartile_means
+from measure import write
 
 CASES = 5000
 SEEDS = (2, 3, 5, 8, 10, 20)
@@ -54,9 +53,8 @@ def main() -> None:
         name: {str(seeds): coverage(*distribution, seeds, random) for seeds in SEEDS}
         for name, distribution in DISTRIBUTIONS.items()
     }
-    place = Path(__file__).parent / "results" / "coverage.json"
-    place.write_text(json.dumps({"command": "python benchmarks/coverage.py", "coverage": found}, indent=1) + "\n")
-    print(json.dumps(found, indent=1))
+    print(found)
+    write("coverage", {"coverage": found})
 
 
 if __name__ == "__main__":

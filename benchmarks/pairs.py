@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lare.experiments.scores import last_quarter
 from lare.experiments.statistics import mann_whitney, mann_whitney_u
 from learning import mean_and_spread, read
 
@@ -39,9 +40,9 @@ def main() -> None:
     parser.add_argument("--late", action="store_true")
     given = parser.parse_args()
     groups = [[one for place in places for one in curves(place, given.key)] for places in (given.ours, given.over)]
-    shared = set.intersection(*(set(one) for group in groups for one in group))
-    last = max(shared)
-    steps = [step for step in shared if step > 0.75 * last] if given.late else [last]
+    shared = sorted(set.intersection(*(set(one) for group in groups for one in group)))
+    last = shared[-1]
+    steps = last_quarter(shared) if given.late else [last]
     ours, theirs = (np.array([np.mean([one[step] for step in steps]) for one in group]) for group in groups)
     for values in (ours, theirs):
         mean, spread = mean_and_spread(list(values))

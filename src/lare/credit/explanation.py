@@ -34,7 +34,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lare.credit import evidence
 from lare.credit.basis import FREQUENCIES, Basis
 from lare.credit.decomposition import AVERAGE, SUM
-from lare.credit.evidence import Posterior, Sums
+from lare.credit.evidence import Posterior, Problem, Sums
 
 ROUNDS = 100
 """Maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
@@ -110,8 +110,9 @@ def explain(sums: Sums, steps: Steps, form: Int[Array, ""] | int, basis: Basis) 
     """Explain returns by sums over the features of a basis, in float64."""
     group, of_factors = basis.group, basis.of_factors
     whole = evidence.fit(sums, form, group, evidence.unknown(basis.size, len(basis.sizes)), ROUNDS)
-    by_all, shaped = explained(sums, form, group, whole), int(basis.extended)
-    part, waves = parts(sums, form, group, whole, by_all)[~of_factors], shaped * basis.frequencies_of_entries
+    every = evidence.problem(sums, form, group)
+    by_all, shaped = explained(every, whole), int(basis.extended)
+    part, waves = parts(every, whole, by_all)[~of_factors], shaped * basis.frequencies_of_entries
     of_entries = jnp.add(*of_each(part, basis.used_entries, waves, shaped * basis.paired_entries))
     of_steps, none = (form == SUM) & lengths_differ(sums), jnp.zeros(0)
     if not of_factors.any():
@@ -121,8 +122,9 @@ def explain(sums: Sums, steps: Steps, form: Int[Array, ""] | int, basis: Basis) 
     alone, numbers = restricted(sums, np.flatnonzero(of_factors)), group[of_factors]
     fitted = evidence.fit(alone, form, numbers, evidence.unknown(len(numbers), int(numbers.max()) + 1), ROUNDS)
     sigma = evidence.covariance(alone, form, numbers, fitted)
-    by_factors = explained(alone, form, numbers, fitted)
-    part = parts(alone, form, numbers, fitted, by_factors)
+    given = evidence.problem(alone, form, numbers)
+    by_factors = explained(given, fitted)
+    part = parts(given, fitted, by_factors)
     own, paired = of_each(part, basis.factors, shaped * FREQUENCIES, shaped * basis.factors)
     slope, uncertainty, linear = effects(fitted.weight, sigma, steps, basis)
     # r_hat of an average is divided by T
@@ -130,7 +132,7 @@ def explain(sums: Sums, steps: Steps, form: Int[Array, ""] | int, basis: Basis) 
     return Explanation(
         sums.episodes,
         of_steps,
-        jnp.diagonal(evidence.problem(alone, form, numbers).s)[: basis.factors] > SAME**2 * sums.steps,
+        jnp.diagonal(given.s)[: basis.factors] > SAME**2 * sums.steps,
         by_factors,
         jnp.maximum(by_all, by_factors),
         of_entries,
@@ -139,7 +141,7 @@ def explain(sums: Sums, steps: Steps, form: Int[Array, ""] | int, basis: Basis) 
         linear,
         own + paired,
         paired,
-        residual(sums, form, basis, fitted, of_factors),
+        residual(every, basis, fitted, of_factors),
     )
 
 
@@ -157,24 +159,14 @@ def restricted(sums: Sums, features: Int[np.ndarray, " some"]) -> Sums:
     return sums._replace(mean=sums.mean[keep], products=sums.products[np.ix_(keep, keep)])
 
 
-def explained(
-    sums: Sums, form: Int[Array, ""] | int, group: Int[np.ndarray, " features"], known: Posterior
-) -> Float[Array, ""]:
+def explained(given: Problem, known: Posterior) -> Float[Array, ""]:
     """The share of the variation that a fit explains; NaN if returns are too few or do not vary."""
-    given = evidence.problem(sums, form, group)
     share = 1 - given.free / (given.q * jnp.where(known.beta > 0, known.beta, 1))
     return jnp.where((given.free > 1) & (given.unit > 0), jnp.clip(share, 0, 1), jnp.nan)
 
 
-def parts(
-    sums: Sums,
-    form: Int[Array, ""] | int,
-    group: Int[np.ndarray, " features"],
-    known: Posterior,
-    share: Float[Array, ""],
-) -> Float[Array, " features"]:
+def parts(given: Problem, known: Posterior, share: Float[Array, ""]) -> Float[Array, " features"]:
     """The part of the explained share that each feature has."""
-    given = evidence.problem(sums, form, group)
     weight = known.weight / jnp.where(given.unit > 0, given.unit, 1)
     part = weight * (given.s @ weight)
     return share * part / jnp.where(jnp.sum(part) > 0, jnp.sum(part), 1)
@@ -211,10 +203,9 @@ def effects(
 
 
 def residual(
-    sums: Sums, form: Int[Array, ""] | int, basis: Basis, fitted: Posterior, of_factors: np.ndarray
+    given: Problem, basis: Basis, fitted: Posterior, of_factors: Bool[np.ndarray, " features"]
 ) -> Float[Array, " entries"]:
-    """Correlation of the raw entries with the residual of a fit on the factors."""
-    given = evidence.problem(sums, form, basis.group)
+    """Correlation of the raw entries with the residual of a fit on the factors. `given` is the problem with all features."""
     unit = jnp.where(given.unit > 0, given.unit, 1)
     weight = jnp.zeros(basis.size).at[np.flatnonzero(of_factors)].set(fitted.weight / unit)
     after = given.p - given.s @ weight

@@ -1,7 +1,7 @@
 """A comparison of methods as a page: the table, and the figures that rliable's authors recommend."""
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from lare.experiments.html import note, table, write_page
 from lare.experiments.own_results import read_results
 from lare.experiments.scores import REFERENCES, RETURN, SUMMED_RETURN, Measured, by_label, differing
 from lare.experiments.statistics import REPETITIONS, Comparison, Estimate, compare, over_all, plus_minus, too_few
-from lare.run.directory import Run, read_measured
+from lare.run.directory import Config, Run, read_measured
 
 HEAD = ("method", "seeds", "IQM [95%]", "mean ± sd", "minus baseline [95%]", "above baseline [95%]", "p")
 OF_DRAWS = ("draws", "mean [95%], draws")
@@ -50,18 +50,21 @@ def find_all(places: Sequence[Path], metric: str) -> tuple[dict[str, list[Run | 
     return found, remarks + several_origins(runs)
 
 
+ORIGINS: tuple[tuple[str, str, Callable[[Config], str]], ...] = (
+    ("by several versions of LaRe", "LaRe {}", lambda config: config.lare),
+    ("with several versions of JAX", "JAX {}", lambda config: config.versions["jax"]),
+    ("on several machines", "{}", lambda config: config.machine),
+)
+"""What may differ in the origins of runs: the remark if it does, how it is named if it does not, and its value."""
+
+
 def several_origins(runs: Sequence[Run]) -> list[str]:
     """Remarks if runs were trained by several versions, or on several machines, with the methods of each."""
-    origins = {
-        "by several versions of LaRe": [run.config.lare for run in runs],
-        "with several versions of JAX": [run.config.versions["jax"] for run in runs],
-        "on several machines": [run.config.machine for run in runs],
-    }
     remarks = []
-    for what, each in origins.items():
+    for what, _, of_config in ORIGINS:
         methods: dict[str, dict[str, None]] = {}
-        for run, one in zip(runs, each, strict=True):
-            methods.setdefault(one, {})[run.config.settings.method] = None
+        for run in runs:
+            methods.setdefault(of_config(run.config), {})[run.config.settings.method] = None
         if len(methods) > 1:
             told = "; ".join(f"{one}: {', '.join(names)}" for one, names in methods.items())
             remarks.append(f"the runs were trained {what} ({told})")
@@ -162,7 +165,7 @@ def named(label: str, place: int) -> str:
 
 
 def shown(*found: Estimate | float | None) -> tuple[str, ...]:
-    """Estimates and probabilities as text; "-" for those that are not known."""
+    """Estimates and probabilities as text. A value that is not known is "-"."""
     return tuple("-" if one is None else f"{one:.2g}" if isinstance(one, float) else str(one) for one in found)
 
 
@@ -229,12 +232,8 @@ def write_comparisons(
 def origin(every: Sequence[Run | Measured]) -> list[str]:
     """What all runs have in common of their versions, machines and evaluations, in a sentence; remarks tell where they differ."""
     configs = [one.config for one in every if isinstance(one, Run)]
-    facts = [
-        {f"LaRe {config.lare}" for config in configs},
-        {f"JAX {config.versions['jax']}" for config in configs},
-        {config.machine for config in configs},
-        {f"{config.settings.evaluation_episodes} episodes in each evaluation" for config in configs},
-    ]
+    facts = [{name.format(of_config(config)) for config in configs} for _, name, of_config in ORIGINS]
+    facts.append({f"{config.settings.evaluation_episodes} episodes in each evaluation" for config in configs})
     told = [one for fact in facts if len(fact) == 1 for one in fact]
     return [f"Runs: {', '.join(told)}."] if told else []
 

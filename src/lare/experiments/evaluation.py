@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError
+from lare.experiments.verdict import Facts, error_of_difference
 from lare.run.directory import Run, as_run
 from lare.tasks.env import HostEnv
 from lare.tasks.load import check_against_environment
@@ -83,15 +84,13 @@ def above_chance(
 
         error^2 = var(random) / n + max(var over the seeds / seeds, mean var over the episodes / (seeds episodes))
 
-    None for a single episode, which has no error. The verdict of a report uses the same error.
+    None for a single episode, which has no error.
     """
-    seeds, episodes = returns.shape
-    if min(episodes, len(random)) < 2:
+    if min(returns.shape[1], len(random)) < 2:
         return None
-    of_episodes = np.mean(returns.var(axis=1, ddof=1)) / returns.size
-    of_seeds = returns.mean(axis=1).var(ddof=1) / seeds if seeds > 1 else 0.0
-    error = np.sqrt(random.var(ddof=1) / len(random) + max(of_episodes, of_seeds))
-    return float(returns.mean() - random.mean()), float(error)
+    of_evaluation = float(np.sqrt(np.mean(returns.var(axis=1, ddof=1)) / returns.size))
+    facts = Facts("", np.zeros(1), returns.mean(axis=1, keepdims=True), random, of_evaluation)
+    return facts.last - float(random.mean()), error_of_difference(facts)
 
 
 def random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:

@@ -249,6 +249,11 @@ def grouped(
     return [group_of(label, tasks, curves, steps, late) for label in found], tasks
 
 
+def last_quarter(steps: Sequence[int]) -> list[int]:
+    """Those of some ascending steps that are after three quarters of the last one."""
+    return [step for step in steps if 4 * step > 3 * steps[-1]]
+
+
 def spans_of(steps: Sequence[int]) -> str:
     """Steps in words: all of a few, or the first three and the last of many."""
     named = [f"{step:,}" for step in steps]
@@ -270,7 +275,7 @@ def group_of(label: str, tasks: Sequence[str], curves: Mapping, steps: Sequence[
         return [(found[step] - low) / (high - low) for step in steps]
 
     scores = np.array([[[values(draw, seed, task) for task in tasks] for seed in seeds] for draw in draws])
-    first = next(place for place, step in enumerate(steps) if 4 * step > 3 * steps[-1]) if late else -1
+    first = -len(last_quarter(steps)) if late else -1
     return Group(label, tuple(seeds), tuple(draws), tuple(steps), scores, scores[..., first:].mean(axis=-1))
 
 

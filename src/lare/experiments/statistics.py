@@ -2,7 +2,7 @@
 
 The scores (see `scores.py`) are those of the last evaluation that all runs have, unless the user asks for another step, or for
 means over the last quarter of the steps. Intervals have 95%, by stratified bootstrap over the seeds. A method that was trained on
-several draws of the language model has a second interval, over the draws, each of which is a mean over its seeds.
+several draws of the language model has a second interval, over the draws. The score of a draw is the mean over its seeds.
 """
 
 import contextlib

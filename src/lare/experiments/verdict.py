@@ -151,9 +151,14 @@ def better_than_chance(run: Facts) -> bool:
 
 
 def noise(run: Facts) -> float:
+    """`error_of_difference`, a little above 0."""
+    return max(error_of_difference(run), 1e-9)
+
+
+def error_of_difference(run: Facts) -> float:
     """The standard error of the difference between the mean return over the seeds and that of random actions."""
     of_random = deviation(run.random) / math.sqrt(max(1, len(run.random)))
-    return max(math.hypot(of_random, error_at_the_end(run)), 1e-9)
+    return math.hypot(of_random, error_at_the_end(run))
 
 
 def error_at_the_end(run: Facts) -> float:
@@ -322,25 +327,29 @@ def fell_from(run: Facts) -> tuple[int, float] | None:
     if evaluations is None:
         return None
     _, end, variation = evaluations
-    mean = np.nanmean(of_trained(run), axis=0)
-    best = int(np.nanargmax(mean))
+    step, top = best_evaluation(run)
     start = float(run.random.mean()) if len(run.random) else float(np.nanmean(run.returns[:, 0]))
-    top = float(mean[best])
     if len(run.random) and top <= start + 2 * noise(run):
         return None
     fell = top - end > max(0.15 * abs(top - start), 2 * variation, 2 * math.sqrt(2) * error_at_the_end(run))
-    return (int(run.steps[best]), top) if fell else None
+    return (step, top) if fell else None
+
+
+def best_evaluation(run: Facts) -> tuple[int, float]:
+    """Step and value of the highest mean over the seeds."""
+    mean = np.nanmean(of_trained(run), axis=0)
+    best = int(np.nanargmax(mean))
+    return int(run.steps[best]), float(mean[best])
 
 
 def higher_before(run: Facts) -> str:
     """A sentence on the best evaluation, if it is higher than the last one by a tenth of what was learned."""
-    mean = np.nanmean(of_trained(run), axis=0)
-    best = int(np.nanargmax(mean))
-    if mean[best] - run.last <= 0.1 * (run.last - run.random.mean()):
+    step, top = best_evaluation(run)
+    if top - run.last <= 0.1 * (run.last - run.random.mean()):
         return ""
     return (
-        f" The best evaluation was {shown(float(mean[best]))}, at step {int(run.steps[best]):,}: `lare evaluate {run.directory} "
-        "--best` plays its policy on other episodes."
+        f" The best evaluation was {shown(top)}, at step {step:,}: `lare evaluate {run.directory} --best` plays its policy on "
+        "other episodes."
     )
 
 
