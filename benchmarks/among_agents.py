@@ -18,8 +18,8 @@ from lare.experiments.watch import on_device, proxy_of
 from lare.run.directory import Run, open_run
 from lare.tasks.env import JaxEnv
 from lare.tasks.table import make_env
-from lare.training.annotate import annotate
 from lare.training.compiled import module_of
+from lare.training.factors import host_factors
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
 from measure import apart, correlation, write
@@ -36,7 +36,7 @@ def judged(run: Run, place: int) -> tuple[Rewards, Rewards]:
     one = jax.tree.map(lambda leaf: leaf[place : place + 1], learner)
     actor = module_of(config).actor(one, run.config.settings.steps, config)
     steps, _, _ = on_device(env, config, actor, EPISODES, KEY)
-    proxy = proxy_of(of_seed(learner, place), steps, annotate(run, config, steps), config)
+    proxy = proxy_of(of_seed(learner, place), steps, host_factors(run, config, steps), config)
     return steps.after.reward.swapaxes(0, 1), proxy.swapaxes(0, 1)
 
 

@@ -1,123 +1,115 @@
-"""Generated code: what its gates refuse, and what its jail costs.
+"""Generated code: what can be read, what reading costs, and what the graphs cost.
 
-python benchmarks/generated_code.py refused     hostile and benign programs, recorded replies, the jail without the gate
+python benchmarks/generated_code.py programs    recorded, varied and hostile programs, and attacks: accepted, refused, time, memory
 python benchmarks/generated_code.py fuzz        sweeps over all names, splices, mutants and garbage
-python benchmarks/generated_code.py cost        verification; phi in the jail compared with in process; its share of training
+python benchmarks/generated_code.py cost        graphs in NumPy and in JAX, compile time, share of a training iteration
 """
 
 import ast
-import contextlib
-import inspect as inspection
+import inspect
 import json
 import random
+import resource
 import sys
+import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import lare
-from lare.algorithms.settings import TD3Settings
-from lare.latent.evaluator import Evaluator
-from lare.latent.language import gate
-from lare.latent.language.program import Program
-from lare.latent.sandbox.jailed import JailedProgram, WorkerFailed
-from lare.latent.verification.checks import Trial, examine
-from lare.latent.verification.verify import verify
-from lare.llm.recording import SHIPPED, read_recording
-from lare.llm.reply import parse
-from lare.tasks.load import read_task
-from lare.training import session as sessions
-from measure import advance, interleave, new_session, show, summary, write
+from lare.latent.factors import compute_factors
+from lare.latent.verify import verify
+from lare.phi.evaluate import evaluate
+from lare.phi.graph import Graph, Refused
+from lare.phi.read import read
+from lare.training.compiled import compiled
+from lare.training.factors import compiles
+from measure import interleave, new_session, write
 
-CASES = Path(__file__).parents[1] / "tests" / "latent" / "cases.json"
-OBSERVATION, ACTION, SEED = 17, 6, 0
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from phi.corpus import Program, benign, hostile, recorded, varied
+from phi.test_limits import ATTACKS
 
-
-def steps(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    random_numbers = np.random.default_rng(SEED)
-    observation = random_numbers.standard_normal((rows, OBSERVATION), np.float32)
-    return observation, random_numbers.uniform(-1, 1, (rows, ACTION)).astype(np.float32)
+SEED = 0
 
 
-def judged(source: str) -> str:
-    """The stage that refuses a program, or "accepted". An accepted program has made no system call that the jail refuses."""
-    with contextlib.ExitStack() as stack:
-        try:
-            program = stack.enter_context(contextlib.closing(JailedProgram(source, OBSERVATION, ACTION)))
-            if program.problems:
-                return "static gate"
-            if program.failed:
-                return "dynamic gate"
-            watched = JailedProgram(source, OBSERVATION, ACTION, kill=True, audit=True)
-            again = stack.enter_context(contextlib.closing(watched))
-            if not all(check.passed for check in examine(Trial(program, again, *steps(256)))):
-                return "dynamic gate"
-            return "accepted, with audit events" if watched.call(*steps(256)).events else "accepted"
-        except WorkerFailed:
-            return "worker ended"
-
-
-def contained(source: str) -> str:
-    """The outcome of a program without the gate: it computes, fails, or ends its own process."""
-    try:
-        with contextlib.closing(JailedProgram(source, OBSERVATION, ACTION, gated=False)) as program:
-            outcome = program.failed or program.call(*steps(256))
-            return "failed" if outcome.error else "computed"
-    except WorkerFailed:
-        return "worker ended"
-
-
-def replies() -> dict[str, dict[str, int]]:
-    """By task: how many recorded replies pass every check without a correction, and how many there are."""
-    found: dict[str, Counter[str]] = {}
-    for kind in sorted(SHIPPED.iterdir(), key=lambda entry: entry.name):
-        for entry in sorted(kind.iterdir(), key=lambda entry: entry.name):
-            recording = read_recording(entry.read_text(encoding="utf-8"), entry.name)
-            task = read_task(recording.task)
-            for exchange in recording.exchanges:
-                for reply in exchange.replies:
-                    row = found.setdefault(f"{recording.task}, {recording.kind}, {exchange.stage}", Counter())
-                    row["all"] += 1
-                    row["pass"] += verify(parse(reply).functions, task, recording.kind).passed
-    return {name: dict(row) for name, row in found.items()}
-
-
-def timed(cases: list[dict[str, str]], seconds: list[float]) -> Counter[str]:
-    """The outcomes of some programs. The time that each takes is added to `seconds`."""
-    found: Counter[str] = Counter()
-    for case in cases:
-        start = time.perf_counter()
-        found[judged(case["code"])] += 1
-        seconds.append(time.perf_counter() - start)
-    return found
-
-
-def refused() -> None:
-    cases = json.loads(CASES.read_text(encoding="utf-8"))
-    seconds: list[float] = []
-    hostile, benign = timed(cases["hostile"], seconds), timed(cases["benign"], seconds)
-    without_gate = Counter(contained(case["code"]) for case in cases["hostile"])
-    figures = {
-        "hostile programs": dict(hostile),
-        "benign programs": dict(benign),
-        "seconds to judge one of both": {
-            "median": float(np.median(seconds)),
-            "95th percentile": float(np.quantile(seconds, 0.95)),
-            "worst": max(seconds),
-        },
-        "hostile programs in the jail, without the gate": dict(without_gate),
-        "recorded replies that pass as they came": replies(),
+def quantiles(values: Iterable[float]) -> dict[str, float]:
+    array = np.array(list(values), float)
+    return {
+        "median": round(float(np.median(array)), 4),
+        "95th percentile": round(float(np.quantile(array, 0.95)), 4),
+        "worst": round(float(array.max()), 4),
     }
+
+
+def corpora() -> dict[str, list[Program]]:
+    """All programs, each once."""
+    distinct = {(p.source, p.sizes): p for p in recorded()}
+    return {"recorded replies": list(distinct.values()), "benign": benign(), "varied": varied(), "hostile": hostile()}
+
+
+def graphs_of(programs: Iterable[Program]) -> list[Graph]:
+    graphs = []
+    for program in programs:
+        try:
+            graphs.append(read(program.source, *program.sizes))
+        except Refused:
+            continue
+    return graphs
+
+
+# --- programs -----------------------------------------------------------------------------------------------------------
+
+
+def peak_memory() -> float:
+    """The largest memory of this process so far, in MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def read_all(programs: Iterable[Program]) -> dict[str, Any]:
+    outcomes, seconds, sizes = Counter(), [], []
+    before = peak_memory()
+    for program in programs:
+        start = time.perf_counter()
+        try:
+            sizes.append(read(program.source, *program.sizes))
+            outcomes["accepted"] += 1
+        except Refused as refusal:
+            outcomes[f"refused, {refusal.code}"] += 1
+        seconds.append(1000 * (time.perf_counter() - start))
+    row: dict[str, Any] = {"programs": len(seconds), **outcomes, "ms to read": quantiles(seconds)}
+    row["MB added to the process"] = round(peak_memory() - before, 1)
+    if sizes:
+        row["operations"] = quantiles(len(graph.operations) for graph in sizes)
+        row["longest chain"] = quantiles(graph.depth for graph in sizes)
+        row["numbers for each row"] = quantiles(graph.size for graph in sizes)
+    return row
+
+
+def programs() -> None:
+    attacks = [Program(name, (17, 6), source) for name, source in ATTACKS.items()]
+    read_all(benign())  # what is loaded at first use
+    figures = {name: read_all(corpus) for name, corpus in (*corpora().items(), ("attacks", attacks))}
+    task = lare.load_task("HalfCheetah-v4")
+    phi = lare.design(task, candidates=1)
+    verify(phi.source, task)
+    seconds = []
+    for _ in range(20):
+        start = time.perf_counter()
+        assert verify(phi.source, task).passed
+        seconds.append(1000 * (time.perf_counter() - start))
+    figures["ms to verify a function of HalfCheetah-v4"] = quantiles(seconds)
     print(json.dumps(figures, indent=1))
-    write("generated_code_refused", figures)
+    write("generated_code_programs", figures)
 
 
-# --- fuzz ------------------------------------------------------------------------------------------------------------
+# --- fuzz ---------------------------------------------------------------------------------------------------------------
 
 HOSTILE = """
 __import__('os') open('/etc/passwd') eval('1') exec('1') globals() getattr(np,'load') type(observation) np.load('x')
@@ -127,16 +119,28 @@ np.array([1],'O') observation.astype('O') (np:=1) np.frompyfunc(len,1,1) observa
 np.add.at(observation,0,1) np.add(observation,1,observation) np.fromfile('x') np.linalg np math __builtins__ breakpoint()
 (yield) (await x) np.apply_along_axis(len,1,observation) np.errstate(call=print) float('nan') id(observation) hash('x')
 """.split()
+FORBIDDEN = (
+    "open",
+    "import",
+    "exec",
+    "os.",
+    "subprocess",
+    "socket",
+    "ctypes",
+    "object.__getattr__",
+    "object.__setattr__",
+)
+"""Audit events that reading must not cause. `ast.parse` causes "compile"."""
 
 
-def names() -> Iterator[str]:
-    """Expressions with every name in NumPy, and with every attribute of every type that can be reached."""
+def sweep() -> Iterator[str]:
+    """Expressions with every name in NumPy, and with every attribute of every type that a value could have."""
     for name in dir(np):
         yield f"np.{name}(observation)"
         yield f"np.{name}"
-        for inner in dir(getattr(np, name, None)) if inspection.ismodule(getattr(np, name, None)) else ():
+        for inner in dir(getattr(np, name, None)) if inspect.ismodule(getattr(np, name, None)) else ():
             yield f"np.{name}.{inner}(observation)"
-    reachable: list[Any] = [
+    values: list[Any] = [
         np.zeros(1),
         np.float32(1),
         np.dtype("f4"),
@@ -149,35 +153,50 @@ def names() -> Iterator[str]:
         True,
         "",
         None,
+        1j,
     ]
-    reachable += [len, names, range(1), slice(1), lambda: 0, np.sin, Ellipsis, type, object, (n for n in [1])]
-    for name in sorted({name for value in reachable for name in dir(value)}):
-        yield f"observation.{name}"
-        yield f"observation.{name}()"
+    values += [len, sweep, range(1), slice(1), lambda: 0, np.sin, Ellipsis, type, object, (n for n in [1])]
+    for name in sorted({name for value in values for name in dir(value)}):
+        for owner in (
+            "observation",
+            "[1]",
+            "{}",
+            "'a'",
+            "1.0",
+            "len",
+            "(lambda: 0)",
+            "np",
+            "np.sin",
+            "(1, 2)",
+            "{1}",
+            "slice(1)",
+        ):
+            yield f"{owner}.{name}"
+            yield f"{owner}.{name}()"
 
 
 def in_function(expression: str) -> str:
-    return f"import numpy as np\ndef evaluation_func(observation, action):\n    x = {expression}\n    return [observation[:, :1]]"
+    body = f"    x = {expression}\n    return [observation[:, :1]]"
+    return f"import numpy as np\ndef evaluation_func(observation, action):\n{body}"
 
 
 def spliced(source: str, choice: random.Random) -> str:
     """A program in which a hostile expression replaces one of its own."""
-    tree = ast.parse(source)
-    places = [node for node in ast.walk(tree) if isinstance(node, ast.expr) and hasattr(node, "lineno")]
-    place = choice.choice(places)
+    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.expr)]
+    node = choice.choice(nodes)
     lines = source.split("\n")
-    if place.lineno != place.end_lineno:
+    if node.lineno != node.end_lineno:
         return source + "\n" + choice.choice(HOSTILE)
-    line = lines[place.lineno - 1].encode()
-    new = line[: place.col_offset] + choice.choice(HOSTILE).encode() + line[place.end_col_offset :]
-    lines[place.lineno - 1] = new.decode(errors="replace")
+    line = lines[node.lineno - 1].encode()
+    new = line[: node.col_offset] + choice.choice(HOSTILE).encode() + line[node.end_col_offset :]
+    lines[node.lineno - 1] = new.decode(errors="replace")
     return "\n".join(lines)
 
 
 def crossed(sources: list[str], choice: random.Random) -> str:
     """The first lines of one program and the last lines of another."""
-    one, other = (choice.choice(sources).split("\n") for _ in range(2))
-    return "\n".join(one[: choice.randrange(len(one) + 1)] + other[choice.randrange(len(other) + 1) :])
+    first, second = (choice.choice(sources).split("\n") for _ in range(2))
+    return "\n".join(first[: choice.randrange(len(first) + 1)] + second[choice.randrange(len(second) + 1) :])
 
 
 def garbage(choice: random.Random) -> str:
@@ -185,23 +204,14 @@ def garbage(choice: random.Random) -> str:
     return "".join(choice.choice(letters) for _ in range(choice.randrange(400)))
 
 
-def frozen(array: np.ndarray) -> np.ndarray:
-    array.setflags(write=False)
-    return array
-
-
-FORBIDDEN = ("open", "import", "exec", "compile", "os.", "subprocess", "socket", "ctypes", "object.__getattr__")
-
-
 def fuzz(budget: int = 20_000) -> None:
-    cases = json.loads(CASES.read_text(encoding="utf-8"))
-    benign, hostile = ([case["code"] for case in cases[kind]] for kind in ("benign", "hostile"))
     choice = random.Random(SEED)
-    sweep = [in_function(expression) for expression in names()]
-    allowed = Counter("accepted" if not gate.inspect(source) else "refused" for source in sweep)
-    families = {
-        "splices of hostile expressions": [spliced(choice.choice(benign), choice) for _ in range(budget)],
-        "mutants crossed from benign and hostile programs": [crossed(benign + hostile, choice) for _ in range(budget)],
+    trusted = [program.source for program in (*benign(), *varied())]
+    mixed = trusted + [program.source for program in hostile()]
+    families: dict[str, Iterable[str]] = {
+        "names and attributes": [in_function(expression) for expression in sweep()],
+        "splices of hostile expressions": [spliced(choice.choice(trusted), choice) for _ in range(budget)],
+        "programs crossed with others": [crossed(mixed, choice) for _ in range(budget)],
         "garbage": [garbage(choice) for _ in range(budget)],
     }
     events: Counter[str] = Counter()
@@ -211,92 +221,121 @@ def fuzz(budget: int = 20_000) -> None:
         if watching and event.startswith(FORBIDDEN):
             events[event] += 1
 
+    graphs_of(varied())  # what is loaded at first use
     sys.addaudithook(watch)
-    figures: dict[str, Any] = {"sweep over names": {"programs": len(sweep), **allowed}, "seed": SEED}
+    figures: dict[str, Any] = {"seed": SEED}
+    steps = [np.random.default_rng(SEED).standard_normal((6, size)).astype(np.float32) for size in (64, 64)]
     for family, sources in families.items():
-        found: Counter[str] = Counter()
+        outcomes, seconds = Counter(), []
         for source in sources:
-            outcome = "refused" if gate.inspect(source) else None
-            if outcome is None:
-                program = Program(source)
-                watching = True
-                try:
-                    with np.errstate(all="ignore"):
-                        program(*(frozen(array) for array in steps(8)))
-                    outcome = "accepted"
-                except Exception as error:
-                    outcome = f"accepted, then {type(error).__name__}"
-                watching = False
-            found[outcome] += 1
-        figures[family] = {"programs": len(sources), **found}
-    figures["audit events of accepted programs"] = dict(events)
+            watching, start = True, time.perf_counter()
+            try:
+                graph = read(source, 64, 64)
+            except Refused:
+                graph = None
+            watching = False
+            seconds.append(1000 * (time.perf_counter() - start))
+            outcomes["accepted" if graph else "refused"] += 1
+            if graph is not None:
+                factors, alone = (
+                    compute_factors(graph, *steps),
+                    compute_factors(graph, *(array[2:3] for array in steps)),
+                )
+                same = np.allclose(factors[2], alone[0], rtol=1e-4, atol=1e-4, equal_nan=True)
+                outcomes["accepted, but rows differ"] += not same
+        figures[family] = {"programs": len(seconds), **outcomes, "ms to read": quantiles(seconds)}
+    figures["audit events while reading"] = dict(events)
     print(json.dumps(figures, indent=1))
     write("generated_code_fuzz", figures)
 
 
-# --- cost ------------------------------------------------------------------------------------------------------------
+# --- cost ---------------------------------------------------------------------------------------------------------------
 
 
-def cost(rounds: int = 7) -> None:
-    task = lare.load_task("HalfCheetah-v4")
-    phi = lare.design(task, candidates=1)
-    seconds = []
+def best_ms(work: Callable[[], Any], rounds: int = 7) -> float:
+    times = []
     for _ in range(rounds):
         start = time.perf_counter()
-        assert verify(phi.source, task).passed
-        seconds.append(time.perf_counter() - start)
-    jailed, plain = Evaluator(phi.source, phi.names, OBSERVATION, ACTION), Program(phi.source)
-    tables = {}
-    for rows, calls in ((1, 500), (256, 500), (4096, 100), (100_000, 10)):
-        batch = steps(rows)
+        work()
+        times.append(time.perf_counter() - start)
+    return 1000 * min(times)
 
-        def in_process(batch: Any, calls: int) -> None:
-            for _ in range(calls):
-                with np.errstate(all="ignore"):
-                    np.concatenate(plain(*batch), axis=1).astype(np.float32)
 
-        def in_jail(batch: Any, calls: int) -> None:
-            for _ in range(calls):
-                jailed(*batch)
+def graph_costs(program: Program) -> dict[str, float]:
+    """Milliseconds to compute the graph of a program, and to compile it."""
+    graph = read(program.source, *program.sizes)
+    random_numbers = np.random.default_rng(SEED)
+    inputs = {
+        name: random_numbers.standard_normal((1000, size)).astype(np.float32)
+        for name, size in zip(("observation", "action"), program.sizes, strict=True)
+    }
+    row = {name: array[:1] for name, array in inputs.items()}
+    costs = {
+        "NumPy, 1 row": best_ms(lambda: evaluate(graph, row)),
+        "NumPy, 1,000 rows": best_ms(lambda: evaluate(graph, inputs)),
+    }
+    if compiles(graph):
+        start = time.perf_counter()
+        lowered = jax.jit(lambda inputs: evaluate(graph, inputs, jnp)["factors"]).lower(inputs)
+        traced = time.perf_counter()
+        function = lowered.compile()
+        costs |= {"JAX, to trace": 1000 * (traced - start), "JAX, to compile": 1000 * (time.perf_counter() - traced)}
+        costs["JAX, 1,000 rows"] = best_ms(lambda: jax.block_until_ready(function(inputs)))
+    return costs
 
-        contenders = {"in process": partial(in_process, batch, calls), "in the jail": partial(in_jail, batch, calls)}
-        tables[f"{rows:,} rows"] = summary(interleave(contenders, rounds), calls, "in process")
-        show(f"phi, {rows:,} rows", tables[f"{rows:,} rows"], "in process")
-    figures = {"verification, seconds": sorted(round(one, 3) for one in seconds), "phi": tables, "share": share(phi)}
-    print(json.dumps({name: figures[name] for name in ("verification, seconds", "share")}))
+
+def iteration_costs(task: str, settings: lare.Settings, rounds: int = 5) -> dict[str, float]:
+    """Milliseconds of an iteration, of storing its steps, and of storing them without phi."""
+    with tempfile.TemporaryDirectory() as folder:
+        session = new_session(Path(folder) / "run", task, settings)
+        for _ in range(3):
+            session.advance()
+        steps = session.collector.collect(session.actor, session.step)
+        plain = compiled(session.config).store
+        copies = {name: jax.tree.map(jnp.copy, session.learner) for name in ("with phi", "without phi")}
+
+        def store(name: str, function: Callable[..., Any]) -> None:
+            copies[name] = jax.block_until_ready(function(copies[name], steps))[0]
+
+        work = {
+            "with phi": lambda: store("with phi", session.functions.store),
+            "without phi": lambda: store("without phi", plain),
+            "iteration": lambda: (session.advance(), jax.block_until_ready(session.learner)),
+        }
+        seconds = interleave(work, rounds)
+        session.close()
+    ms = {name: 1000 * float(np.median(values)) for name, values in seconds.items()}
+    phi = max(ms["with phi"] - ms["without phi"], 0.0)
+    return {**ms, "phi": phi, "share of phi": phi / ms["iteration"]}
+
+
+ITERATIONS = {
+    "HalfCheetah-v4": lare.Settings(method="lare-bayes", algorithm="td3", td3={"warmup": 100}),
+    "CN-6": lare.Settings(method="lare-bayes", algorithm="ippo"),
+    "CN-30": lare.Settings(method="lare-bayes", algorithm="ippo"),
+    "SMAX-2s3z": lare.Settings(method="lare-rd", algorithm="qmix"),
+}
+
+
+def cost() -> None:
+    rows: dict[str, list[float]] = {}
+    distinct = [program for name, corpus in corpora().items() if name != "hostile" for program in corpus]
+    for program in distinct:
+        try:
+            costs = graph_costs(program)
+        except Refused:
+            continue
+        for name, value in costs.items():
+            rows.setdefault(name, []).append(value)
+    figures: dict[str, Any] = {f"ms, {name}": quantiles(values) for name, values in rows.items()}
+    for task, settings in ITERATIONS.items():
+        figures[f"ms of an iteration of {task}, one seed"] = {
+            key: round(value, 4) for key, value in iteration_costs(task, settings).items()
+        }
+        print(task, figures[f"ms of an iteration of {task}, one seed"], flush=True)
+    print(json.dumps(figures, indent=1))
     write("generated_code_cost", figures)
 
 
-def share(phi: Any, steps_of_run: int = 3000) -> dict[str, float]:
-    """The share of a training run's time that phi takes."""
-    import tempfile
-
-    settings = lare.Settings(method="lare-rrdu", seed=SEED, td3=TD3Settings(warmup=1000))
-    with tempfile.TemporaryDirectory() as place:
-        session = new_session(Path(place) / "run", "HalfCheetah-v4", settings)
-        advance(session, 1000)
-        spent = 0.0
-        annotate = sessions.annotate
-
-        def timed(*given: Any) -> Any:
-            nonlocal spent
-            start = time.perf_counter()
-            result = annotate(*given)
-            spent += time.perf_counter() - start
-            return result
-
-        sessions.annotate = timed
-        start = time.perf_counter()
-        advance(session, steps_of_run)
-        whole = time.perf_counter() - start
-        sessions.annotate = annotate
-        session.close()
-    return {"steps": steps_of_run, "seconds": whole, "seconds in phi": spent, "share": spent / whole}
-
-
-COMMANDS = {"refused": refused, "fuzz": fuzz, "cost": cost}
-
 if __name__ == "__main__":
-    if len(sys.argv) != 2 or sys.argv[1] not in COMMANDS:
-        sys.exit(__doc__)
-    COMMANDS[sys.argv[1]]()
+    {"programs": programs, "fuzz": fuzz, "cost": cost}[sys.argv[1]]()

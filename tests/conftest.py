@@ -1,6 +1,7 @@
 """Fixtures for all tests."""
 
 import gc
+import hashlib
 import itertools
 import json
 import os
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 from jax_toys import Echo, echo_spec
@@ -18,6 +20,7 @@ from lare.algorithms.table import ALGORITHMS
 from lare.deploy import export
 from lare.experiments import evaluation, policy, watch
 from lare.latent.function import LatentFunction, verified
+from lare.phi.graph import Gather, Graph
 from lare.run.settings import Settings
 from lare.tasks.spec import TaskSpec
 from lare.tasks.table import FAMILIES, Family
@@ -88,10 +91,20 @@ def forget_what_was_compiled():
         gc.collect()
 
 
+def digest(graph: Graph) -> str:
+    """A hash of all operations of a graph, the same for one that is read again."""
+    hashed = hashlib.sha256(repr(graph.outputs).encode())
+    for node in graph.nodes:
+        option = node.option.positions if isinstance(node.option, Gather) else node.option
+        option = option.tobytes() if isinstance(option, np.ndarray) else option
+        hashed.update(repr((node.op, node.inputs, node.shape, node.kind, option)).encode())
+    return hashed.hexdigest()
+
+
 @pytest.fixture(autouse=True, scope="module")
 def compile_once():
     """Functions that are compiled for a configuration serve every run of a module that has it: one that is resumed, evaluated,
-    explained, or trained again.
+    explained, or trained again. `store`, which computes phi, serves those of the same phi.
 
     A few of them are kept, until the module's last test.
     """
@@ -103,8 +116,12 @@ def compile_once():
             del kept[next(iter(kept))]
         return kept[key]
 
-    def of_config(config):
-        return once(repr(config), lambda: compiled(config))
+    def of_config(config, phi=()):
+        functions = once(repr(config), lambda: compiled(config))
+        if not phi:
+            return functions
+        key = repr(config), *map(digest, phi)
+        return functions._replace(store=once(key, lambda: compiled(config, phi).store))
 
     def of_shapes(function, *shapes):
         return once((function, str(jax.tree.map(jax.typeof, shapes))), lambda: ahead(function, *shapes))

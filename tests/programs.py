@@ -1,11 +1,11 @@
-"""Programs, run on steps of HalfCheetah: as they are meant to be, and as Python has them."""
+"""Programs on steps of HalfCheetah: as the graph that is read, and as Python computes them."""
 
 import math
 
 import numpy as np
 
-from lare.latent.language.program import FILE, Program
-from toys import phi
+from lare.latent.factors import compute_factors
+from lare.phi.read import read
 
 
 def batch(rows: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -14,13 +14,13 @@ def batch(rows: int = 5) -> tuple[np.ndarray, np.ndarray]:
     return observation.astype(np.float32), action.astype(np.float32)
 
 
-def run(body: str):
-    """Runs some lines as a program."""
-    return Program(phi(f"{body}\nreturn [action]"))(*batch())
+def by_graph(source: str) -> np.ndarray:
+    """The factors of a program by the graph that is read."""
+    return compute_factors(read(source, 17, 6), *batch())
 
 
-def run_plainly(source: str):
-    """What a program returns as Python has it."""
+def by_python(source: str) -> np.ndarray:
+    """The factors of a program that Python executes."""
     names = {"np": np, "math": math}
-    exec(compile(source, FILE, "exec"), names)
-    return names["evaluation_func"](*batch())
+    exec(compile(source, "phi", "exec"), names)
+    return np.concatenate(names["evaluation_func"](*batch()), axis=1, dtype=np.float32)

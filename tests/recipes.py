@@ -122,8 +122,13 @@ def with_steps(learner, config, steps, factors=None, tell=False):
     with `tell`: they would only learn the form of the score from it, and compiling this takes a second.
     """
     factors = factors_for(config, steps) if factors is None else factors
-    learner = jitted(common.store, config)(learner, steps, factors)
+    learner = jitted(common.store_with_factors, config)(learner, steps, factors)
     return told(learner, config) if learner.credit and (tell or not config.method.descends) else learner
+
+
+def store_seeds(config):
+    """Stores the steps and factors of several seeds, as `compiled(config).store` does with those that it computes."""
+    return jax.jit(jax.vmap(partial(common.store_with_factors, config=config)), donate_argnums=0)
 
 
 COMPILED = {}

@@ -11,7 +11,6 @@ from lare import cli
 from lare.algorithms.table import ALGORITHMS
 from lare.cli.runs import when_saved
 from lare.credit.methods import METHODS
-from lare.latent.verification.checks import CHECKS
 from lare.llm.prompts import candidate
 from lare.source import source
 from lare.tasks.load import read_task, shipped_tasks
@@ -157,20 +156,13 @@ def test_design_writes_the_function_once(command, tmp_path):
 def test_verify_prints_each_check(command, phi, spec_file):
     status, out, err = command("verify", phi, "--task", spec_file())
     assert (status, err) == (0, "")
-    first, *checks, last = out.splitlines()
-    assert first == "for Chase: observations of 2 numbers, actions of 1"
-    assert checks == [f"passed  {name}" for name in ("gate", *CHECKS)]
-    assert last.startswith("It ran in a process of its own (")
-
-
-def test_verify_says_what_cannot_be_exported(command, phi, spec_file):
-    phi.write_text(phi.read_text().replace("np.square(action)", "np.sort(action, axis=1)"))
-    status, out, _ = command("verify", phi, "--task", spec_file())
-    assert status == 0
-    assert out.splitlines()[-2] == (
-        "advice  lare export cannot make it a part of the exported reward: it has a call of np.sort (docs/export.md lists what can "
-        "be)"
-    )
+    assert out.splitlines() == [
+        "for Chase: observations of 2 numbers, actions of 1",
+        "passed  read",
+        "passed  finite",
+        "factor  f_near reads observation[0], action[0]",
+        "factor  f_effort reads action[0]",
+    ]
 
 
 def test_verify_says_how_much_of_the_score_the_factors_explain(command, phi, spec_file):
@@ -207,13 +199,13 @@ def test_verify_prints_every_error(command, spec_file, tmp_path):
     (tmp_path / "bad.py").write_text("import os\ndef evaluation_func(o, a):\n    return [np.clamp(a), open('x')]\n")
     status, out, err = command("verify", "bad.py", "--task", spec_file())
     assert (status, err) == (1, "")
-    assert out.splitlines() == [
-        "for Chase: observations of 2 numbers, actions of 1",
-        "FAILED  gate",
-        "        E-IMPORT line 1: import os: only `import numpy as np` and `import math` are available",
-        "        E-CALL line 3: open is not a function that is available",
-        "        E-NUMPY line 3: np.clamp is not available: there is no such function; write np.clip",
-    ]
+    first, failed, *errors = out.splitlines()
+    assert first == "for Chase: observations of 2 numbers, actions of 1"
+    assert failed == "FAILED  read"
+    assert len(errors) == 2
+    assert errors[0].startswith("        E-IMPORT line 1: import os")
+    assert errors[1].startswith("        E-NUMPY line 3: np.clamp is not available")
+    assert "np.clip" in errors[1]
 
 
 def test_verify_says_how_a_reply_from_a_chat_is_corrected(command, spec_file, tmp_path):
@@ -221,7 +213,7 @@ def test_verify_says_how_a_reply_from_a_chat_is_corrected(command, spec_file, tm
     (tmp_path / "reply.json").write_text(json.dumps({"Understand": "", "Analyze": "", "Functions": source}))
     status, out, err = command("verify", "reply.json", "--task", spec_file())
     assert (status, err) == (1, "")
-    assert "        E-FORM: factor 1 must be an array of shape (batch_size, 1) = (256, 1), " in out
+    assert "        E-FORM line 2: factor 1 must be an array of the shape (batch, 1)" in out
     assert out.endswith(
         "Paste the lines after FAILED into the same chat, and ask for the whole reply again, corrected.\n"
     )
@@ -245,14 +237,6 @@ def test_what_cannot_be_tried_is_status_2(command, phi, arguments, message):
     status, out, err = command("verify", *arguments.split())
     assert (status, out) == (2, "")
     assert err.startswith(f"lare: {message}")
-
-
-def test_no_process_to_be_had_is_status_2(command, phi, spec_file, monkeypatch):
-    monkeypatch.setattr("lare.latent.sandbox.jailed.START", "raise SystemExit('no Python here')")
-    status, out, err = command("verify", phi, "--task", spec_file())
-    assert (status, out) == (2, "")
-    assert err.startswith("lare: the process for the latent function does not start: ")
-    assert "no Python here" in err
 
 
 def test_a_new_task_is_written_once(command, tmp_path):
@@ -290,7 +274,7 @@ def test_what_a_new_task_lacks_is_said(command):
     ]
 
 
-def test_the_ablation_without_pre_verification_keeps_what_runs(command):
+def test_the_ablation_without_pre_verification_keeps_what_can_be_read(command):
     status, out, err = command("design", "Reacher-v4", "--candidates", 1, "--no-pre-verification")
     assert (status, err) == (0, "")
     assert "def evaluation_func" in out
@@ -368,13 +352,13 @@ def test_debug_shows_where_it_came_from(command, arguments):
 
 
 def test_an_error_of_many_lines_is_printed_in_one(command, spec_file, tmp_path):
-    (tmp_path / "bad.py").write_text("def evaluation_func(o, a):\n    while True: pass\n    raise ValueError\n")
+    (tmp_path / "bad.py").write_text("import os\ndef evaluation_func(o, a):\n    return [np.load(a)]\n")
     status, _, err = command("train", spec_file(), "--function", "bad.py")
     assert status == 2
-    assert err == (
-        "lare: bad.py: the function does not fit task 'Chase': E-CONSTRUCT line 2: while is not available "
-        "E-CONSTRUCT line 3: raise is not available\n"
-    )
+    start = "lare: bad.py: the function does not fit task 'Chase': E-IMPORT line 1: import os"
+    assert err.startswith(start)
+    assert " E-NUMPY line 3: np.load" in err
+    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ def is_seen(letter: str) -> bool:
 
 def unseen(text: str) -> int | None:
     """The index of the first invisible character; None if there is none."""
-    if text.isascii() and text.isprintable():
+    if text.isascii() and text.replace("\n", "").replace("\t", "").isprintable():
         return None
     return next((place for place, letter in enumerate(text) if not is_seen(letter)), None)
 

@@ -4,6 +4,7 @@ import importlib.util
 import json
 import subprocess
 import sys
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from lare.algorithms import ppo
 from lare.credit import decomposition
 from lare.credit.methods import METHODS
 from lare.data import replay
-from lare.deploy import onnx
+from lare.deploy import export
 from lare.errors import pip_install
 from lare.latent.function import verified
 from lare.tasks.env import env_action
@@ -26,7 +27,8 @@ from lare.training import on_policy
 from lare.training.compiled import compiled, new_memory
 from lare.training.learner import Paid
 from lare.training.seeds import of_seed
-from lare.training.session import load_learner
+from lare.training.session import graphs, load_learner
+from recipes import TOTAL, steps_of
 from tiers import long
 from toys import pick_spec, toy_spec
 
@@ -77,13 +79,13 @@ PHI = """import numpy as np
 def evaluation_func(o, a):
     return [o[:, 0:1] * np.sum(a, axis=1, keepdims=True), o[:, 1:2]]
 """
-NO_TRANSLATION = PHI.replace("np.sum(a", "np.median(a")
+MEDIAN = PHI.replace("np.sum(a", "np.median(a")
 
 
 def trained(kind, method, small, small_many, echo, out):
-    """A short run, of two seeds. PPO and IPPO store factors, not what they are of: there phi is one that has no translation."""
+    """A short run, of two seeds."""
     row, task, one = METHODS[method], task_of(kind, method, echo), kind in ("td3", "ddpg", "sac", "ppo")
-    source = NO_TRANSLATION if "ppo" in kind else PHI
+    source = MEDIAN if "ppo" in kind else PHI
     source = source.replace(", o[:, 1:2]", "") if row.kind == "reward" else source
     function = None
     if row.latent:
@@ -129,18 +131,20 @@ def test_what_is_exported_agrees_with_jax(kind, method, small, small_many, echo,
     one = of_seed(learner, 1)
     check_policy(exported, config, jax.tree.map(lambda leaf: leaf[1:], compiled(config).actor(learner, host["step"])))
     rewards = [name for name in found.functions if name != "policy"]
-    assert bool(found.apart) == (config.method.latent and "ppo" in kind)
     if found.left_out:
         assert (found.left_out, rewards) == (LEFT_OUT[method], [])
         return
-    steps = replay.read(one.replay, replay.newest(one.replay, 20))
-    steps = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), steps)
-    wanted = common.rewards(steps, Paid(one.credit, one.scale), config)
+    # Random steps, because a replay may hold the factors of its steps alone.
+    steps = steps_of(config.env, config.environments)
+    buffer = jax.jit(partial(common.store, config=config, phi=graphs(run)))(one, steps)[0].replay
+    stored = jax.tree.map(jnp.concatenate, replay.read(buffer, replay.newest(buffer, TOTAL)))
+    steps = jax.tree.map(lambda leaf: np.concatenate(np.swapaxes(leaf, 0, 1)), steps)
+    wanted = common.rewards(stored, Paid(one.credit, one.scale), config)
     if config.scale_rewards:
         scale = [np.full(team.size, common.magnitude(of)) for team, of in zip(config.env.teams, one.scale, strict=True)]
         wanted = wanted * np.concatenate(scale)
     for place, name in enumerate(rewards):
-        check_reward(exported, name, config, steps, np.asarray(wanted), place)
+        check_reward(exported, name, config, steps, np.asarray(stored.length, np.float32), np.asarray(wanted), place)
 
 
 def check_policy(exported, config, actor):
@@ -178,35 +182,28 @@ def check_policy(exported, config, actor):
     same(exported, "policy", inputs, wanted)
 
 
-def check_reward(exported, name, config, steps, wanted, place):
+def check_reward(exported, name, config, steps, length, wanted, place):
     env, team = config.env, config.env.teams[place]
-    action = np.asarray(steps.before["action"]) if "action" in steps.before else None
-    inputs = {"length": np.asarray(steps.length, np.float32), "alive": np.asarray(common.alive(steps, config))}
-    if action is not None:
-        inputs["action"] = action if env.discrete else env_action(np.clip(action, -1, 1), env)
-    for side, columns in (("before", steps.before), ("after", steps.after)):
-        shown = columns.get("state" if config.of_state else "observation")
-        inputs |= {} if shown is None else {side: np.asarray(shown)}
+    inputs = {"length": length, "alive": steps.before.alive, "action": steps.taken}
+    for side, timestep in (("before", steps.before), ("after", steps.after)):
+        inputs[side] = timestep.state if config.of_state else timestep.observation
     if config.of_state:
-        inputs["action"] = inputs["action"].reshape(len(action), -1)
+        inputs["action"] = inputs["action"].reshape(len(length), -1)
         wanted = wanted[:, 0]
     else:
         inputs = {key: rows[:, team.agents] if rows.ndim > 1 else rows for key, rows in inputs.items()}
         wanted = wanted[:, team.agents]
-        if "factors" in steps.before:
-            factors = steps.before["factors"][:, config.judged(place), : config.factors[place]]
-            inputs["factors"] = np.asarray(factors)
         if team.size == 1:
             inputs = {key: rows[:, 0] if rows.ndim > 1 else rows for key, rows in inputs.items()}
             wanted = wanted[:, 0]
         else:
             inputs["length"] = inputs["length"][:, None]
-    if config.env.agents_leave and not config.of_state:  # the trainer pays those who have left nothing
+    if config.env.agents_leave:  # the trainer pays those who have left nothing
         given = {key: inputs[key] for key in exported.described(name)["inputs"]}
-        there = np.asarray(common.alive(steps, config))[:, team.agents]
+        there = steps.before.alive[:, 0] if config.of_state else steps.before.alive[:, team.agents]
         wanted = np.where(there, wanted, exported.load(name)(**given)["r_hat"])
     same(exported, name, inputs, {"r_hat": wanted})
-    if env.discrete and not config.of_state and {"before", "action", "after"} <= inputs.keys():
+    if env.discrete and not config.of_state:
         of_numbers(exported, name, inputs, env.action_size)
 
 
@@ -258,23 +255,6 @@ def test_phi_and_decoder_are_one_function_without_lare(run, tmp_path, phi):
     assert set(loaded(tmp_path / "out").described("reward")["inputs"]) == {"before", "action"}
 
 
-def test_a_phi_without_translation_runs_beside_the_decoder(small, command, tmp_path):
-    function = verified(NO_TRANSLATION, toy_spec())
-    settings = small(method="lare-linear", steps=120)
-    run = lare.train(toy_spec(), settings, function=function, out=tmp_path / "run", listeners=[])
-    _, _, noted = command("export", run.directory, "--out", "out")
-    assert noted == (
-        "reward takes the factors of phi as an input, because phi cannot be translated: it has a call of np.median\n"
-    )
-    exported, random = loaded(tmp_path / "out"), np.random.default_rng(0)
-    before, after = random.uniform(-1, 1, (2, 5, 2)).astype(np.float32)
-    action = random.uniform(-2, 2, (5, 1)).astype(np.float32)
-    np.testing.assert_allclose(exported.factors(before, action, after), function(before, action), rtol=1e-6)
-    wanted = exported.load("reward")(factors=function(before, action))["r_hat"]
-    np.testing.assert_allclose(exported.reward(before, action, after), wanted, rtol=1e-6)
-    np.testing.assert_allclose(exported.reward(before[0], action[0], after[0]), wanted[0], rtol=1e-6)
-
-
 def test_the_policy_is_that_of_policy_of(run, tmp_path):
     lare.export(run, tmp_path / "out", seed=1)
     observation = np.random.default_rng(0).uniform(-1, 1, (4, 2)).astype(np.float32)
@@ -287,7 +267,7 @@ def test_the_command_line(run, command, monkeypatch, tmp_path):
     status, said, noted = command("export", run.directory, "--out", "first")
     assert (status, noted) == (0, "")
     assert said == "wrote policy, reward to first; exported.py there says how to call them\n"
-    monkeypatch.setattr(onnx, "is_installed", lambda: False)
+    monkeypatch.setattr(export, "is_installed", lambda: False)
     status, _, noted = command("export", run.directory, "--out", "second")
     assert noted == f"without the package onnx, no .onnx files were written: {pip_install('onnx')}\n"
     assert not list((tmp_path / "second").glob("*.onnx"))

@@ -9,10 +9,10 @@ import pytest
 from lare.errors import LareError
 from lare.latent import design as module
 from lare.latent.design import ATTEMPTS, LONGEST_QUOTE, DesignBroken, DesignFailed, DesignStopped, design
-from lare.latent.verification.checks import Check
-from lare.latent.verification.verify import Verdict
+from lare.latent.verify import Check, Verdict, verify
 from lare.llm.prompts import candidate, combine, correct
 from lare.llm.recording import read_recording
+from lare.phi.read import read
 from lare.tasks.load import read_task, shipped_tasks
 from tiers import long
 from toys import PHI, Chase, phi, toy_spec
@@ -27,7 +27,7 @@ def failing(name: str) -> str:
 
 
 def error_of(name: str) -> str:
-    return f"E-NAME line 2: {name} is not defined"
+    return f"E-RUN line 2: {name} is not defined, or not available"
 
 
 GOOD = reply(PHI)
@@ -53,7 +53,7 @@ class Scripted:
 @pytest.fixture
 def trusting(monkeypatch):
     """Every source passes: for what is about the requests alone."""
-    monkeypatch.setattr(module, "verify", lambda *_: Verdict((Check("gate", True, ""),), 2))
+    monkeypatch.setattr(module, "verify", lambda *_: Verdict((Check("read", True),), read(PHI, 2, 1)))
 
 
 ONE_OF_A_KIND = ("CN-6", "CompetitivePP-6", "HalfCheetah-v4", "Reacher-v4", "SMAX-2s3z", "TriangleArea", "Walker2d-v4")
@@ -105,14 +105,11 @@ def test_a_failure_goes_back_with_its_error(chase):
 
 
 def test_every_error_goes_back(chase):
-    bad = reply("import os\n" + phi("return [one, np.two(3)]"))
+    source = "import os\n" + phi("return [action, np.two(3)]")
+    bad, errors = reply(source), verify(source, chase).errors
+    assert [line.split(":")[0] for line in errors.splitlines()] == ["E-IMPORT line 1", "E-NUMPY line 3"]
     model = Scripted(bad, GOOD)
     design(chase, model=model, candidates=1)
-    errors = (
-        "E-IMPORT line 1: import os: only `import numpy as np` and `import math` are available\n"
-        "E-NAME line 3: one is not defined\n"
-        "E-NUMPY line 3: np.two is not available: there is no such function"
-    )
     assert model.asked[1] == (correct(candidate(chase), bad, errors), 0)
 
 
@@ -163,7 +160,7 @@ def test_the_kind_is_what_is_asked_and_checked(chase):
     one = reply(phi("return [action]"))
     model = Scripted(GOOD, one)
     function = design(chase, "reward", model=model, candidates=1)
-    error = "E-FORM: evaluation_func must return exactly one reward array, but returned 2"
+    error = verify(PHI, chase, "reward").errors
     assert [messages for messages, _ in model.asked] == [
         candidate(chase, "reward"),
         correct(candidate(chase, "reward"), GOOD, error),
@@ -217,38 +214,30 @@ def test_a_record_is_kept_from_the_first_reply_on(chase, trusting, tmp_path):
 # --- without verification, as an ablation ----------------------------------------------------------------------------
 
 
-def test_without_verification_whatever_runs_is_kept(chase):
-    # The gate refuses it, and so would half of the checks; in the jail it can do nothing.
-    source = phi("global calls\ntext = f'{action.mean()}'\nreturn [action * np.nan, action - action.mean()]")
+def test_without_verification_what_can_be_read_is_kept(chase):
+    source = phi("return [action * np.nan, action]")
+    assert not verify(source, chase).passed
     model = Scripted(reply(source), GOOD)
     function = design(chase, model=model, candidates=1, pre_verification=False)
     assert (function.source, function.size) == (source, 2)
-    assert function.checks == (Check("executed", True, ""),)
-    assert (function.names, function.meanings) == (["factor_1", "factor_2"], ["", ""])  # nothing of it is parsed here
+    assert function.checks == (Check("read", True),)
+    assert function.names == ["factor_1", "action"]
     assert model.lines == [GOOD]
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        (MALFORMED, NOT_JSON),
-        (reply(phi("raise ValueError('no idea')")), "E-RUN line 2: ValueError: no idea"),
-        (reply("import os\nos.listdir('/')"), "E-RUN line 2: PermissionError: [Errno 1] Operation not permitted: '/'"),
-        (
-            reply(phi("return action")),
-            "E-FORM: evaluation_func must return a list of arrays, "
-            "but returned an array of shape (256, 1) and type float32",
-        ),
-        (
-            reply("import os\nos._exit(3)"),
-            "the process that runs the latent function failed: it ended (exit status 3)",
-        ),
+        (MALFORMED, re.escape(NOT_JSON)),
+        (reply(phi("raise ValueError('no idea')")), "E-RUN line 2: .*ValueError: no idea"),
+        (reply("import os\nos.listdir('/')"), "E-IMPORT line 1: import os"),
+        (reply(phi("return action")), "E-FORM line 2: evaluation_func must return a list of arrays"),
+        (reply(phi("return [action - action.mean()]")), "E-ROWS line 2: "),
     ],
 )
-def test_without_verification_what_does_not_run_is_no_function(chase, seccomp, line, message):
-    with pytest.raises(DesignFailed) as error:
+def test_without_verification_what_cannot_be_read_is_no_function(chase, line, message):
+    with pytest.raises(DesignFailed, match=f"^task 'Chase': the reply cannot be read: {message}"):
         design(chase, model=Scripted(line), candidates=1, pre_verification=False)
-    assert str(error.value) == f"task 'Chase': the reply does not run: {message}"
 
 
 def test_a_task_without_recordings_is_refused():

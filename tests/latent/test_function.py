@@ -1,6 +1,5 @@
-"""The artifact: its source, its factors, and its workers."""
+"""The artifact: its source, its graph and its factors."""
 
-import gc
 import hashlib
 import pickle
 from dataclasses import replace
@@ -9,13 +8,13 @@ import numpy as np
 import pytest
 
 from lare.errors import LareError
-from lare.latent.evaluator import LatentRewardError
-from lare.latent.function import normal, verified
-from lare.latent.verification.checks import CHECKS, Check
+from lare.latent.factors import LatentRewardError
+from lare.latent.function import entries_text, normal, verified
+from lare.latent.verify import Check
+from lare.phi.graph import Refused
 from toys import PHI, phi
 
 SOURCE = PHI.strip("\n")
-NAMES = ("gate", *CHECKS)
 
 
 def batch(rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -24,8 +23,9 @@ def batch(rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_verified(sound):
     assert (sound.task, sound.kind, sound.source, sound.size) == ("Chase", "factors", SOURCE, 2)
+    assert sound.sizes == (2, 1)
     assert (sound.model, sound.exchanges) == ("none: written by hand", ())
-    assert sound.checks == tuple(Check(name, True, "") for name in NAMES)
+    assert sound.checks == (Check("read", True, ""), Check("finite", True, ""))
 
 
 def test_blank_lines_around_a_source_do_not_count(chase, sound, trusting):
@@ -33,11 +33,10 @@ def test_blank_lines_around_a_source_do_not_count(chase, sound, trusting):
 
 
 def test_what_does_not_pass_is_no_function(chase):
-    with pytest.raises(LareError) as error:
+    with pytest.raises(
+        LareError, match=r"^the function does not fit task 'Chase': E-RUN line 2: IndexError: list index out of range"
+    ):
         verified(phi("x = [][0]\nreturn [x]"), chase)
-    assert str(error.value) == (
-        "the function does not fit task 'Chase': E-RUN line 2: IndexError: list index out of range"
-    )
 
 
 def test_the_factors_of_a_batch(function):
@@ -45,6 +44,21 @@ def test_the_factors_of_a_batch(function):
     factors = function(observation, action)
     assert factors.dtype == np.float32
     np.testing.assert_array_equal(factors, [[-4, -9], [-1, -0.25]])
+    np.testing.assert_array_equal(function(observation[0], action[0]), factors[0])
+
+
+@pytest.mark.parametrize(
+    ("observation", "action", "message"),
+    [
+        (np.zeros((3, 3)), np.zeros((3, 1)), r"observations must have the shape \(batch, 2\).* \(3, 3\)"),
+        (np.zeros((3, 2)), np.zeros(3), r"actions must have the shape \(batch, 1\).* \(3,\)"),
+        (np.zeros((3, 2)), np.zeros((4, 1)), "there are 3 observations and 4 actions"),
+        (np.zeros((3, 2)), [["a"]] * 3, "actions must be arrays of numbers"),
+    ],
+)
+def test_arrays_of_other_sizes_are_refused(function, observation, action, message):
+    with pytest.raises(LareError, match=message):
+        function(observation, action)
 
 
 def test_a_function_that_fails_while_it_is_used(chase):
@@ -54,16 +68,9 @@ def test_a_function_that_fails_while_it_is_used(chase):
     function = verified(phi("near = np.sqrt(observation[:, 0:1] + 5000)\nreturn [action, near]"), chase)
     with pytest.raises(LatentRewardError) as error:
         function(observation, action)
-    function.close()
     assert str(error.value) == "the latent function failed: factor 'near' is nan for the observation [-6000.     0.]"
     assert error.value.observation is observation
-
-
-def test_what_it_would_do_with_seven_rows_nobody_meets(chase):
-    # Verification tries no batch of seven, and training has none.
-    function = verified(phi("return [action] * (2 if len(action) == 7 else 1)"), chase)
-    np.testing.assert_array_equal(function(*batch(7)), batch(7)[1])
-    function.close()
+    assert error.value.action is action
 
 
 def test_names_and_meanings_are_read_off_the_source(function):
@@ -76,34 +83,36 @@ def test_names_and_meanings_are_read_off_the_source(function):
     assert other.meanings == ["", "energy, squared"]
 
 
-def test_a_worker_is_started_when_it_is_needed_and_once(function):
-    assert function.evaluators == {}
-    function(*batch(2))
-    worker = function.evaluator(2, 1)
-    function(*batch(3))
-    assert function.evaluators == {(2, 1): worker}
-    function.close()
-    assert worker.program.process.returncode is not None
-    # It starts again when it is needed.
-    np.testing.assert_array_equal(function(*batch(2)), [[-1, -1]] * 2)
-    function.close()
+def test_entries_that_each_factor_reads(function):
+    assert function.entries_read == [
+        {"observation": [0], "action": [0]},
+        {"observation": [], "action": [0]},
+    ]
+    assert function.reads == ["observation[0], action[0]", "action[0]"]
 
 
-def test_the_workers_end_with_the_function(sound):
-    function = replace(sound)
-    process = function.evaluator(2, 1).program.process
-    assert process.poll() is None
-    del function
-    gc.collect()
-    assert process.returncode is not None
+@pytest.mark.parametrize(
+    ("observation", "action", "text"),
+    [
+        ([], [], "nothing"),
+        ([3], [], "observation[3]"),
+        ([8, 9, 13], [0, 1, 2, 3, 4, 5], "observation[8:10, 13], action[0:6]"),
+    ],
+)
+def test_entries_as_text(observation, action, text):
+    assert entries_text({"observation": observation, "action": action}) == text
 
 
-def test_a_function_goes_to_another_process_without_its_workers(function):
-    function(*batch(2))
+def test_a_source_that_cannot_be_read_has_no_graph(function):
+    with pytest.raises(Refused, match="E-FORM"):
+        _ = replace(function, source="x = 1").graph
+
+
+def test_a_function_in_another_process_is_the_same(function):
     other = pickle.loads(pickle.dumps(function))
     assert other == function
-    assert other.evaluators == {}
-    function.close()
+    assert "graph" not in other.__dict__
+    np.testing.assert_array_equal(other(*batch(2)), function(*batch(2)))
 
 
 def test_the_digest_is_the_sources(function):
@@ -113,7 +122,7 @@ def test_the_digest_is_the_sources(function):
 
 
 def test_null(chase):
-    with pytest.raises(LareError, match=r"E-SYNTAX line 2: there is '\\x00', a character that nobody sees"):
+    with pytest.raises(LareError, match=r"E-SYNTAX: line 2 has '\\x00', a character that no reader sees"):
         verified(phi("return [action]") + "\0", chase)
 
 

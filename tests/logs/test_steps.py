@@ -5,7 +5,7 @@ import pytest
 
 import lare
 from lare import LareError
-from lare.latent.verification.verify import verify
+from lare.latent.verify import verify
 from logged import PHI, logged
 
 

@@ -593,7 +593,6 @@ def test_a_function_that_fails_is_a_line_and_the_steps_wait(phi, monkeypatch):
             credit.rewards_at(numbers)
     credit.look()
     np.testing.assert_array_equal(credit.store.features[numbers], phi.of_steps(*one[:3], "before"))
-    credit.close()
     assert credit.rewards_at(numbers).shape == (4,)
 
 

@@ -462,7 +462,6 @@ def test_a_model_is_saved_without_episodes_and_a_buffer_with_them(tmp_path, phi)
     assert buffer.credit.metrics()["credit/episodes"] == 4 + 6
     assert buffer.credit.metrics()["credit/dropped"] == 1
     assert buffer.credit.learner.fits > credit.learner.fits
-    credit.close()
 
 
 def test_every_one_of_n_steps_is_paid():
@@ -516,7 +515,6 @@ def test_every_method_pays(method, phi, reward):
     paid = model.replay_buffer.rewards[:100, 0]
     assert np.isfinite(paid).all()
     assert np.abs(paid).max() > 0
-    credit.close()
 
 
 def refused(message):

@@ -19,6 +19,7 @@ from lare.llm.model import recorded_model
 from lare.run import checkpoint, directory
 from lare.run.decide import decide
 from lare.run.directory import describe, open_run, read_config, read_metrics
+from lare.run.formats import FORMAT
 from lare.run.settings import Settings
 from lare.tasks.load import read_task
 from toys import PHI, toy_spec
@@ -67,8 +68,8 @@ def run(tmp_path):
         (b"\xff", "cannot be read: 'utf-8' codec can't decode byte 0xff in position 0: invalid start byte"),
         (b'{"format": ' + b"9" * 5000 + b"}", "a number of 5000 digits"),
         (
-            b'{"format": 3}',
-            "the keys 'lare', 'settings', 'task', 'task_sha256', 'longest_episode', 'function_sha256', 'isolation', 'versions', "
+            f'{{"format": {FORMAT}}}'.encode(),
+            "the keys 'lare', 'settings', 'task', 'task_sha256', 'longest_episode', 'function_sha256', 'versions', "
             "'machine' are missing",
         ),
         (b'{"format": 1, "lare": "0.1"}', "the run is of another version of LaRe (0.1), whose files this one does not read: "

@@ -35,5 +35,9 @@ def test_other_formats_are_refused(number):
         migrated({"format": number, "lare": "0.9"})
 
 
+def test_format_3_without_isolation():
+    assert migrated({"format": 3, "lare": "0.9", "isolation": "a process"}) == {"format": FORMAT, "lare": "0.9"}
+
+
 def test_the_newest_format_needs_no_migration():
     assert FORMAT not in formats.MIGRATIONS

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from lare.errors import LareError
-from lare.latent.verification.verify import random_steps
+from lare.latent.verify import random_steps
 from lare.tasks.environment import make, number
 from toys import Chase, toy_spec
 

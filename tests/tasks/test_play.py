@@ -106,10 +106,10 @@ def test_rows_of_many_steps_at_once():
     action = np.arange(2 * 3 * 2, dtype=np.float32).reshape(2, 3, 2)
     one = Hunt().reset(0)
     shown = one._replace(observation=np.stack([one.observation] * 2), state=np.array([[7], [8]], np.float32))
-    seen, taken = rows_of(role("mouse"), MICE, shown, action)
+    seen, taken = rows_of("observation", MICE, shown, action)
     np.testing.assert_array_equal(seen, shown.observation[:, 1:])
     np.testing.assert_array_equal(taken, action[:, 1:])
-    seen, taken = rows_of(role("mouse", judged_from="state"), MICE, shown, action)
+    seen, taken = rows_of("state", MICE, shown, action)
     assert seen.tolist() == [[[7]], [[8]]]
     assert taken.tolist() == [[[2, 3, 4, 5]], [[8, 9, 10, 11]]]
 

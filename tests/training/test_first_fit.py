@@ -59,7 +59,8 @@ def begun(small_many, tmp_path):
     run = create(tmp_path / "run", task, decide(settings, task), [verified(PHI, task)])
     started = session.start(run)
     steps = started.collector.collect(started.actor, 0)
-    started.learner = started.functions.store(started.learner, steps, session.annotate(run, started.config, steps))
+    started.learner, finite = started.functions.store(started.learner, steps)
+    assert np.all(finite)
     yield started
     started.close()
 
@@ -96,8 +97,8 @@ def test_fits_see_no_held_out_episode_and_the_best_decoders_are_kept(begun, monk
 def test_the_first_fit_goes_on_longer_and_only_the_first(begun, monkeypatch):
     fits = []
 
-    def counted(config):
-        functions = compiled(config)
+    def counted(config, phi=()):
+        functions = compiled(config, phi)
 
         def fit(learner, keys):
             fits.append(config.credit.steps)

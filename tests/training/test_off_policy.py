@@ -13,7 +13,19 @@ from lare.data import replay
 from lare.training import learner as common
 from lare.training import off_policy
 from lare.training.compiled import compiled
-from recipes import ALONE, config_of, factors_for, jitted, paid_by, read, steps_of, stored, untrained, with_steps
+from recipes import (
+    ALONE,
+    config_of,
+    factors_for,
+    jitted,
+    paid_by,
+    read,
+    steps_of,
+    store_seeds,
+    stored,
+    untrained,
+    with_steps,
+)
 
 
 def test_relabelling_is_by_the_newest_decoder():
@@ -81,7 +93,7 @@ def test_seeds_in_lockstep_are_seeds_alone():
         jax.tree.map(lambda leaf: np.stack([leaf] * 3), part) for part in (steps, factors_for(config, steps))
     )
     alone = jax.tree.map(lambda leaf: np.asarray(leaf)[1], start)
-    together, _ = functions.improve(functions.learn_returns(functions.store(start, many, factors)), many, keys, 0)
+    together, _ = functions.improve(functions.learn_returns(store_seeds(config)(start, many, factors)), many, keys, 0)
     alone = with_steps(alone, config, steps, tell=True)
     alone, _ = jax.jit(partial(off_policy.improve_one, config=config))(alone, steps, keys[1], jnp.array(0))
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):

@@ -25,6 +25,7 @@ from recipes import (
     jitted,
     paid_by,
     steps_of,
+    store_seeds,
     untrained,
     with_steps,
 )
@@ -213,7 +214,7 @@ def test_seeds_in_lockstep_are_seeds_alone(algorithm, env):
         jax.tree.map(lambda leaf: np.stack([leaf] * 3), part) for part in (steps, factors_for(config, steps))
     )
     alone = jax.tree.map(lambda leaf: np.asarray(leaf)[1], start)
-    together, _ = functions.fit(functions.learn_returns(functions.store(start, many, factors)), keys)
+    together, _ = functions.fit(functions.learn_returns(store_seeds(config)(start, many, factors)), keys)
     together, _ = functions.improve(together, many, keys, 40)
     alone = with_steps(alone, config, steps, tell=True)
     alone = alone._replace(credit=jax.jit(partial(common.fit_often, config=config))(alone, keys[1])[0])

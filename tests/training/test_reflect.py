@@ -10,7 +10,7 @@ import pytest
 from lare.errors import LareError
 from lare.latent.design import design
 from lare.latent.function import verified
-from lare.latent.verification.verify import random_steps
+from lare.latent.verify import random_steps
 from lare.llm import prompts
 from lare.llm.recording import RecordedModel, read_recording
 from lare.tasks.play import Episode, episodes_of

@@ -24,6 +24,7 @@ from recipes import (
     paid_by,
     read,
     steps_of,
+    store_seeds,
     stored,
     untrained,
     with_steps,
@@ -180,7 +181,7 @@ def test_seeds_in_lockstep_are_seeds_alone():
     factors = [factors_for(config, steps) for steps in of_each]
     both, all_factors = (jax.tree.map(lambda *leaves: np.stack(leaves), *part) for part in (of_each, factors))
     alone = [jax.tree.map(lambda leaf, seed=seed: np.asarray(leaf)[seed], start) for seed in (0, 1)]
-    started = functions.learn_returns(functions.store(start, both, all_factors))
+    started = functions.learn_returns(store_seeds(config)(start, both, all_factors))
     together, measured = functions.improve(started, both, keys, 0)
     assert measured["algorithm/updates"].tolist() == [5, 3]
     improve = jax.jit(partial(sequences.improve, config=config))

@@ -30,6 +30,7 @@ from lare.run.formats import FORMAT
 from lare.source import source
 from lare.tasks.environment import EnvironmentFault
 from lare.training import session as sessions
+from lare.training.collect_host import HostCollector
 from lare.training.session import load_actor
 from lare.training.train import Interrupted
 from tiers import long
@@ -41,22 +42,27 @@ def needed(method, function):
     return function if METHODS[method].latent else None
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, long(signal.SIGSTOP)])
-def test_a_worker_that_is_killed_or_starved_stops_the_run_and_harms_nothing(number, small, tmp_path, monkeypatch):
-    monkeypatch.setattr("lare.latent.sandbox.jailed.TIME_LIMIT", 4.0)
-    whole = lare.train(toy_spec(), small(), function=verified(PHI, toy_spec()), out=tmp_path / "whole", listeners=[])
-    function = verified(PHI, toy_spec())
-    worker = function.evaluator(2, 1).program.process
-    stopper = At(132, lambda: os.kill(worker.pid, number))
-    with pytest.raises(LareError, match="the process that runs the latent function failed: ") as error:
-        lare.train(toy_spec(), small(), function=function, out=tmp_path / "run", listeners=[stopper])
-    assert stopper.messages[0].startswith("the latent function runs in a process of its own (")
+def test_a_factor_that_is_not_finite_stops_the_run_and_harms_nothing(small, tmp_path, monkeypatch):
+    settings, task = small(), toy_spec()
+    whole = lare.train(task, settings, function=verified(PHI, task), out=tmp_path / "whole", listeners=[])
+    collect = HostCollector.collect
+
+    def beyond(collector, actor, step):
+        steps = collect(collector, actor, step)
+        if step == 132:
+            steps.before.observation[1, 2] = 1e30
+        return steps
+
+    monkeypatch.setattr(HostCollector, "collect", beyond)
+    with pytest.raises(LareError, match="factor 'f_near' is -inf for the observation") as error:
+        lare.train(task, settings, function=verified(PHI, task), out=tmp_path / "run", listeners=[])
+    monkeypatch.undo()
     assert str(error.value).endswith(
         f"it was given the batch in {tmp_path / 'run' / 'failed_batch.npz'}; the last checkpoint is whole"
     )
-    assert worker.poll() is not None
     with np.load(tmp_path / "run" / "failed_batch.npz") as batch:
         assert (batch["observation"].shape, batch["action"].shape) == ((24, 2), (24, 1))
+        assert (batch["observation"] == np.float32(1e30)).any()
     assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
@@ -86,12 +92,6 @@ def test_a_run_says_what_was_set_in_vain(small, tmp_path):
 
     lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[Listener(-1, None)])
     assert heard[1].startswith("fit_updates makes no difference to dense (and ")
-
-
-def test_the_isolation_stands_in_the_config(small, phi, tmp_path):
-    run = lare.train(toy_spec(), small(steps=60), function=phi, out=tmp_path / "run", listeners=[])
-    assert run.config.isolation == phi.evaluator(2, 1).isolation
-    assert run.config.isolation.startswith("a process of its own (")
 
 
 @pytest.mark.parametrize(

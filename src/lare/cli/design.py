@@ -59,8 +59,8 @@ def design(
         reflect: number of further rounds, in which the model sees how well its factors explain the returns of whole episodes,
             and may improve them.
         policy: a run whose policy plays the episodes for --reflect; without it, actions are random.
-        pre_verification: verify and correct the function; without (the paper's ablation), the first reply is run once, in the
-            jail, and kept as it is.
+        pre_verification: verify and correct the function; without (the paper's ablation), the first reply is kept as it is, if
+            it can be read.
         budget: largest number of tokens, in and out together; a request that might exceed it is not sent.
         requests: largest number of requests.
         minutes: longest time to wait for the model, over all requests and retries. One reply may take an eighth of it, and at

@@ -105,7 +105,7 @@ def verify(
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
     judges: Judges | None = None,
 ) -> None:
-    """Verify a function: what it contains, and what it does. It runs in a sandboxed process.
+    """Verify a function: it is read, never executed, and its factors must be finite. Prints the entries that each factor reads.
 
     With --fit, also print how much of the returns of some episodes its factors explain, and how much each factor contributes.
 
@@ -124,10 +124,9 @@ def verify(
     """
     from lare.cli.design import policy_that_plays
     from lare.credit.words import FEWEST
-    from lare.deploy.phi import missing_translation
     from lare.latent.function import of_verdict
     from lare.latent.saved import read_source
-    from lare.latent.verification.verify import verify as verify_source
+    from lare.latent.verify import verify as verify_source
     from lare.tasks.load import load_task, read_task
     from lare.tasks.spec import the_role
 
@@ -152,18 +151,14 @@ def verify(
             say(f"        {line}")
     for line in verdict.advice:
         say(f"advice  {line}")
-    if verdict.passed and (part := missing_translation(source, role.observation_size, role.action_size)):
-        say(
-            f"advice  lare export cannot make it a part of the exported reward: it has {part} (docs/export.md lists what can be)"
-        )
-    if verdict.isolation:
-        say(f"It ran in {verdict.isolation}.")
     if not verdict.passed:
         if file.suffix == ".json":
             say("Paste the lines after FAILED into the same chat, and ask for the whole reply again, corrected.")
         sys.exit(1)
+    function = of_verdict(source, role, kind, verdict)
+    for name, reads in zip(function.names, function.reads, strict=True):
+        say(f"factor  {name} reads {reads}")
     if fit:
-        function = of_verdict(source, role, kind, verdict)
         say_what_returns_say(function, role, episodes_for(role, data, fit, plays))
 
 

@@ -268,8 +268,6 @@ def export(
 
     found = lare.export(open_run(run), out, seed, best)
     say(f"wrote {', '.join(found.functions)} to {found.directory}; exported.py there says how to call them")
-    for name, why in found.apart.items():
-        progress(f"{name} takes the factors of phi as an input, because phi cannot be translated: it has {why}")
     if found.left_out:
         progress(f"there is no reward function: {found.left_out}")
     if not found.onnx:

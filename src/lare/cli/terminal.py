@@ -12,7 +12,7 @@ from lare.errors import LareError
 from lare.legible import legible
 
 if TYPE_CHECKING:
-    from lare.latent.verification.verify import Steps
+    from lare.latent.verify import Steps
     from lare.tasks.spec import TaskSpec
 
 Task = Annotated[Positional[str], tyro.conf.arg(metavar="TASK")]

@@ -4,8 +4,8 @@ DIRECTORY/
   export.json              task, seed, step; inputs, outputs and operations of each function
   policy.npz, .onnx        observation -> action
   reward.npz, .onnx        steps -> r_hat, phi and decoder as one function; one reward_TEAM each if several teams learn
-  latent_function.py       the source of phi
-  exported.py              NumPy code that runs the .npz files
+  latent_function.py       the source of phi, for readers
+  exported.py, evaluate.py NumPy code that computes the .npz files
 """
 
 import json
@@ -15,22 +15,24 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from lare.deploy import exported, onnx
-from lare.deploy.graph import BATCH, Graph
-from lare.deploy.policy import policy
-from lare.deploy.reward import reward, unexported
-from lare.deploy.rows import Untranslatable
+from lare.deploy import exported
+from lare.deploy.policy import policy_graph
+from lare.deploy.reward import reward_graph, unexported
 from lare.errors import LareError
 from lare.experiments.policy import choices
 from lare.files import write_atomically
+from lare.phi import evaluate
+from lare.phi.graph import Gather, Graph, Node
+from lare.phi.onnx import BATCH, is_installed, onnx_model
 from lare.run.directory import Run, as_run, function_file
 from lare.source import source
-from lare.tasks.spec import judged_states
 from lare.training.compiled import compiled
 from lare.training.seeds import of_seed
 from lare.training.session import load_actor, load_learner
 
-TEXT, LOADER = "export.json", "exported.py"
+TEXT = "export.json"
+DTYPES = {"float": "float32", "int": "int64", "bool": "bool"}
+"""The types of the inputs and outputs of each kind."""
 
 
 class Exported(NamedTuple):
@@ -41,8 +43,6 @@ class Exported(NamedTuple):
     """`policy`, and `reward` or one for each team."""
     left_out: str | None
     """Why there is no reward function; None if there is one."""
-    apart: dict[str, str]
-    """The names of reward functions that take the factors of phi as an input, and the part of phi that cannot be translated."""
     onnx: bool
     """Whether there are ONNX files: the package `onnx` is installed."""
 
@@ -74,20 +74,15 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
         actors, step = compiled(config).actor(learner, host["step"]), host["step"]
     actor = jax.tree.map(lambda leaf: leaf[place], actors)
     start = choices(run).start if config.env.discrete and config.env.agents == 1 else 0
-    graphs = {"policy": policy(actor, config, start)}
+    graphs = {"policy": policy_graph(actor, config, start)}
     credit = of_seed(learner.credit, place)
     left_out = unexported(config, credit[0].decoder if credit else None)
     files: dict[str, str] = {}
-    apart: dict[str, str] = {}
     for team, role in enumerate(run.config.task.roles if left_out is None else ()):
         name = "reward" if role is run.config.task else f"reward_{role.team}"
         phi, decoder = run.functions[team] if run.functions else None, credit[team] if credit else None
         files[name] = function_file(run.config.task, role)
-        try:
-            graphs[name] = reward(decoder, config, team, phi)
-        except Untranslatable as error:
-            apart[name] = str(error)
-            graphs[name] = reward(decoder, config, team)
+        graphs[name] = reward_graph(decoder, config, team, None if phi is None else phi.graph)
     try:
         out.mkdir(parents=True)
     except FileExistsError:
@@ -106,29 +101,48 @@ def export(run: Run | str | Path, out: str | Path, seed: int | None = None, best
         text[name] = described(graph)
         if name in files and config.env.discrete and not config.of_state:
             text[name]["choices"] = {"first": start, "count": config.env.action_size}
-        if name in apart:
-            text[name] |= {"phi": files[name], "judges": judged_states(run.judges, "before", "after")}
         write_arrays(out / f"{name}.npz", graph)
-        if onnx.is_installed():
-            onnx.write(graph, out / f"{name}.onnx", name)
+        if is_installed():
+            model = onnx_model(graph, name).SerializeToString()
+            write_atomically(out / f"{name}.onnx", lambda file, model=model: file.write(model))
     for file, function in zip(files.values(), run.functions, strict=False):
         function.save(out / file)
     whole = json.dumps(text, indent=1).encode()
     write_atomically(out / TEXT, lambda file: file.write(whole))
-    loader = Path(exported.__file__).read_bytes()
-    write_atomically(out / LOADER, lambda file: file.write(loader))
-    return Exported(out, tuple(graphs), left_out, apart, onnx.is_installed())
+    for module in (exported, evaluate):
+        code = Path(str(module.__file__)).read_bytes()
+        write_atomically(out / Path(str(module.__file__)).name, lambda file, code=code: file.write(code))
+    return Exported(out, tuple(graphs), left_out, is_installed())
 
 
 def described(graph: Graph) -> dict[str, Any]:
-    """A graph as JSON, without its constants."""
-    sides = {
-        side: {name: {"shape": [BATCH, *shape], "type": graph.kinds[name]} for name, shape in shapes.items()}
-        for side, shapes in (("inputs", graph.inputs), ("outputs", graph.outputs))
+    """A graph as JSON, without its constants and positions."""
+
+    def arrays(nodes: dict[str, Node]) -> dict[str, Any]:
+        return {name: {"shape": [BATCH, *node.shape], "type": DTYPES[node.kind]} for name, node in nodes.items()}
+
+    outputs = {name: graph.nodes[i] for name, i in graph.outputs.items()}
+    return {
+        "inputs": arrays(graph.inputs),
+        "outputs": arrays(outputs),
+        "output_nodes": graph.outputs,
+        "nodes": [[node.op, node.inputs, node.shape, node.kind, _option(node.option)] for node in graph.nodes],
     }
-    return sides | {"operations": graph.operations}
+
+
+def _option(option: Any) -> Any:
+    """An option as JSON; None for arrays, which are in the .npz file."""
+    if isinstance(option, Gather):
+        return option.slices and [[s.start, s.stop, s.step] for s in option.slices]
+    return None if isinstance(option, np.ndarray) else option
 
 
 def write_arrays(path: Path, graph: Graph) -> None:
-    """Write the constants of a graph."""
-    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **graph.constants))
+    """Write the constants of a graph, and the positions that are no slices, by the indices of their nodes."""
+    arrays = {}
+    for i, node in enumerate(graph.nodes):
+        if node.op == "constant":
+            arrays[str(i)] = node.option.astype(np.float32) if node.kind == "float" else node.option
+        elif node.op == "gather" and node.option.slices is None:
+            arrays[str(i)] = node.option.positions
+    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))

@@ -8,66 +8,29 @@
 single row may be given without this axis; then the outputs have none either.
 """
 
+import importlib.util
 import json
+from collections import namedtuple
 from functools import cache
 from pathlib import Path
-from runpy import run_path
+from types import SimpleNamespace
 
 import numpy as np
 
 HERE = Path(__file__).parent
 LENGTH = "length is the number of steps of the whole episode, because the score is an average over the steps"
-OPERATIONS = {
-    "Add": np.add,
-    "Sub": np.subtract,
-    "Mul": np.multiply,
-    "Div": np.divide,
-    "Pow": np.power,
-    "Max": np.maximum,
-    "Min": np.minimum,
-    "Neg": np.negative,
-    "Abs": np.abs,
-    "Sign": np.sign,
-    "Floor": np.floor,
-    "Ceil": np.ceil,
-    "Round": np.rint,
-    "Sqrt": np.sqrt,
-    "Reciprocal": np.reciprocal,
-    "Exp": np.exp,
-    "Log": np.log,
-    "Cos": np.cos,
-    "Sin": np.sin,
-    "Tanh": np.tanh,
-    "Less": np.less,
-    "LessOrEqual": np.less_equal,
-    "Greater": np.greater,
-    "GreaterOrEqual": np.greater_equal,
-    "Equal": np.equal,
-    "And": np.logical_and,
-    "Or": np.logical_or,
-    "Not": np.logical_not,
-    "Where": np.where,
-    "MatMul": np.matmul,
-    "Reshape": np.reshape,
-    "Identity": lambda x: x,
-    "Cast": lambda x: x.astype(np.float32),
-    "Relu": lambda x: np.maximum(x, 0),
-    "Sigmoid": lambda x: 1 / (1 + np.exp(-x)),
-    "ArgMax": np.argmax,
-    "ArgMin": np.argmin,
-    "Concat": lambda *parts, axis: np.concatenate(parts, axis=axis),
-    "Gather": lambda table, number: table[number],
-    "Squeeze": lambda x, axes: np.squeeze(x, tuple(axes)),
-    "Unsqueeze": lambda x, axes: np.expand_dims(x, tuple(axes)),
-    "Slice": lambda x, start, end, axis, step: np.moveaxis(
-        np.moveaxis(x, axis[0], 0)[start[0] : end[0] : step[0]], 0, axis[0]
-    ),
-    "ReduceSum": lambda x, axes: np.sum(x, tuple(axes), keepdims=True),
-    "ReduceMean": lambda x, axes: np.mean(x, tuple(axes), keepdims=True),
-    "ReduceMax": lambda x, axes: np.max(x, tuple(axes), keepdims=True),
-    "ReduceMin": lambda x, axes: np.min(x, tuple(axes), keepdims=True),
-    "ReduceProd": lambda x, axes: np.prod(x, tuple(axes), keepdims=True),
-}
+Node = namedtuple("Node", "op inputs shape kind option")
+
+
+@cache
+def evaluation():
+    """The module `evaluate.py`, which computes graphs."""
+    spec = importlib.util.spec_from_file_location("lare_evaluate", HERE / "evaluate.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @cache
@@ -81,35 +44,51 @@ def described(name):
 
 
 @cache
+def graph_of(name):
+    """The graph of a function."""
+    text = described(name)
+    with np.load(HERE / f"{name}.npz", allow_pickle=False) as file:
+        arrays = dict(file)
+    nodes = []
+    for i, (op, inputs, shape, kind, option) in enumerate(text["nodes"]):
+        if op == "gather":
+            slices = option and tuple(slice(*ends) for ends in option)
+            option = SimpleNamespace(slices=slices, positions=arrays.get(str(i)))
+        elif op == "constant":
+            option = arrays[str(i)]
+        elif isinstance(option, list):
+            option = tuple(option)
+        nodes.append(Node(op, inputs, tuple(shape), kind, option))
+    return SimpleNamespace(nodes=nodes, outputs=text["output_nodes"], unused_after=[[]] * len(nodes))
+
+
+@cache
 def load(name):
     """The function of NAME.npz. It takes arrays by name, and returns a dictionary of arrays."""
-    graph = described(name)
-    with np.load(HERE / f"{name}.npz", allow_pickle=False) as file:
-        constants = dict(file)
+    text, graph = described(name), graph_of(name)
 
     def function(**inputs):
-        needed = ", ".join(graph["inputs"])
-        if missing := [key for key in graph["inputs"] if key not in inputs]:
+        needed = ", ".join(text["inputs"])
+        if missing := [key for key in text["inputs"] if key not in inputs]:
             raise ValueError(
                 f"{name} needs the inputs {needed}: {', '.join(missing)} is missing"
                 + (f" ({LENGTH})" if "length" in missing else "")
             )
-        if unknown := [key for key in inputs if key not in graph["inputs"]]:
+        if unknown := [key for key in inputs if key not in text["inputs"]]:
             raise ValueError(f"{name} needs the inputs {needed}: there is no input {', '.join(unknown)}")
-        given = {key: as_input(key, inputs[key], like) for key, like in graph["inputs"].items()}
-        single = all(given[key].ndim < len(like["shape"]) for key, like in graph["inputs"].items())
-        values = constants | {key: array[None] if single else array for key, array in given.items()}
-        for operation, arguments, result, axis in graph["operations"]:
-            more = {} if axis is None else {"axis": axis}
-            values[result] = OPERATIONS[operation](*(values[argument] for argument in arguments), **more)
-        return {key: values[key][0] if single else values[key] for key in graph["outputs"]}
+        arrays = {key: as_input(key, inputs[key], like) for key, like in text["inputs"].items()}
+        single = all(arrays[key].ndim < len(like["shape"]) for key, like in text["inputs"].items())
+        rows = {key: array[None] if single else array for key, array in arrays.items()}
+        outputs = evaluation().evaluate(graph, rows)
+        outputs = {key: outputs[key].astype(like["type"]) for key, like in text["outputs"].items()}
+        return {key: array[0] if single else array for key, array in outputs.items()}
 
     return function
 
 
-def as_input(key, given, like):
-    """The given numbers as an array. All axes but the first, the batch, must have the sizes that `export.json` lists."""
-    array = np.asarray(given, like["type"])
+def as_input(key, values, like):
+    """Numbers as an array. All axes but the first, the batch, must have the sizes that `export.json` lists."""
+    array = np.asarray(values, like["type"])
     sizes = tuple(like["shape"][1:])
     if array.shape[array.ndim - len(sizes) :] != sizes:
         expected = ", ".join(map(str, like["shape"]))
@@ -124,10 +103,8 @@ def reward(before, action, after, name="reward", **more):
     row. `more` holds `length` or `alive`, if `export.json` lists them among the inputs.
     """
     action = one_hot(before, action, described(name).get("choices"))
-    given = {"before": before, "action": action, "after": after, **more}
-    if "factors" in described(name)["inputs"]:
-        given["factors"] = factors(before, action, after, name)
-    return load(name)(**{key: given[key] for key in described(name)["inputs"] if key in given})["r_hat"]
+    inputs = {"before": before, "action": action, "after": after, **more}
+    return load(name)(**{key: inputs[key] for key in described(name)["inputs"] if key in inputs})["r_hat"]
 
 
 def one_hot(before, action, choices):
@@ -135,23 +112,9 @@ def one_hot(before, action, choices):
     number = np.asarray(action)
     if choices is None or number.ndim != np.ndim(before) - 1:
         return action
-    place, count = number - choices["first"], choices["count"]
-    if number.dtype.kind not in "iu" or np.any((place < 0) | (place >= count)):
+    index, count = number - choices["first"], choices["count"]
+    if number.dtype.kind not in "iu" or np.any((index < 0) | (index >= count)):
         raise ValueError(
             f"an action is a number from {choices['first']} to {choices['first'] + count - 1}, or a one-hot row"
         )
-    return np.eye(count, dtype=np.float32)[place]
-
-
-def factors(before, action, after, name="reward"):
-    """The factors phi(s, a) of steps, (batch, ..., factors), for a phi that could not be made a part of NAME.npz.
-
-    A language model has written phi, and it has passed LaRe's checks. Here it runs in this process, without LaRe's sandbox.
-    """
-    phi = run_path(str(HERE / described(name)["phi"]))["evaluation_func"]
-    rows = {"before": np.asarray(before, np.float32), "after": np.asarray(after, np.float32)}
-    action, found = np.asarray(action, np.float32), []
-    for judged in described(name)["judges"]:
-        shown = rows[judged]
-        found += phi(shown.reshape(-1, shown.shape[-1]), action.reshape(-1, action.shape[-1]))
-    return np.concatenate(found, axis=1).reshape(*action.shape[:-1], -1).astype(np.float32)
+    return np.eye(count, dtype=np.float32)[index]

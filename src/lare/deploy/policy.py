@@ -16,15 +16,17 @@ import numpy as np
 from lare.algorithms import ppo
 from lare.algorithms.policies import UNAVAILABLE
 from lare.algorithms.recurrent import Recurrent
-from lare.deploy.graph import Graph
+from lare.deploy.layers import finish, graph_input, linear, network, numpy, sigmoid, standardize
 from lare.networks import MLP, Linear
 from lare.normalise import CLIP, deviation
+from lare.phi.arrays import Array, as_array, elementwise
+from lare.phi.graph import UNLIMITED, Builder, Graph, building
 from lare.tasks.env import EnvSpec
 from lare.training.config import TrainConfig
 from lare.training.sequences import Actor as Agents
 
 
-def policy(actor: Any, config: TrainConfig, start: int) -> Graph:
+def policy_graph(actor: Any, config: TrainConfig, start: int) -> Graph:
     """The graph of an actor of one seed.
 
     Args:
@@ -32,95 +34,83 @@ def policy(actor: Any, config: TrainConfig, start: int) -> Graph:
         config: the configuration of its run.
         start: the number of the first choice, if actions are choices.
     """
-    graph, env = Graph(), config.env
+    env = config.env
     agents = (env.agents,) if env.agents > 1 else ()
-    observation = graph.input("observation", (*agents, env.observation_size))
-    available = graph.input("available", (*agents, env.action_size), "bool") if env.masks_actions else None
-    match actor:
-        case Agents():
-            values = recurrent(graph, observation, actor.agent, env)
-        case ppo.Actor():
-            values = stochastic(graph, observation, actor, config)
-        case _:
-            # SAC's network outputs mean and log deviation, side by side; only the mean is needed.
-            values = graph.apply("Tanh", graph.network(observation, first(actor, env.action_size), "Relu"))
-    if not env.discrete:
-        graph.output("action", scaled(graph, values, env), (*agents, env.action_size))
-        return graph
-    if available is not None:
-        values = graph.apply("Where", available, values, np.float32(UNAVAILABLE))
-    if not config.greedy:
-        graph.output("logits", values, (*agents, env.action_size))
-    chosen = graph.apply("ArgMax", values, axis=-1)
-    graph.output("action", graph.apply("Add", chosen, np.int64(start)) if start else chosen, agents, "int64")
-    return graph
+    outputs: dict[str, Any] = {}
+    with building(Builder(UNLIMITED)):
+        observation = graph_input("observation", (*agents, env.observation_size))
+        available = graph_input("available", (*agents, env.action_size), "bool") if env.masks_actions else None
+        match actor:
+            case Agents():
+                values, outputs["next_hidden"] = _recurrent(observation, actor.agent, env)
+            case ppo.Actor():
+                values = _stochastic(observation, actor, config)
+            case _:
+                # SAC's network outputs mean and log deviation, side by side; only the mean is needed.
+                values = elementwise("tanh", network(observation, first_outputs(actor, env.action_size)))
+        if not env.discrete:
+            return finish(action=_in_env_units(values, env), **outputs)
+        if available is not None:
+            values = elementwise("where", available, values, UNAVAILABLE)
+        if not config.greedy:
+            outputs["logits"] = values
+        choice = numpy("argmax", values, axis=-1)
+        return finish(action=choice + start if start else choice, **outputs)
 
 
-def first(network: MLP, outputs: int) -> MLP:
+def first_outputs(mlp: MLP, count: int) -> MLP:
     """The network with only the first of its outputs."""
-    last = network.layers[-1]
+    last = mlp.layers[-1]
     return eqx.tree_at(
-        lambda one: (one.layers[-1].weight, one.layers[-1].bias),
-        network,
-        (last.weight[:, :outputs], last.bias[:outputs]),
+        lambda net: (net.layers[-1].weight, net.layers[-1].bias),
+        mlp,
+        (last.weight[:, :count], last.bias[:count]),
     )
 
 
-def stochastic(graph: Graph, x: str, actor: ppo.Actor, config: TrainConfig) -> str:
+def _stochastic(x: Array, actor: ppo.Actor, config: TrainConfig) -> Any:
     """The likeliest action, or the logits of choices: PPO and IPPO."""
-    known, network, size = actor.observations, actor.policy.network, config.env.observation_size
-    if known is not None and float(known.rows) > 0:
-        x = graph.standardised(x, known.mean[:size], deviation(known)[:size], CLIP)
+    statistics, mlp, size = actor.observations, actor.policy.network, config.env.observation_size
+    seen = statistics is not None and float(statistics.rows) > 0
+    if statistics is not None and seen:
+        x = standardize(x, statistics.mean[:size], deviation(statistics)[:size], CLIP)
     if len(config.env.teams) > 1:
-        number = np.eye(config.env.agents, dtype=np.float32)
-        if known is not None and float(known.rows) > 0:
-            spread = np.asarray(deviation(known))[size:]
-            number = np.clip((number - known.mean[size:]) / np.where(spread > 0, spread, 1), -CLIP, CLIP) * (spread > 0)
-        network = told_apart(network, size, number)
-    return graph.network(x, network, "Relu" if network.activation is jax.nn.relu else "Tanh")
+        agent_ids = np.eye(config.env.agents, dtype=np.float32)
+        if statistics is not None and seen:
+            std = np.asarray(deviation(statistics))[size:]
+            scaled = (agent_ids - statistics.mean[size:]) / np.where(std > 0, std, 1)
+            agent_ids = np.clip(scaled, -CLIP, CLIP) * (std > 0)
+        first = _with_agent_bias(mlp.layers[0], size, agent_ids)
+        mlp = eqx.tree_at(lambda net: net.layers[0], mlp, first)
+    return network(x, mlp, "relu" if mlp.activation is jax.nn.relu else "tanh")
 
 
-def told_apart(network: MLP, size: int, number: np.ndarray) -> MLP:
-    """A network of observations alone. The agent's number is moved into the bias of the first layer, (agents, width)."""
-    layer = network.layers[0]
-    return eqx.tree_at(lambda one: one.layers[0], network, of_agents(layer, size, number))
+def _with_agent_bias(layer: Linear, size: int, agent_ids: np.ndarray) -> Linear:
+    """A layer of [x, number of the agent], as a layer of x with a bias for each agent, (agents, width)."""
+    bias = layer.bias + agent_ids @ layer.weight[size:]
+    return eqx.tree_at(lambda linear: (linear.weight, linear.bias), layer, (layer.weight[:size], bias))
 
 
-def of_agents(layer: Linear, size: int, number: np.ndarray) -> Linear:
-    """A layer of [x, number of the agent], as a layer of x with a bias for each agent."""
-    bias = layer.bias + number @ layer.weight[size:]
-    return eqx.tree_at(lambda one: (one.weight, one.bias), layer, (layer.weight[:size], bias))
-
-
-def recurrent(graph: Graph, x: str, agent: Recurrent, env: EnvSpec) -> str:
-    """The value of each choice: QMIX and VDN."""
-    width, choices, observed = agent.memory.kept.weight.shape[0], env.action_size, env.observation_size
-    hidden = graph.input("hidden", (env.agents, width))
-    last = graph.input("last_action", (env.agents,), "int64")
-    table = np.eye(choices + 1, choices, dtype=np.float32)  # its last row stands for no action
-    x = graph.apply("Concat", x, graph.apply("Gather", table, last), axis=-1)
-    encoder = of_agents(agent.encoder, observed + choices, np.eye(env.agents, dtype=np.float32))
-    x = graph.apply("Relu", graph.linear(x, encoder))
-
-    def part(layer: Linear, number: int, of: str) -> str:
-        gate = slice(number * width, (number + 1) * width)
-        return graph.linear(
-            of, eqx.tree_at(lambda one: (one.weight, one.bias), layer, (layer.weight[:, gate], layer.bias[gate]))
-        )
-
-    given, kept = agent.memory.given, agent.memory.kept
-    z, r = (
-        graph.apply("Sigmoid", graph.apply("Add", part(given, gate, x), part(kept, gate, hidden))) for gate in (0, 1)
+def _recurrent(x: Array, agent: Recurrent, env: EnvSpec) -> tuple[Any, Any]:
+    """The value of each choice, and the new memory: QMIX and VDN."""
+    width, choices = agent.memory.kept.weight.shape[0], env.action_size
+    hidden = graph_input("hidden", (env.agents, width))
+    last_action = graph_input("last_action", (env.agents,), "int")
+    one_hot = elementwise("equal", last_action[:, None], np.arange(choices))  # nothing, before the first step
+    x = numpy("concatenate", [x, one_hot * 1.0], axis=-1)
+    encoder = _with_agent_bias(agent.encoder, env.observation_size + choices, np.eye(env.agents, dtype=np.float32))
+    x = elementwise("maximum", linear(x, encoder), 0.0)
+    given, kept = (
+        numpy("split", linear(*pair), 3, axis=-1) for pair in ((x, agent.memory.given), (hidden, agent.memory.kept))
     )
-    new = graph.apply("Tanh", graph.apply("Add", part(given, 2, x), graph.apply("Mul", r, part(kept, 2, hidden))))
-    fresh = graph.apply("Mul", graph.apply("Sub", np.float32(1), z), new)
-    remembered = graph.apply("Add", fresh, graph.apply("Mul", z, hidden))
-    graph.output("next_hidden", remembered, (env.agents, width))
-    return graph.linear(remembered, agent.decoder)
+    z, r = (sigmoid(given[gate] + kept[gate]) for gate in (0, 1))
+    new = elementwise("tanh", given[2] + r * kept[2])
+    hidden = (1 - z) * new + z * hidden
+    return linear(hidden, agent.decoder), hidden
 
 
-def scaled(graph: Graph, action: str, env: EnvSpec) -> str:
+def _in_env_units(action: Array, env: EnvSpec) -> Any:
     """From [-1, 1] to the environment's units."""
     low, high = (np.asarray(bound if env.agents > 1 else bound[0], np.float32) for bound in (env.low, env.high))
-    share = graph.apply("Mul", graph.apply("Add", graph.clip(action, -1, 1), np.float32(1)), np.float32(0.5))
-    return graph.clip(graph.apply("Add", graph.apply("Mul", share, high - low), low), low, high)
+    share = (numpy("clip", action, -1.0, 1.0) + 1.0) * 0.5
+    return numpy("clip", share * (high - low) + as_array(low), low, high)

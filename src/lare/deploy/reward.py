@@ -5,10 +5,12 @@
     length [batch *one]                             T of the step's episode, if the score is an average over its steps
     ->  r_hat [batch *agents]
 
-The graph has only the inputs that the method uses. `phi` is a part of the graph. If it cannot be translated (`phi.py`), its output
-is an input instead: factors [batch *agents factors]. If credit is judged from the global state, `before` and `after` are states,
-`action` holds the actions of all agents side by side, and there is one r_hat for the team.
+The graph has only the inputs that the method uses, and the graph of phi is a part of it. If credit is judged from the global state,
+`before` and `after` are states, `action` holds the actions of all agents side by side, and there is one r_hat for the team.
 """
+
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +19,11 @@ from lare.credit.closed_form import LinearDecoder
 from lare.credit.decoders import Bottleneck, StepDecoder
 from lare.credit.decomposition import Decomposition, normalised, unit
 from lare.credit.methods import Encoder, Reward
-from lare.deploy.graph import Graph
-from lare.deploy.phi import factors
-from lare.deploy.policy import first
-from lare.deploy.rows import Rows, joined
-from lare.latent.function import LatentFunction
+from lare.deploy.layers import finish, graph_input, network, numpy, standardize
+from lare.deploy.policy import first_outputs
 from lare.normalise import CLIP, deviation
+from lare.phi.arrays import Array, elementwise
+from lare.phi.graph import UNLIMITED, Builder, Graph, building, current_builder
 from lare.tasks.spec import judged_states
 from lare.training.config import TrainConfig
 
@@ -42,153 +43,140 @@ def unexported(config: TrainConfig, decoder: object | None) -> str | None:
     return None
 
 
-def reward(
-    credit: Decomposition | None,
-    config: TrainConfig,
-    place: int,
-    phi: LatentFunction | None = None,
-) -> Graph:
+def reward_graph(credit: Decomposition | None, config: TrainConfig, team_index: int, phi: Graph | None = None) -> Graph:
     """The graph of a team's proxy rewards, without optimism.
 
     Args:
         credit: the decoder of one seed; None if phi itself is the reward.
         config: the configuration of its run.
-        place: the index of the team.
-        phi: the function to make a part of the graph. Without it, the factors are an input, if the method needs any.
-
-    Raises:
-        Untranslatable: phi has code that cannot be translated.
+        team_index: the index of the team.
+        phi: the graph of the team's phi, if the method has one.
     """
-    graph, team = Graph(), config.env.teams[place]
+    team = config.env.teams[team_index]
     rows = () if config.of_state or team.size == 1 else (team.size,)
-    seen = []
-    if phi is not None:
-        seen.append(of_phi(graph, phi, rows, config))
-    elif config.method.latent:
-        seen.append(graph.input("factors", (*rows, config.factors[place])))
-    seen += raw(graph, config, rows, place)
-    x = graph.apply("Concat", *seen, axis=-1) if len(seen) > 1 else seen[0]
-    if credit is None:
-        said = graph.apply("MatMul", x, np.ones(1, np.float32))
-    else:
-        said = decoded(graph, x, credit, config)
-        if bool(credit.average):
-            said = graph.apply("Div", said, graph.input("length", (1,) if rows else ()))
-    if config.method.shared and rows:
-        said = shared(graph, said, rows, config)
-    graph.output("r_hat", said, rows)
-    return graph
+    with building(Builder(UNLIMITED)):
+        inputs = _StepInputs(config, rows)
+        features = [] if phi is None else _factors(phi, inputs, rows, config)
+        features += _raw_features(inputs, config, rows, team_index)
+        x = numpy("concatenate", features, axis=-1) if len(features) > 1 else features[0]
+        if credit is None:
+            r_hat = x[..., 0]
+        else:
+            r_hat = _decoded(x, credit, config)
+            if bool(credit.average):
+                r_hat = r_hat / graph_input("length", (1,) if rows else ())
+        if config.method.shared and rows:
+            r_hat = _shared(r_hat, rows, config)
+        return finish(r_hat=r_hat)
 
 
-def of_phi(graph: Graph, phi: LatentFunction, rows: tuple[int, ...], config: TrainConfig) -> str:
-    """The factors of steps by phi, for each agent by itself."""
-    width, parts = action_width(config), []
-    for which in judged_states(config.judges, "before", "after"):
-        shown = graph.input(which, (*rows, config.shown))
-        action = graph.input("action", (*rows, width))
-        if rows:
-            shown = graph.apply("Reshape", shown, np.array([-1, config.shown]))
-            action = graph.apply("Reshape", action, np.array([-1, width]))
-        given = Rows(graph, shown, (config.shown,)), Rows(graph, action, (width,))
-        parts.append(factors(graph, phi.readable, *given))
-    z = joined(parts, axis=1)
-    return graph.apply("Reshape", z.name, np.array([-1, *rows, *z.shape])) if rows else z.name
+class _StepInputs:
+    """The arrays of a step. The graph gets those that are asked for."""
+
+    def __init__(self, config: TrainConfig, rows: tuple[int, ...]):
+        width = config.env.action_size * (config.env.agents if config.of_state else 1)
+        self.sizes = {"before": config.shown, "after": config.shown, "action": width}
+        self.rows = rows
+        self._arrays: dict[str, Array] = {}
+
+    def __getitem__(self, name: str) -> Array:
+        if name not in self._arrays:
+            self._arrays[name] = graph_input(name, (*self.rows, self.sizes[name]))
+        return self._arrays[name]
 
 
-def action_width(config: TrainConfig) -> int:
-    """Numbers in the actions of a judged row."""
-    return config.env.action_size * (config.env.agents if config.of_state else 1)
+def _factors(phi: Graph, inputs: _StepInputs, rows: tuple[int, ...], config: TrainConfig) -> list[Any]:
+    """The factors of a step by phi, for each agent by itself."""
+    factors = []
+    for side in judged_states(config.judges, "before", "after"):
+        nodes = {"observation": inputs[side].node, "action": inputs["action"].node}
+        node = current_builder().inline(phi, nodes, rows[0] if rows else None)["factors"]
+        factors.append(Array(node, None))
+    return factors
 
 
-def raw(graph: Graph, config: TrainConfig, rows: tuple[int, ...], place: int) -> list[str]:
+def _raw_features(inputs: _StepInputs, config: TrainConfig, rows: tuple[int, ...], team_index: int) -> list[Any]:
     """The raw part of a decoder's input, as in `training/learner.py`."""
     encoder, env = config.method.encoder, config.env
     if encoder in (None, Encoder.LATENT):
         return []
-    shown = (*rows, config.shown)
     if encoder is Encoder.RAW and not config.raw_differences:
-        return [graph.input("after", shown)]
-    action = graph.input("action", (*rows, action_width(config)))
-    if not env.discrete:
-        bounds = (
-            (env.low, env.high)
-            if config.of_state
-            else (env.low[env.teams[place].agents], env.high[env.teams[place].agents])
-        )
-        low, high = (bound.reshape((*rows, -1)) for bound in bounds)
-        action = graph.clip(graph.standardised(action, (low + high) / 2, (high - low) / 2), -1, 1)
+        return [inputs["after"]]
+    if env.discrete:
+        action: Callable[[], Any] = lambda: inputs["action"]  # noqa: E731
+    else:
+        agents = slice(None) if config.of_state else env.teams[team_index].agents
+        low, high = (bound[agents].reshape((*rows, -1)) for bound in (env.low, env.high))
+
+        def action() -> Any:
+            return numpy("clip", standardize(inputs["action"], (low + high) / 2, (high - low) / 2), -1.0, 1.0)
+
     match encoder:
         case Encoder.RAW:
-            before, after = (graph.input(name, shown) for name in ("before", "after"))
-            return [before, action, graph.apply("Sub", before, after)]
+            return [inputs["before"], action(), inputs["before"] - inputs["after"]]  # pyright: ignore
         case Encoder.STATE_ACTION:
-            return [graph.input("before", shown), action]
+            return [inputs["before"], action()]
         case Encoder.JUDGED | Encoder.LATENT_AND_JUDGED:
-            return [*(graph.input(name, shown) for name in judged_states(config.judges, "before", "after")), action]
+            return [*(inputs[side] for side in judged_states(config.judges, "before", "after")), action()]
         case _:
-            return [graph.input("after", shown), action]
+            return [inputs["after"], action()]
 
 
-def decoded(graph: Graph, x: str, credit: Decomposition, config: TrainConfig) -> str:
+def _decoded(x: Array, credit: Decomposition, config: TrainConfig) -> Any:
     """The decoder's output for a step, in the unit of the true rewards."""
     decoder = credit.decoder
     if isinstance(decoder, LinearDecoder):
-        return additive(graph, x, decoder)
+        return _additive(x, decoder)
     if normalised(credit, config.credit):
-        x = graph.standardised(x, credit.statistics.mean, deviation(credit.statistics), CLIP)
+        x = standardize(x, credit.statistics.mean, deviation(credit.statistics), CLIP)
     if isinstance(decoder, Bottleneck):
-        x = graph.network(x, first(decoder.encoder, decoder.encoder.layers[-1].weight.shape[1] // 2), "Relu")
+        x = network(x, first_outputs(decoder.encoder, decoder.encoder.layers[-1].weight.shape[1] // 2))
         decoder = decoder.decoder
     assert isinstance(decoder, StepDecoder)
-    size = np.float32(unit(credit, config.credit)) * np.float32(decoder.gain)
-    # The product with a vector of length 1 removes the last axis.
-    return graph.apply("MatMul", graph.network(x, decoder.network, "Relu"), np.full(1, size, np.float32))
+    scale = float(unit(credit, config.credit)) * float(decoder.gain)
+    return network(x, decoder.network)[..., 0] * scale
 
 
-def additive(graph: Graph, x: str, decoder: LinearDecoder) -> str:
+def _additive(x: Array, decoder: LinearDecoder) -> Any:
     """r_hat = b + w . f(u), one group of features after the other; the groups are those of `credit/basis.py`."""
-    basis, weights = decoder.basis, by_group(decoder)
-    u = graph.standardised(x, decoder.mean, decoder.deviation)
-    within = graph.clip(u, -HALF_PERIOD, HALF_PERIOD)
+    basis, weights = decoder.basis, _weights_by_group(decoder)
+    u = standardize(x, decoder.mean, decoder.deviation)
+    within = numpy("clip", u, -HALF_PERIOD, HALF_PERIOD)
     factors, entries = slice(0, basis.factors), slice(basis.factors, basis.factors + basis.used_entries)
     linear = np.zeros(basis.inputs, np.float32)
     linear[factors], linear[entries] = weights.get("factors", 0), weights.get("entries", 0)
-    said = graph.apply("Add", graph.apply("MatMul", u, linear), np.asarray(decoder.bias, np.float32))
+    r_hat = numpy("matmul", u, linear) + float(decoder.bias)
     waves = np.zeros((FREQUENCIES, 2, basis.inputs), np.float32)
     for name, columns in (("shapes of factors", factors), ("shapes of entries", entries)):
         if name in weights:
-            of_group = weights[name].reshape(-1, 2, columns.stop - columns.start)
-            waves[: len(of_group), :, columns] = of_group
+            group = weights[name].reshape(-1, 2, columns.stop - columns.start)
+            waves[: len(group), :, columns] = group
     for k, (cosine, sine) in enumerate(waves, start=1):
-        angle = graph.apply("Mul", within, np.float32(k * np.pi / HALF_PERIOD))
-        for wave, weight in (("Cos", cosine), ("Sin", sine)):
+        angle = within * (k * np.pi / HALF_PERIOD)
+        for wave, weight in (("cos", cosine), ("sin", sine)):
             if weight.any():
-                said = graph.apply("Add", said, graph.apply("MatMul", graph.apply(wave, angle), weight / k))
+                r_hat = r_hat + numpy("matmul", elementwise(wave, angle), weight / k)
     pairs = np.zeros((basis.inputs, basis.inputs), np.float32)
     for name, columns in (("pairs of factors", factors), ("pairs of entries", entries)):
         if name in weights:
             size = columns.stop - columns.start
             pairs[columns, columns][np.triu_indices(size, 1)] = weights[name]
     if pairs.any():
-        products = graph.apply("Mul", within, graph.apply("MatMul", within, pairs.T))
-        said = graph.apply("Add", said, graph.apply("MatMul", products, np.ones(basis.inputs, np.float32)))
-    return said
+        r_hat = r_hat + numpy("sum", within * numpy("matmul", within, pairs.T), axis=-1)
+    return r_hat
 
 
-def by_group(decoder: LinearDecoder) -> dict[str, np.ndarray]:
+def _weights_by_group(decoder: LinearDecoder) -> dict[str, np.ndarray]:
     """The weights of each group of features."""
     basis: Basis = decoder.basis
     ends = np.cumsum(list(basis.sizes.values()))
     return dict(zip(basis.sizes, np.split(np.asarray(decoder.weight, np.float32), ends[:-1]), strict=True))
 
 
-def shared(graph: Graph, said: str, rows: tuple[int, ...], config: TrainConfig) -> str:
+def _shared(r_hat: Array, rows: tuple[int, ...], config: TrainConfig) -> Any:
     """The mean over the agents. If agents may leave, the mean over those that are alive, and 0 for the others."""
-    (agents,) = rows
-    ones = np.ones((agents, agents), np.float32)
     if not config.env.agents_leave:
-        return graph.apply("MatMul", said, ones / agents)
-    there = graph.input("alive", rows)
-    count = graph.apply("Max", graph.apply("MatMul", there, ones), np.float32(1))
-    mean = graph.apply("Div", graph.apply("MatMul", graph.apply("Mul", said, there), ones), count)
-    return graph.apply("Mul", mean, there)
+        return numpy("broadcast_to", numpy("mean", r_hat, axis=-1, keepdims=True), rows)
+    alive = graph_input("alive", rows)
+    count = elementwise("maximum", numpy("sum", alive, axis=-1, keepdims=True), 1.0)
+    return numpy("sum", r_hat * alive, axis=-1, keepdims=True) / count * alive  # pyright: ignore

@@ -16,7 +16,6 @@ from lare.run.directory import Run
 from lare.tasks.env import JaxEnv, Team, team_mean
 from lare.tasks.play import rows_of
 from lare.tasks.table import make_env
-from lare.training.annotate import host
 from lare.training.collect_device import play
 from lare.training.compiled import acting, module_of
 from lare.training.config import TrainConfig
@@ -58,9 +57,9 @@ def sample(run: Run, random: bool = False) -> list[Sample]:
     """Steps of each team, under the first seed's policy, or under random actions."""
     watched = watch(run, SAMPLED, random, key=1)
     config, steps, found = watched.config, watched.steps, []
-    after, taken = host(steps.after), np.asarray(steps.taken)
+    after, taken = jax.tree.map(np.asarray, (steps.after, steps.taken))
     for place, team in enumerate(config.env.teams):
-        rows, _ = rows_of(run.config.task, team, after, taken)
+        rows, _ = rows_of(config.judged_from, team, after, taken)
         mask = np.broadcast_to(watched.mask[..., None], rows.shape[:-1])
         reward = watched.reward[..., team.agents]
         if config.of_state:

@@ -40,13 +40,14 @@ class Credit:
     varies."""
 
 
-def factor_labels(run: Run, place: int = 0) -> list[tuple[str, str]]:
-    """Name and meaning of each column of z, for the function of one of the task's roles."""
+def factor_labels(run: Run, place: int = 0) -> list[tuple[str, str, str]]:
+    """Name, meaning and entries of each column of z, for the function of one of the task's roles."""
     if not run.functions:
         return []
     function = run.functions[place]
     columns = function.columns_by(run.judges)
-    return list(zip(columns, function.meanings * (len(columns) // function.size), strict=True))
+    times = len(columns) // function.size
+    return list(zip(columns, function.meanings * times, function.reads * times, strict=True))
 
 
 def credit_of(run: Run) -> Credit | None:

@@ -52,13 +52,13 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[
     return f'<div class="wide"><table><tr>{cells("th", head)}</tr>\n{body}\n</table></div>'
 
 
-def factor_table(labels: Iterable[tuple[str, str]], correlations: Iterable[float]) -> str:
-    """Names and meanings of factors and, if any is known, their correlations with the true reward."""
-    values, head = list(correlations), ("factor", "meaning, by the comments in phi")
+def factor_table(labels: Iterable[tuple[str, str, str]], correlations: Iterable[float]) -> str:
+    """Names, meanings and entries of factors and, if any is known, their correlations with the true reward."""
+    values, head = list(correlations), ("factor", "meaning, by the comments in phi", "entries that it reads")
     if all(map(math.isnan, values)):
         return table(head, labels)
     rows = [(*label, "-" if math.isnan(value) else f"{value:.2f}") for label, value in zip(labels, values, strict=True)]
-    return table((*head, "correlation with the true reward"), rows, (2,))
+    return table((*head, "correlation with the true reward"), rows, (3,))
 
 
 def note(text: str) -> str:

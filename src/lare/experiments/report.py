@@ -350,7 +350,7 @@ def factors(run: Run, credit: Any) -> Iterable[str]:
     correlations = credit.correlations if credit is not None else [np.nan] * len(named)
     yield factor_table(named, correlations)
     if credit is not None:
-        yield figures.courses(credit.factors[:, 0], [name for name, _ in named])
+        yield figures.courses(credit.factors[:, 0], [name for name, *_ in named])
     yield note(f"phi judges the observation {judged(run)} the step.")
 
 

@@ -18,11 +18,11 @@ from lare.tasks.env import HostEnv, JaxEnv
 from lare.tasks.table import make_env, make_host_env
 from lare.tasks.workers import LocalEnvs
 from lare.training import learner as learning
-from lare.training.annotate import annotate
 from lare.training.collect_device import play
 from lare.training.collect_host import HostEpisodes
 from lare.training.compiled import compiled, module_of, new_memory
 from lare.training.config import TrainConfig
+from lare.training.factors import host_factors
 from lare.training.learner import Learner, Paid
 from lare.training.seeds import of_seed
 from lare.training.session import load_learner
@@ -72,7 +72,7 @@ def watch(run: Run, episodes: int = 1, random: bool = False, key: int = 0) -> Wa
         steps, mask, state = *on_host(run, config, actor, episodes), None
     else:
         steps, mask, state = on_device(env, config, actor, episodes, key)
-    factors = annotate(run, config, steps)
+    factors = host_factors(run, config, steps)
     proxy = proxy_of(of_seed(learner), steps, factors, config) if config.method.has_proxy else None
     return Watched(config, steps, mask, factors, proxy, state)
 

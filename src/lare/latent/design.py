@@ -1,19 +1,13 @@
 """Candidates, combine, verify, correct: lines 2 and 3 of Algorithm 1 of the LaRe paper."""
 
-import contextlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
 
 from lare.errors import LareError, shortened
 from lare.latent.candidates import CANDIDATES, MOST_CANDIDATES
 from lare.latent.function import LatentFunction, normal, of_verdict
-from lare.latent.sandbox.jailed import JailedProgram, WorkerFailed
-from lare.latent.verification.checks import Check, Failed, factors_of
-from lare.latent.verification.verify import Steps, Verdict, tried_on, verify
+from lare.latent.verify import Check, Steps, Verdict, sample_steps, verify
 from lare.llm import prompts
 from lare.llm.model import Model, recorded_model
 from lare.llm.prompts import Kind, Message, Stage
@@ -68,7 +62,7 @@ def examine(reply: str, task: TaskSpec, kind: Kind, steps: Steps | None = None) 
     try:
         source = normal(parse(reply).functions)
     except MalformedReply as error:
-        return Attempt(reply, "", Verdict((), 0), str(error))
+        return Attempt(reply, "", Verdict(()), str(error))
     verdict = verify(source, task, kind, steps)
     return Attempt(reply, source, verdict, verdict.errors)
 
@@ -112,8 +106,7 @@ class Conversation:
 
     def sound(self, replies: Sequence[str]) -> list[str]:
         """The replies that can be read and pass verification."""
-        with ThreadPoolExecutor() as pool:
-            tried = list(pool.map(lambda reply: examine(reply, self.task, self.kind, self.steps), replies))
+        tried = [examine(reply, self.task, self.kind, self.steps) for reply in replies]
         for number, attempt in enumerate(tried, start=1):
             self.said(f"candidate {number}: {first_line(attempt)}")
         return [attempt.reply for attempt in tried if not attempt.errors]
@@ -133,13 +126,11 @@ class Conversation:
         raise self.failed(f"none of {ATTEMPTS} attempts passed; the last one failed: {first_line(attempt)}")
 
     def once(self, reply: str) -> Attempt:
-        """Accept a reply if it runs at all: the ablation without pre-verification. Raises `DesignFailed` if it does not."""
-        try:
-            source = normal(parse(reply).functions)
-            factors = run_once(source, self.task, self.kind, self.steps)
-        except (MalformedReply, Failed, WorkerFailed) as error:
-            raise self.failed(f"the reply does not run: {error}") from error
-        return Attempt(reply, source, Verdict((Check("executed", True, ""),), factors.shape[1]), "")
+        """Accept a reply if it can be read: the ablation without pre-verification. Raises `DesignFailed` if it cannot."""
+        attempt = examine(reply, self.task, self.kind, self.steps)
+        if attempt.verdict.graph is None:
+            raise self.failed(f"the reply cannot be read: {first_line(attempt)}")
+        return replace(attempt, verdict=Verdict((Check("read", True),), attempt.verdict.graph), errors="")
 
     def made(self, attempt: Attempt) -> LatentFunction:
         """The latent function of an attempt."""
@@ -169,13 +160,6 @@ def quoted(reply: str) -> str:
     return reply[:LONGEST_QUOTE] if reply.strip() else "(an empty reply)"
 
 
-def run_once(source: str, task: TaskSpec, kind: Kind, steps: Steps | None = None) -> np.ndarray:
-    """The factors of a program on steps of its task, without the gate, in the jail. Raises if the program does not run."""
-    observation, action = tried_on(task, steps)
-    with contextlib.closing(JailedProgram(source, observation.shape[1], action.shape[1], gated=False)) as program:
-        return factors_of(program.failed or program.call(observation, action), len(observation), kind)
-
-
 def design(
     task: TaskSpec | str | Path,
     kind: Kind = "factors",
@@ -201,7 +185,7 @@ def design(
         draw: the number of the shipped recording that answers (0 to 4). It is independent of the training seed.
         candidates: n; with 1 (the paper's ablation without self-prompting), the single candidate is the function and
             nothing is combined.
-        pre_verification: without it (the paper's ablation), the first function is kept if it runs at all, in its jail.
+        pre_verification: without it (the paper's ablation), the first function is kept if it can be read.
         record: the file to which every exchange is written, from the first reply on.
         said: a function that receives messages about the progress.
         steps: observations (n, observation size) and actions (n, action size) that functions are tried on if there is no
@@ -217,8 +201,8 @@ def design(
     if not 1 <= candidates <= MOST_CANDIDATES:
         raise LareError(f"candidates = {candidates}: from 1 to {MOST_CANDIDATES}")
     model = model or recorded_model(task.name, kind, draw)
-    # Detects an environment that does not run before a model is paid. It also caches the steps before threads need them.
-    tried_on(task, steps)
+    # Detects an environment that does not run before a model is paid.
+    sample_steps(task, steps)
     recorder = Recorder(task.name, kind, getattr(model, "temperature", None), record)
     conversation = Conversation(task, kind, model, recorder, said, steps)
     try:

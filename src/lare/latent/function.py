@@ -13,12 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from lare.errors import LareError, shortened
-from lare.latent.evaluator import Evaluator
-from lare.latent.language.names import factor_meanings, names_of
-from lare.latent.verification.checks import Check
-from lare.latent.verification.verify import Steps, Verdict, verify
+from lare.latent.factors import check_finite, compute_factors
+from lare.latent.verify import Check, Steps, Verdict, verify
 from lare.llm.key import without_key
 from lare.llm.prompts import Kind
+from lare.phi.graph import Graph
+from lare.phi.names import factor_meanings, factor_names
+from lare.phi.read import read
 from lare.tasks.spec import Judges, TaskSpec, the_role
 
 CHANGED = "; changed by hand since"
@@ -43,11 +44,11 @@ class LatentFunction:
     size: int
     """d, the number of factors."""
     checks: tuple[Check, ...]
+    sizes: tuple[int, int]
+    """The sizes of an observation and of an action."""
     model: str = "none: written by hand"
     exchanges: tuple[dict[str, Any], ...] = ()
     """Every request and its replies: `stage`, `messages`, `replies`."""
-    sizes: tuple[int, int] | None = None
-    """The sizes of an observation and of an action that it was verified with."""
 
     @property
     def digest(self) -> str:
@@ -59,40 +60,37 @@ class LatentFunction:
         """Whether the source was changed after it was saved."""
         return self.model.endswith(CHANGED)
 
-    @property
-    def readable(self) -> str:
-        """The source if the gate has passed it, else an empty text: this process must not parse any other source."""
-        return self.source if any(check.name == "gate" and check.passed for check in self.checks) else ""
+    @functools.cached_property
+    def graph(self) -> Graph:
+        """The function as a graph of array operations of one row: what is computed, compiled and exported.
 
-    @property
+        Raises:
+            Refused: the source cannot be read, which a verified function's can.
+        """
+        return read(self.source, *self.sizes)
+
+    @functools.cached_property
     def names(self) -> list[str]:
         """A name for each factor."""
-        return names_of(self.readable, self.size)
+        return factor_names(self.source, self.size)
 
     @property
     def meanings(self) -> list[str]:
         """The source's comment on each factor; empty for a factor without a comment."""
-        comments = factor_meanings(self.readable)
-        return [comments.get(name, "") for name in self.names]
+        return factor_meanings(self.source, self.names)
 
-    @functools.cached_property
-    def evaluators(self) -> dict[tuple[int, int], Evaluator]:
-        """The workers that have been started, by the sizes of their arrays. They end with this object."""
-        return {}
+    @property
+    def entries_read(self) -> list[dict[str, list[int]]]:
+        """For each factor, the entries of the observation and of the action that it depends on, by "observation" and "action"."""
+        return self.graph.entries_read("factors")
 
-    def evaluator(self, observation_size: int, action_size: int) -> Evaluator:
-        """The worker that runs this function on arrays of these sizes. It is started when it is first needed.
-
-        Raises:
-            NoWorker: no process can be started.
-        """
-        sizes = observation_size, action_size
-        if sizes not in self.evaluators:
-            self.evaluators[sizes] = Evaluator(self.source, self.names, *sizes)
-        return self.evaluators[sizes]
+    @property
+    def reads(self) -> list[str]:
+        """The same as texts: "observation[8:10, 13], action[0:6]"."""
+        return [entries_text(entries) for entries in self.entries_read]
 
     def __call__(self, observation: Any, action: Any) -> Float[np.ndarray, "*batch factors"]:
-        """The factors of a batch of steps, or of a single step. They are computed in a separate process.
+        """The factors of a batch of steps, or of a single step.
 
         Args:
             observation: (batch, observation size), or a single row (observation size,).
@@ -100,37 +98,36 @@ class LatentFunction:
 
         Raises:
             LareError: the arrays do not have the task's sizes, or the numbers of observations and actions differ.
-            LatentRewardError: the function failed, or gave the wrong shape or a number that is not finite.
+            LatentRewardError: a factor is not finite.
         """
         rows, single = self.rows(observation, action)
-        factors = self.evaluator(rows[0].shape[1], rows[1].shape[1])(*rows)
+        factors = compute_factors(self.graph, *rows)
+        check_finite(factors, self.names, *rows)
         return factors[0] if single else factors
 
     def rows(self, observation: Any, action: Any) -> tuple[tuple[np.ndarray, np.ndarray], bool]:
         """Both arrays as rows of numbers, and whether both were single rows."""
-        found = []
-        for name, given, size in zip(
-            ("observation", "action"), (observation, action), self.sizes or (None, None), strict=True
-        ):
+        arrays = []
+        for name, values, size in zip(("observation", "action"), (observation, action), self.sizes, strict=True):
             try:
-                array = np.asarray(given, np.float32)
+                array = np.asarray(values, np.float32)
             except (TypeError, ValueError):
                 raise LareError(
-                    f"{name}s must be arrays of numbers: {shortened(given)} cannot be converted to one"
+                    f"{name}s must be arrays of numbers: {shortened(values)} cannot be converted to one"
                 ) from None
-            if array.ndim not in (1, 2) or size not in (None, array.shape[-1]):
-                wanted = name if size is None else f"{size}"
+            if array.ndim not in (1, 2) or size != array.shape[-1]:
                 raise LareError(
-                    f"{name}s must have the shape (batch, {wanted}), or ({wanted},) for a single step: the shape is {array.shape}"
+                    f"{name}s must have the shape (batch, {size}), or ({size},) for a single step: the shape is {array.shape}"
                 )
-            found.append(array)
-        single = {array.ndim for array in found} == {1}
-        shown, taken = (np.atleast_2d(array) for array in found)
-        if len(shown) != len(taken):
+            arrays.append(array)
+        single = {array.ndim for array in arrays} == {1}
+        observations, actions = (np.atleast_2d(array) for array in arrays)
+        if len(observations) != len(actions):
             raise LareError(
-                f"there are {len(shown)} observations and {len(taken)} actions: each step needs one observation and one action"
+                f"there are {len(observations)} observations and {len(actions)} actions: each step needs one observation and one "
+                "action"
             )
-        return (shown, taken), single
+        return (observations, actions), single
 
     def of_steps(
         self,
@@ -160,14 +157,8 @@ class LatentFunction:
         return [f"{name} ({which})" for which in ("before", "after") for name in self.names]
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state for another process: everything except the workers, which are started again there."""
-        return {name: value for name, value in self.__dict__.items() if name != "evaluators"}
-
-    def close(self) -> None:
-        """End the workers. They start again when they are needed."""
-        for evaluator in self.evaluators.values():
-            evaluator.close()
-        self.evaluators.clear()
+        """The state for another process: everything except the graph, which is read again there."""
+        return {name: value for name, value in self.__dict__.items() if name != "graph"}
 
     def save(self, path: str | Path) -> None:
         """Write the source to `path` (.py), and the replies and checks to a .json file beside it.
@@ -198,20 +189,30 @@ class LatentFunction:
             raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
 
+def entries_text(entries: dict[str, list[int]]) -> str:
+    """Entries as Python's indices, runs of them as slices: "observation[8:10, 13]"; "nothing" if there are none."""
+    texts = []
+    for name, numbers in entries.items():
+        runs = [list(run) for _, run in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
+        ends = [(run[0][1], run[-1][1]) for run in runs]
+        if numbers:
+            texts.append(f"{name}[{', '.join(str(a) if a == b else f'{a}:{b + 1}' for a, b in ends)}]")
+    return ", ".join(texts) or "nothing"
+
+
 def sha256(source: str) -> str:
     """SHA-256 of a source, in hexadecimal digits."""
     return hashlib.sha256(source.encode()).hexdigest()
 
 
 def normal(source: str) -> str:
-    """The source in its stored form: uniform line ends, no surrounding blank lines, and no header of `save`.
+    r"""The source in its stored form: lines end with \n, no surrounding blank lines, and no header of `save`.
 
     Variation selectors, which turn a sign into an emoji, are removed: models write warning signs into comments, and a variation
-    selector is invisible.
+    selector is invisible. A line ends where Python's parser ends it, and nowhere else.
     """
-    text = source.replace(VARIATION, "")
-    lines = itertools.dropwhile(lambda line: not line or line.startswith(HEADER), text.splitlines())
-    return "\n".join(lines).rstrip("\n")
+    lines = source.replace(VARIATION, "").replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    return "\n".join(itertools.dropwhile(lambda line: not line or line.startswith(HEADER), lines)).rstrip("\n")
 
 
 def verified(
@@ -230,10 +231,13 @@ def verified(
 
 
 def of_verdict(source: str, task: TaskSpec, kind: Kind, verdict: Verdict) -> LatentFunction:
-    """The function of a source and of its verdict, which the caller has accepted."""
+    """The function of a source that could be read, and of its verdict, which the caller has accepted."""
     role = the_role(task)
+    assert verdict.graph is not None
     sizes = role.observation_size, role.action_size
-    return LatentFunction(role.name, kind, source, verdict.size, verdict.checks, sizes=sizes)
+    function = LatentFunction(role.name, kind, source, verdict.graph.factor_count, verdict.checks, sizes)
+    function.__dict__["graph"] = verdict.graph  # it need not be read again
+    return function
 
 
 Given = TypeVar("Given")

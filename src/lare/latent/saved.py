@@ -10,7 +10,7 @@ from typing import NamedTuple
 from lare.errors import LareError, shortened
 from lare.foreign import read_json, read_text
 from lare.latent.function import CHANGED, HEADER, LatentFunction, normal, sha256, verified
-from lare.latent.verification.verify import Steps
+from lare.latent.verify import Steps
 from lare.llm.prompts import Kind
 from lare.llm.recording import Exchange
 from lare.llm.reply import MalformedReply, parse
@@ -56,7 +56,7 @@ def text_of(source_path: Path) -> str:
 
 def split_header(text: str) -> tuple[list[str], str]:
     """The header lines that `save` wrote, and the source."""
-    lines = text.splitlines()
+    lines = text.split("\n")
     header = list(itertools.takewhile(lambda line: line.startswith(HEADER), lines))
     return header, "\n".join(lines[len(header) :])
 

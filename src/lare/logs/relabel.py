@@ -171,13 +171,10 @@ def relabel(
     logs.check_out(out, overwrite)
     name = method or ("bayes" if phi is None else "lare-bayes")
     credit = assigner(logs, name, phi, task, settings, memory, seed)
-    try:
-        seen = learn(credit, logs, hold_out, seed, updates, told)
-        explanation, tally = tuple(credit.explanation()), Tally()
-        about = f"Rewards by lare relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
-        written = logs.write(out, pay(credit, logs, hold_out, seed, tally, seen, told), overwrite, about)
-    finally:
-        credit.close()
+    seen = learn(credit, logs, hold_out, seed, updates, told)
+    explanation, tally = tuple(credit.explanation()), Tally()
+    about = f"Rewards by lare relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
+    written = logs.write(out, pay(credit, logs, hold_out, seed, tally, seen, told), overwrite, about)
     r2 = tally.r2_and_error() if credit.config.method.in_reward_units else (math.nan, math.nan)
     counted = tally.episodes, tally.steps, tally.cut, len(tally.returns)
     return Relabelled(written, name, *counted, *r2, tally.correlation(), explanation)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lare.latent.verification.verify import STEPS, Steps
+from lare.latent.verify import STEPS, Steps
 from lare.logs.source import open_logs
 from lare.tasks.load import as_task
 from lare.tasks.play import Episode

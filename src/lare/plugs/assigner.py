@@ -414,11 +414,6 @@ class CreditAssigner:
     def __setstate__(self, state: dict[str, Any]) -> None:
         saving.restore(self, state["text"], state["arrays"], state["phi"])
 
-    def close(self) -> None:
-        """Stop the worker process of `phi`. It starts again when it is needed."""
-        if self.config.phi is not None:
-            self.config.phi.close()
-
 
 def numbers_of(steps: Any) -> Int[np.ndarray, "*shape"]:
     """Numbers of steps as an array. Raises `LareError` if one of them is not such a number."""

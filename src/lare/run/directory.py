@@ -27,7 +27,7 @@ from jaxtyping import Float
 from lare.errors import Checked, LareError, shortened
 from lare.files import write_atomically
 from lare.foreign import read_json, read_text
-from lare.latent.evaluator import LatentRewardError
+from lare.latent.factors import LatentRewardError
 from lare.latent.function import LatentFunction, per_role
 from lare.latent.saved import load, read_source
 from lare.run.checkpoint import STATE, saved_host
@@ -65,8 +65,6 @@ class Config(Checked):
     """The environment's time limit."""
     function_sha256: tuple[str, ...]
     """Hashes of the latent functions in use: one for each team; empty for a method that needs none."""
-    isolation: str | None
-    """How the latent function is isolated during training."""
     versions: dict[str, str]
     machine: str
     ended_at: tuple[int, ...] = ()
@@ -83,7 +81,6 @@ def describe(task: TaskSpec, settings: ResolvedSettings, functions: Sequence[Lat
         task_sha256=task.digest,
         longest_episode=env_spec(task).max_steps,
         function_sha256=tuple(function.digest for function in functions),
-        isolation=isolation(task, functions[0]) if functions else None,
         versions={name: version(name) for name in VERSIONS} | {"python": platform.python_version()},
         machine=f"{platform.system()} {platform.machine()}, {cores()}, {jax.default_backend()}",
     )
@@ -94,11 +91,6 @@ def cores() -> str:
     there = os.cpu_count() or 1
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else there
     return f"{usable} of {there} cores" if usable < there else f"{there} cores"
-
-
-def isolation(task: TaskSpec, function: LatentFunction) -> str:
-    """How a task's latent functions are isolated on this machine."""
-    return function.evaluator(task.observation_size, task.action_size).isolation
 
 
 def function_file(task: TaskSpec, role: TaskSpec, since: int = 0) -> str:
@@ -334,7 +326,7 @@ def read_measured(directory: Path) -> Run:
 
 
 def open_run(directory: str | Path) -> Run:
-    """Read a run directory; its latent function is verified again before anything executes it.
+    """Read a run directory; its latent function is read and verified again.
 
     Raises:
         LareError: it is not a run, its files are not valid, or its environment is in a file that the user does not trust.

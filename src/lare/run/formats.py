@@ -9,7 +9,7 @@ from typing import Any
 
 from lare.errors import LareError
 
-FORMAT = 3
+FORMAT = 4
 """The format of config.json and of the checkpoint. It is increased whenever their contents change."""
 
 
@@ -18,7 +18,12 @@ def from_2(values: dict[str, Any]) -> dict[str, Any]:
     return values
 
 
-MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {2: from_2}
+def from_3(values: dict[str, Any]) -> dict[str, Any]:
+    """`isolation` said how the process was isolated that executed phi."""
+    return {name: value for name, value in values.items() if name != "isolation"}
+
+
+MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {2: from_2, 3: from_3}
 """Functions that convert a format to the next one."""
 
 

@@ -3,12 +3,13 @@
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from lare.tasks.env import EnvSpec, HostEnv, Team, Timestep, env_action, team_mean
-from lare.tasks.spec import TaskSpec
+from lare.tasks.spec import JudgedFrom, TaskSpec
 from lare.tasks.table import make_host_env
 
 Policy = Callable[[np.ndarray], np.ndarray]
@@ -42,12 +43,10 @@ def team_of(role: TaskSpec, spec: EnvSpec) -> Team:
     return next((team for team in spec.teams if team.name == role.team), spec.teams[0])
 
 
-def rows_of(
-    role: TaskSpec, team: Team, shown: Timestep, action: Float[np.ndarray, "*batch agents action"]
-) -> tuple[np.ndarray, np.ndarray]:
-    """The inputs of a role's function at some steps: observations and actions, [*batch rows ...]."""
+def rows_of(judged_from: JudgedFrom, team: Team, shown: Timestep, action: Any) -> tuple[Any, Any]:
+    """The inputs of a team's phi at some steps: observations and actions, [*batch rows ...]. Arrays of NumPy or JAX."""
     of_team = action[..., team.agents, :]
-    if role.judged_from == "observation":
+    if judged_from == "observation":
         return shown.observation[..., team.agents, :], of_team
     return shown.state[..., None, :], of_team.reshape(*of_team.shape[:-2], 1, -1)
 
@@ -63,12 +62,12 @@ def episode_of(env: HostEnv, role: TaskSpec, policy: Policy | None, random: np.r
     """One episode."""
     team, columns, measures = team_of(role, env.spec), [], {}
     for before, action, after in steps_of(env, policy, random, seed):
-        shown, taken = rows_of(role, team, before, action)
+        shown, taken = rows_of(role.judged_from, team, before, action)
         paid = np.asarray(team_mean(after.reward, before.alive, team))
         alive, reward = before.alive[team.agents], after.reward[team.agents]
         if role.judged_from == "state":
             alive, reward = np.ones(1, bool), paid[None]
-        columns.append((shown, taken, rows_of(role, team, after, action)[0], alive, reward, paid))
+        columns.append((shown, taken, rows_of(role.judged_from, team, after, action)[0], alive, reward, paid))
         measures = {name: float(value) for name, value in after.measures.items()}
     return Episode(*(np.stack(part) for part in zip(*columns, strict=True)), measures=measures)
 

@@ -1,6 +1,6 @@
 """The functions of a run, compiled, with a leading seed axis on every array but the number of steps done."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Key
 from lare.algorithms.table import Consumes
 from lare.data.trajectory import Trajectory
 from lare.float64 import float64
+from lare.phi.graph import Graph
 from lare.training import episodes, off_policy, on_policy, sequences
 from lare.training import learner as common
 from lare.training.config import TrainConfig
@@ -25,8 +26,8 @@ class Compiled(NamedTuple):
 
     init: Callable[[Key[Array, " seeds"]], Learner]
     """Untrained learners."""
-    store: Callable[[Learner, Trajectory, Any], Learner]
-    """From learner, new steps, and their factors."""
+    store: Callable[[Learner, Trajectory], tuple[Learner, Bool[Array, " seeds"]]]
+    """From learner and new steps; whether all factors of each seed are finite."""
     learn_returns: Callable[[Learner], Learner]
     """`episodes.learn_returns`, for when episodes have finished."""
     fit: Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, Metrics]]
@@ -85,8 +86,8 @@ def acting(config: TrainConfig, greedy: bool) -> Callable[..., tuple[Array, Any]
     return jax.vmap(act, in_axes=(0, 0, 0, 0, None if greedy else 0, 0))
 
 
-def compiled(config: TrainConfig) -> Compiled:
-    """The functions of a run."""
+def compiled(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compiled:
+    """The functions of a run. `phi` holds the graph of each team's phi; only `store` needs it."""
     module = module_of(config)
 
     def fit_in_turn(learner: Learner, keys: Key[Array, " seeds"]) -> tuple[Learner, Metrics]:
@@ -104,7 +105,7 @@ def compiled(config: TrainConfig) -> Compiled:
     return Compiled(
         init=jax.jit(partial(new_learners, config=config)),
         learn_returns=learn_returns,
-        store=jax.jit(jax.vmap(partial(common.store, config=config)), donate_argnums=0),
+        store=jax.jit(jax.vmap(partial(common.store, config=config, phi=phi)), donate_argnums=0),
         fit=jax.jit(fit_in_turn, donate_argnums=0),
         improve=jax.jit(partial(module.improve, config=config), donate_argnums=0),
         assess=jax.jit(jax.vmap(partial(common.assess, config=config))),

@@ -23,9 +23,11 @@ from lare.data.replay import Replay, StoredSteps
 from lare.data.sampling import CreditSample, sample_packed, sample_padded, sample_parts
 from lare.data.trajectory import Trajectory
 from lare.normalise import Scale, magnitude, new_scale, observe_scale, within_range
+from lare.phi.graph import Graph
 from lare.tasks.env import alive_mean, team_mean
 from lare.tasks.spec import judged_states
 from lare.training.config import TrainConfig
+from lare.training.factors import step_factors
 
 PART = 2400
 """About how many rows of features each part of a decoder's gradient is computed from. More rows do not fit into the cache, and
@@ -133,6 +135,24 @@ def alive_rows(steps: StoredSteps, config: TrainConfig, place: int) -> Bool[Arra
 
 
 def store(
+    learner: Learner, steps: Trajectory, config: TrainConfig, phi: Sequence[Graph] = ()
+) -> tuple[Learner, Bool[Array, ""]]:
+    """Compute the factors of new steps, and put both into the replay and into the running statistics.
+
+    Args:
+        learner: the learner.
+        steps: the new steps.
+        config: the configuration of the run.
+        phi: the graph of each team's phi.
+
+    Returns:
+        The new learner, and whether all factors are finite.
+    """
+    factors = step_factors(phi, steps, config)
+    return store_with_factors(learner, steps, factors, config), jnp.all(jnp.isfinite(factors))
+
+
+def store_with_factors(
     learner: Learner, steps: Trajectory, factors: Float[Array, "time envs rows factors"], config: TrainConfig
 ) -> Learner:
     """Put new steps into the replay and into the running statistics."""

@@ -89,11 +89,11 @@ def as_judged(steps: StoredSteps, length: int, config: TrainConfig, role: TaskSp
     taken = env_action(before["action"], env)
     alive = before.get("alive", np.ones((length, env.agents), bool))
     paid = np.asarray(team_mean(before["reward"], alive, team))
-    rows, action = rows_of(role, team, shown, taken)
+    rows, action = rows_of(role.judged_from, team, shown, taken)
     there, reward = alive[:, team.agents], before["reward"][:, team.agents]
     if config.of_state:
         there, reward = np.ones((length, 1), bool), paid[:, None]
-    return Episode(rows, action, rows_of(role, team, led_to, taken)[0], there, reward, paid)
+    return Episode(rows, action, rows_of(role.judged_from, team, led_to, taken)[0], there, reward, paid)
 
 
 def timestep(columns: dict[str, np.ndarray]) -> Timestep:
@@ -144,8 +144,8 @@ def factors_again(run: Run, config: TrainConfig, buffer: Replay) -> Float[Array,
             )
             taken = env_action(columns["action"][env, some], config.env)
             for place, (function, team) in enumerate(zip(run.functions, config.env.teams, strict=True)):
-                before, action = rows_of(run.config.task, team, shown, taken)
-                after, _ = rows_of(run.config.task, team, led_to, taken)
+                before, action = rows_of(config.judged_from, team, shown, taken)
+                after, _ = rows_of(config.judged_from, team, led_to, taken)
                 z = run.factors(function, *(part.reshape(-1, part.shape[-1]) for part in (before, action, after)))
                 found[env, some, config.judged(place), : z.shape[1]] = z.reshape(*action.shape[:-1], -1)
     return jnp.asarray(found)
@@ -170,7 +170,4 @@ def in_place_of(run: Run, functions: tuple[LatentFunction, ...], step: int) -> R
     """The run with new functions from a step on, which are saved in its directory."""
     renewed = replace(run, functions=functions, since=step)
     renewed.keep_functions()
-    for function in run.functions:
-        if function not in functions:
-            function.close()
     return renewed

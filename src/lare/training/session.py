@@ -19,6 +19,7 @@ from lare.data import replay
 from lare.data.trajectory import Trajectory
 from lare.errors import LareError
 from lare.latent.improve import Model
+from lare.phi.graph import Graph
 from lare.run import best as best_policies
 from lare.run import checkpoint
 from lare.run.best import Best
@@ -28,11 +29,11 @@ from lare.source import source
 from lare.tasks.env import JaxEnv, Timestep
 from lare.tasks.table import env_spec, make_env
 from lare.training import advice, first_fit, renew
-from lare.training.annotate import annotate
 from lare.training.collect_device import DeviceCollector
 from lare.training.collect_host import HostCollector, host_collector
 from lare.training.compiled import Compiled, compiled
 from lare.training.config import TrainConfig
+from lare.training.factors import host_factors
 from lare.training.learner import Learner, forget_episodes
 from lare.training.seeds import lines
 from lare.training.streams import Stream, seed_keys, stream_keys
@@ -57,6 +58,11 @@ def config_for(run: Run) -> TrainConfig:
         steps=settings.steps,
         fit_updates=settings.fit_updates,
     )
+
+
+def graphs(run: Run) -> tuple[Graph, ...]:
+    """The graph of each team's phi."""
+    return tuple(function.graph for function in run.functions)
 
 
 @jax.jit
@@ -106,12 +112,19 @@ class Session:
             Stopped: the user has asked the run to stop, during the decoder's first fit. The session cannot go on.
         """
         steps = self.collector.collect(self.actor, self.step)
-        self.learner = self.functions.store(self.learner, steps, annotate(self.run, self.config, steps))
+        self.learner, finite = self.functions.store(self.learner, steps)
+        if self.run.functions and not np.all(finite):
+            self.raise_not_finite(steps)
         if self.learner.credit and np.any(steps.ended):
             self.learner = self.functions.learn_returns(self.learner)
         if self.step >= self.config.warmup:
             self.update(steps, stopped)
         self.step += self.settings.iteration_steps
+
+    def raise_not_finite(self, steps: Trajectory) -> None:
+        """Raise `LareError` that names the factor which is not finite, and save its batch in the run directory."""
+        host_factors(self.run, self.config, steps)
+        raise LareError("a factor is not finite in the compiled function; the last checkpoint is whole")
 
     def update(self, steps: Trajectory, stopped: Callable[[], bool]) -> None:
         """Make the decoder's own updates, if it has any and they are due, and those of the algorithm."""
@@ -182,7 +195,7 @@ class Session:
         self.run = renew.in_place_of(self.run, found, self.step)
         self.config = config_for(self.run)
         self.learner = renew.with_functions(self.run, self.config, self.learner)
-        self.functions = compile_ahead(self.run, self.config, compiled(self.config))
+        self.functions = compile_ahead(self.run, self.config, compiled(self.config, graphs(self.run)))
         self.save(anew=True)
 
     def return_to(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[str]:
@@ -281,7 +294,7 @@ def begin(run: Run, config: TrainConfig, make_learner: Callable[[Compiled], Lear
 
     The compiler needs hundreds of megabytes for a while. They are given back before the replay needs them.
     """
-    functions = compile_ahead(run, config, compiled(config))
+    functions = compile_ahead(run, config, compiled(config, graphs(run)))
     give_memory_back()
     learner = make_learner(functions)
     if config.env.in_jax:
@@ -316,10 +329,9 @@ def compile_ahead(run: Run, config: TrainConfig, functions: Compiled) -> Compile
     )
     taken = shape(env.agents, env.action_size, dtype=np.float32 if env.discrete else env.low.dtype)
     steps = Trajectory(shown, action, taken, shown)
-    factors = shape(config.judged_rows, max(config.factors, default=0))
     learner, keys = learner_shape(run, functions), jax.eval_shape(seed_keys, jnp.asarray(run.seeds), 0)
     return functions._replace(
-        store=ahead(functions.store, learner, steps, factors),
+        store=ahead(functions.store, learner, steps),
         improve=ahead(functions.improve, learner, steps, keys, 0),
         assess=ahead(functions.assess, learner),
     )

@@ -18,7 +18,7 @@ from lare.latent.function import LatentFunction, check_task, per_role
 from lare.latent.improve import Model
 from lare.latent.saved import load
 from lare.run.decide import decide
-from lare.run.directory import Run, as_run, create, default_directory, isolation, locked
+from lare.run.directory import Run, as_run, create, default_directory, locked
 from lare.run.settings import ResolvedSettings, Settings, set_in_vain
 from lare.tasks.load import as_task
 from lare.tasks.spec import TaskSpec
@@ -315,8 +315,6 @@ def introduce(session: Session, listener: Listener, messages: Sequence[str]) -> 
     run, settings = session.run, session.settings
     for message in messages:
         listener.said(message)
-    if run.function is not None:
-        listener.said(f"the latent function runs in {isolation(run.config.task, run.function)}")
     if settings.untrained:
         listener.said(settings.untrained)
     elif session.step < settings.warmup:

@@ -1,1 +1,0 @@
-"""The checks that a program must pass before it is used."""

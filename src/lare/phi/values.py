@@ -1,0 +1,232 @@
+"""The values of a program that are neither numbers nor arrays, and what a program may spend."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from lare.phi.arrays import BatchSize, Operand
+from lare.phi.graph import Refused
+
+MOST_STEPS = 40_000
+"""The most steps of a program: statements, expressions, and entries of lists that are made or looked into."""
+LONGEST_LIST = 10_000
+LONGEST_TEXT = 10_000
+MOST_BITS = 63
+"""The most bits of an integer."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """What is known by its name: a module, a function or a type of Python or NumPy."""
+
+    name: str
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(eq=False)
+class Function:
+    """A function of the program."""
+
+    name: str
+    parameters: ast.arguments
+    body: Sequence[ast.stmt] | ast.expr
+    scope: Scope
+    defaults: Sequence[Any]
+    keyword_defaults: Sequence[Any]
+    yields: bool = False
+    owner: Class | None = None
+    """The class whose method it is."""
+
+
+@dataclass(eq=False)
+class Bound:
+    """A function, or a method of Python's or NumPy's types, with its first argument."""
+
+    call: Callable[..., Any]
+
+
+@dataclass(eq=False)
+class Decorated:
+    """A function in a class: a static method, a class method or a property."""
+
+    kind: str
+    function: Any
+
+
+@dataclass(eq=False)
+class Class:
+    """A class of the program."""
+
+    name: str
+    attributes: dict[str, Any]
+    bases: Sequence[Class] = ()
+    fields: Sequence[str] | None = None
+    """The names of the fields of a dataclass or of a named tuple, in order."""
+    is_tuple: bool = False
+
+    def find(self, name: str) -> Any:
+        """An attribute, also of the bases. Raises `AttributeError` if there is none."""
+        for cls in (self, *self.bases):
+            if name in cls.attributes:
+                return cls.attributes[name]
+        raise AttributeError(f"{self.name} has no attribute {name!r}")
+
+    def has(self, name: str) -> bool:
+        return any(name in cls.attributes for cls in (self, *self.bases))
+
+
+@dataclass(eq=False)
+class Instance:
+    """An object of a class of the program."""
+
+    cls: Class
+    attributes: dict[str, Any] = field(default_factory=dict)
+
+
+class Set(dict):
+    """A set of the program. It keeps the order in which its entries were added."""
+
+
+class Iterator(list):
+    """What zip, map, a generator and their like return. Its entries can be gone through once."""
+
+
+class Scope(dict):
+    """The names of a call, of a class or of a comprehension, within those of the scopes around it."""
+
+    def __init__(self, parent: Scope | None = None, kind: str = "function"):
+        super().__init__()
+        self.parent, self.kind = parent, kind
+        self.elsewhere: dict[str, Scope] = {}
+        """The scopes of names that are declared global or nonlocal."""
+        self.yielded: list[Any] | None = None
+        """What a generator has yielded."""
+        self.owner: Class | None = None
+        self.instance: Any = None
+        """The class whose method is called, and the object that it is called on."""
+
+    def find(self, name: str) -> Any:
+        """The value of a name. Raises `NameError` if there is none."""
+        scope: Scope | None = self
+        while scope is not None:
+            if name in scope.elsewhere:
+                scope = scope.elsewhere[name]
+            if name in scope:
+                return scope[name]
+            scope = scope.parent
+        raise NameError(name)
+
+    def assign(self, name: str, value: Any) -> None:
+        self.elsewhere.get(name, self)[name] = value
+
+    @property
+    def function(self) -> Scope:
+        """The scope of the function around a comprehension."""
+        return self.parent.function if self.kind == "comprehension" and self.parent is not None else self
+
+    @property
+    def closure(self) -> Scope:
+        """The scope that functions see which are defined here: not that of a class."""
+        return self.parent if self.kind == "class" and self.parent is not None else self
+
+
+class Meter:
+    """Counts the steps of a program. All that takes time or memory is paid for before it happens."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def pay(self, steps: int = 1) -> None:
+        self.steps += steps
+        if self.steps > MOST_STEPS:
+            raise Refused("E-COST", f"the program takes more than {MOST_STEPS} steps")
+
+    def pay_for_list(self, values: Sequence[Any] | int) -> Any:
+        """Pay for a new list of these entries, or of this many, and return it."""
+        count = values if isinstance(values, int) else len(values)
+        if count > LONGEST_LIST:
+            raise Refused("E-COST", f"a list of {count} entries is too long: at most {LONGEST_LIST}")
+        self.pay(count)
+        return values
+
+    def pay_for_all_within(self, values: Iterable[Any]) -> None:
+        """Pay for all that is within values. A list that holds another twice, and so on, has very many entries."""
+        rest = list(values)
+        while rest:
+            value = rest.pop()
+            self.pay()
+            if isinstance(value, dict):
+                self.pay(len(value))
+                rest.extend(value.values())
+            elif isinstance(value, (list, tuple)):
+                rest.extend(value)
+            elif isinstance(value, Instance):
+                rest.extend(value.attributes.values())
+
+
+def checked_number(value: Any) -> Any:
+    """A number of Python. Raises `Refused` if it is too large."""
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:
+        raise Refused("E-COST", "an integer is too large")
+    return value
+
+
+def checked_text(text: str) -> str:
+    if len(text) > LONGEST_TEXT:
+        raise Refused("E-COST", f"a text of {len(text)} characters is too long: at most {LONGEST_TEXT}")
+    return text
+
+
+def as_key(value: Any) -> Any:
+    """A value as the key of a dictionary. Raises `TypeError` if it is none."""
+    parts = value if isinstance(value, tuple) else (value,)
+    if not all(isinstance(part, (str, bool, int, float, Named)) or part is None for part in parts):
+        raise TypeError("the keys of dictionaries and the entries of sets are texts, numbers, or tuples of them")
+    return value
+
+
+class Return(Exception):
+    """Leaves a function of the program."""
+
+    def __init__(self, value: Any):
+        super().__init__()
+        self.value = value
+
+
+class Break(Exception):
+    """Leaves a loop."""
+
+
+class Continue(Exception):
+    """Goes on with the next turn of a loop."""
+
+
+class Raised(Exception):
+    """The program raised an error. `names` are those of its class and of the classes above it."""
+
+    def __init__(self, name: str, message: str):
+        super().__init__(f"the program raises {name}{': ' + message if message else ''}")
+        self.name = name
+
+
+def type_of(value: Any) -> Named:
+    """The type of a value, as a program sees it."""
+    if isinstance(value, Operand):
+        return Named("np.ndarray")
+    if isinstance(value, Instance):
+        return Named(value.cls.name)
+    names = {
+        Set: "set",
+        Iterator: "iterator",
+        Bound: "function",
+        Class: "type",
+        BatchSize: "int",
+        Named: "type",
+        Function: "function",
+    }
+    return Named(names.get(type(value), type(value).__name__))

@@ -1,0 +1,114 @@
+"""The graph: kinds and shapes of operations, what factors read, and graphs within graphs."""
+
+import numpy as np
+import pytest
+
+from lare.latent.function import entries_text
+from lare.phi.evaluate import evaluate
+from lare.phi.graph import UNLIMITED, Builder, Limits, Refused
+from lare.phi.read import read
+from phi.corpus import benign, steps, varied
+from toys import phi
+
+PROGRAMS = {p.name: p for p in (*benign()[:6], *varied()[::9])}
+
+
+def read_or_skip(program):
+    try:
+        return read(program.source, *program.sizes)
+    except Refused:
+        pytest.skip("it is refused")
+
+
+def test_equal_operations_are_added_once():
+    builder = Builder()
+    x = builder.input("x", (3,))
+    assert builder.elementwise("sin", x) == builder.elementwise("sin", x)
+
+
+def test_constants_are_folded():
+    builder = Builder()
+    total = builder.elementwise("add", builder.constant([1, 2]), builder.constant(3))
+    assert builder.nodes[total].option.tolist() == [4, 5]
+
+
+@pytest.mark.parametrize(
+    ("op", "kinds", "result"),
+    [
+        ("add", ("bool", "bool"), "bool"),
+        ("add", ("bool", "int"), "int"),
+        ("add", ("int", "float"), "float"),
+        ("divide", ("int", "int"), "float"),
+        ("power", ("int", "int"), "int"),
+        ("less", ("float", "int"), "bool"),
+        ("bitwise_and", ("bool", "bool"), "bool"),
+        ("bitwise_and", ("int", "bool"), "int"),
+        ("floor_divide", ("bool", "bool"), "int"),
+    ],
+)
+def test_kind_is_that_of_numpy(op, kinds, result):
+    builder = Builder()
+    inputs = [builder.input(f"x{i}", (2,), kind) for i, kind in enumerate(kinds)]
+    assert builder.nodes[builder.elementwise(op, *inputs)].kind == result
+
+
+def test_rearrangements_of_rearrangements_are_one_gather():
+    graph = read(phi("return [observation.reshape(-1, 2, 3).transpose(0, 2, 1)[:, 1, ::-1][:, :1]]"), 6, 1)
+    assert [node.op for node in graph.operations] == ["gather"]
+    assert graph.operations[0].option.slices == (slice(4, 5, 1),)
+
+
+@pytest.mark.parametrize(
+    "limits", [Limits(array=4), Limits(operations=3), Limits(chain=3), Limits(work=999), Limits(numbers=5)]
+)
+def test_limit_is_checked(limits):
+    builder = Builder(limits)
+
+    def build():
+        x = builder.input("x", (5,))
+        for _ in range(9):
+            x = builder.elementwise("sin", x)
+        builder.finish({"y": x})
+
+    with pytest.raises(Refused, match=r"at most|too much"):
+        build()
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_entries_that_are_not_read_do_not_matter(name):
+    program = PROGRAMS[name]
+    graph = read_or_skip(program)
+    observation, action = steps(program.sizes, rows=5)
+    factors = evaluate(graph, {"observation": observation, "action": action}, dtype=np.float64)["factors"]
+    for number, entries in enumerate(graph.entries_read("factors")):
+        changed = {}
+        for key, array in (("observation", observation), ("action", action)):
+            unread = np.setdiff1d(np.arange(array.shape[1]), entries[key])
+            changed[key] = array.copy()
+            changed[key][:, unread] = 7.3 - 2 * array[:, unread]
+        result = evaluate(graph, changed, dtype=np.float64)["factors"]
+        np.testing.assert_array_equal(result[:, number], factors[:, number])
+
+
+def test_entries_read_are_exact_through_whole_arrays():
+    source = "import numpy as np\n" + phi(
+        "x = np.tanh(observation * 2)\nsorted_x = np.sort(x[:, 4:], axis=1)\n"
+        "return [x[:, 2:3] + x[:, 5:6], sorted_x[:, :1] * action, np.where(x > 0, x, 1)[:, [0]]]"
+    )
+    texts = [entries_text(entries) for entries in read(source, 7, 1).entries_read("factors")]
+    assert texts == ["observation[2, 5]", "observation[4:7], action[0]", "observation[0]"]
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_inlined_graph_computes_each_of_several_rows(name):
+    program = PROGRAMS[name]
+    graph = read_or_skip(program)
+    observation, action = (array.reshape(4, 3, -1) for array in steps(program.sizes, rows=12))
+    builder = Builder(UNLIMITED)
+    inputs = {
+        key: builder.input(key, (3, size)) for key, size in zip(("observation", "action"), program.sizes, strict=True)
+    }
+    outer = builder.finish(builder.inline(graph, inputs, rows=3))
+    arrays = {"observation": observation, "action": action}
+    for_rows = evaluate(outer, arrays, dtype=np.float64)["factors"]
+    np.testing.assert_allclose(for_rows, evaluate(graph, arrays, dtype=np.float64)["factors"], rtol=1e-12, atol=1e-12)

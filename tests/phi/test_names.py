@@ -1,0 +1,100 @@
+"""Names and meanings of factors, as the source gives them."""
+
+import gc
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from lare.phi.names import factor_meanings, factor_names
+from toys import PHI, phi
+
+
+@pytest.mark.parametrize(
+    ("source", "count", "names"),
+    [
+        (PHI, 2, ["f_near", "f_effort"]),
+        (phi("return [-action, action]"), 2, ["factor_1", "action"]),
+        (phi("return (action, -action)"), 2, ["action", "factor_2"]),
+        (phi("factors = [action, -action]\nreturn factors"), 2, ["action", "factor_2"]),
+        (phi("factors = [action, observation]\nreturn [f[:, :1] for f in factors]"), 2, ["action", "observation"]),
+        # Where the list is not written out, or not once, or not at the end, or not as long, there are no names in it.
+        (phi("factors = [action]\nfactors = [action, -action]\nreturn factors"), 2, ["factor_1", "factor_2"]),
+        (phi("factors = [action]\nfactors.append(action)\nreturn factors"), 2, ["factor_1", "factor_2"]),
+        (phi("factors = [action]\nreturn [f for f in factors if True]"), 1, ["factor_1"]),
+        (phi("return [action] * 2"), 2, ["factor_1", "factor_2"]),
+        (phi("if True:\n    return [action]"), 1, ["factor_1"]),
+        (phi("return [x for x in (action, action)]"), 2, ["factor_1", "factor_2"]),
+        (phi("return action"), 1, ["factor_1"]),
+        (PHI, 3, ["factor_1", "factor_2", "factor_3"]),
+        (phi("return []"), 0, []),
+        ("x = 1", 1, ["factor_1"]),
+        ("not (Python", 1, ["factor_1"]),
+        # Another function's list is not this one's.
+        (
+            "def helper(a, b):\n    return [a, b]\n\n" + phi("return [observation, action]"),
+            2,
+            ["observation", "action"],
+        ),
+    ],
+)
+def test_factor_names(source, count, names):
+    assert factor_names(source, count) == names
+
+
+@pytest.mark.parametrize(
+    ("lines", "meaning"),
+    [
+        ("# how near", "how near"),
+        ("# 1. how near", "how near"),
+        ("#  12) how near", "how near"),
+        ("# Factor 3: how near", "how near"),
+        ("# how near it is,\n#   in metres", "how near it is, in metres"),
+        ("## how near", "how near"),
+        ("# something else\n\n# how near", "how near"),
+        ("# 3 metres", "3 metres"),
+        ("# factors of two", "factors of two"),
+    ],
+)
+def test_factor_meanings_comment_above_an_assignment(lines, meaning):
+    assert factor_meanings(phi(f"{lines}\nx = action\nreturn [x]"), ["x"]) == [meaning]
+
+
+def test_factor_meanings_of_other_comments():
+    source = phi("# not this one\n\nx = action\ny = action  # nor this\nx[0] = 1\n# nor that\nreturn [x, y]")
+    assert factor_meanings(source, ["x", "y"]) == ["", ""]
+
+
+def test_factor_meanings_of_the_last_assignment():
+    assert factor_meanings(phi("# first\nx = action\n# then\nx = -x\nreturn [x]"), ["x"]) == ["then"]
+
+
+def test_factor_meanings_of_several():
+    assert factor_meanings(PHI, ["f_near", "f_effort"]) == ["how near the action comes", "effort"]
+    assert factor_meanings(PHI, ["f_effort", "factor_2"]) == ["effort", ""]
+
+
+def test_factor_meanings_above_the_first_of_several_lines():
+    """Such a comment must be numbered."""
+    body = "# 1. how near\nd = action\nx = -d\n# 2. effort\ny = action\nz = x\n# not numbered\ne = x\nw = e\nreturn [x, y, z, w]"
+    assert factor_meanings(phi(body), ["x", "y", "z", "w"]) == ["how near", "effort", "", ""]
+
+
+def test_factor_names_in_threads():
+    """As several candidates are read. JAX has such a hook in the garbage collector too."""
+    source = phi("\n".join(["action = action + (1 + (2 + (3 + (4 + action))))"] * 20) + "\nreturn [action]")
+    usual = gc.get_threshold()
+    threads = ThreadPoolExecutor(8)
+
+    def let_another_go_on(phase, info):
+        time.sleep(0)
+
+    gc.callbacks.append(let_another_go_on)
+    gc.set_threshold(5)
+    try:
+        names = list(threads.map(lambda _: factor_names(source, 1), range(200)))
+    finally:
+        gc.set_threshold(*usual)
+        gc.callbacks.remove(let_another_go_on)
+        threads.shutdown()
+    assert names == [["action"]] * 200

@@ -1,0 +1,43 @@
+"""The ONNX model of a graph gives the numbers of the graph."""
+
+import numpy as np
+import onnxruntime
+import pytest
+
+from lare.phi.evaluate import evaluate
+from lare.phi.graph import Refused
+from lare.phi.onnx import onnx_model
+from lare.phi.read import read
+from phi.corpus import benign, recorded, steps, varied
+from phi.test_numpy_functions import CASES, SETUP
+from tiers import long
+
+PROGRAMS = {p.name: p for p in (*benign(), *varied(), *recorded())}
+IN_SHORT = {*[p.name for p in varied()[::12]], *[p.name for p in recorded()[::80]]}
+EXPRESSIONS = [case.values[0].replace("¦", "|") for case in CASES]
+
+
+def check_same(graph, sizes):
+    session = onnxruntime.InferenceSession(
+        onnx_model(graph, "phi").SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    inputs = dict(zip(("observation", "action"), steps(sizes, rows=7, dtype=np.float32), strict=True))
+    (factors,) = session.run(["factors"], inputs)
+    expected = evaluate(graph, inputs)["factors"]
+    np.testing.assert_allclose(factors, expected, rtol=2e-3, atol=2e-4)
+
+
+@pytest.mark.parametrize("name", [name if name in IN_SHORT else long(name) for name in PROGRAMS])
+def test_model_agrees_with_graph(name):
+    program = PROGRAMS[name]
+    try:
+        graph = read(program.source, *program.sizes)
+    except Refused:
+        pytest.skip("it is refused")
+    check_same(graph, program.sizes)
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS[::3])
+def test_function_can_be_written(expression):
+    graph = read(SETUP.format(expression, 1).replace("np.arange(1, 1 + 1)", "1"), 6, 3)
+    check_same(graph, (6, 3))
