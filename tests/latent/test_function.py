@@ -122,7 +122,7 @@ def test_the_digest_is_the_sources(function):
 
 
 def test_null(chase):
-    with pytest.raises(LareError, match=r"E-SYNTAX: line 2 has '\\x00', a character that no reader sees"):
+    with pytest.raises(LareError, match=r"E-SYNTAX line 2: '\\x00' is a character that no reader sees"):
         verified(phi("return [action]") + "\0", chase)
 
 

@@ -29,7 +29,7 @@ RECORDED = [name if name.startswith("reward/") and "draw0" in name else long(nam
             "import os\n" + phi("return [action, np.two(3)]"),
             ["E-IMPORT line 1: import os", "E-NUMPY line 3: np.two"],
         ),
-        ("(" * 41, ["E-SYNTAX: line 1: "]),
+        ("(" * 41, ["E-SYNTAX line 1: "]),
         ("X = [1][1:][0]\n" + phi("return [action]"), ["E-RUN line 1: IndexError: list index out of range"]),
         (phi("return [no_idea]"), ["E-RUN line 2: no_idea is not defined"]),
         (phi("while True: pass\nreturn [action]"), ["E-COST line 2: "]),

@@ -48,6 +48,12 @@ def varied() -> list[Program]:
 
 
 @cache
+def mended() -> list[dict[str, str]]:
+    """Refused programs of `varied`: the errors, and what a language model made of the program when it saw them."""
+    return json.loads((HERE / "mended.json").read_text(encoding="utf-8"))
+
+
+@cache
 def recorded() -> list[Program]:
     """Every function in the shipped recordings."""
     programs = []

@@ -8,7 +8,7 @@ import pytest
 from lare.phi.evaluate import evaluate
 from lare.phi.graph import Refused
 from lare.phi.read import read
-from phi.corpus import benign, execute, recorded, steps, varied
+from phi.corpus import benign, execute, mended, recorded, steps, varied
 from tiers import long
 
 REFUSED = {
@@ -67,3 +67,14 @@ def test_program_is_refused(name):
     program = next(p for p in varied() if p.name == name)
     with pytest.raises(Refused, match=r"^E-[A-Z]+ line \d+: "):
         read(program.source, *program.sizes)
+
+
+@pytest.mark.parametrize("name", [entry["name"] for entry in mended()])
+def test_refusal_was_enough_to_mend_the_program(name):
+    """A language model that saw a refused program and the errors, and nothing else, wrote `mended.json`, each at the first try."""
+    entry = next(entry for entry in mended() if entry["name"] == name)
+    program = next(p for p in varied() if p.name == name)
+    graph = read(entry["code"], *program.sizes)
+    observation, action = steps(program.sizes)
+    factors = evaluate(graph, {"observation": observation, "action": action}, dtype=np.float64)["factors"]
+    check_equal(factors, execute(program.source, observation, action), 1e-6)

@@ -54,7 +54,7 @@ class BatchSize:
         return BatchSize(factor) if factor > 0 and not rest else self.refuse()
 
     def refuse(self, *_: Any) -> Never:
-        raise Refused("E-ROWS", "a factor cannot depend on the number of rows, and no loop can go over the rows")
+        raise Refused("E-ROWS", "a factor cannot depend on the number of rows, and no loop can go over them: compute with columns, x[:, i]")
 
     def __hash__(self) -> int:
         return hash(self.factor)
