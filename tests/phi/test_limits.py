@@ -84,13 +84,43 @@ ATTACKS = {
     "doubling graph": phi("x = observation\nfor i in range(400):\n    x = x * x + x[:, ::-1]\nreturn [x[:, :1]]"),
     "polynomial": NUMPY + phi("return [np.polyval(np.ones(5000), observation[:, :1])]"),
     "quantiles": NUMPY + phi("return [np.quantile(observation, np.linspace(0, 1, 9999), axis=1)]"),
+    # Found by a reviewer.
+    "overflowing repetitions": NUMPY + "x = np.repeat(np.zeros(4), np.array([2 ** 62] * 4))",
+    "negative payment": NUMPY + "itertools.repeat(0, -10 ** 15)\nwhile True:\n    pass",
+    "raised doubling list": "s = []\nfor i in range(60):\n    s = [s, s]\nraise ValueError(s)",
+    "sorted by doubling lists": "s = [1, 1]\nfor i in range(60):\n    s = [s, s]\nsorted([0, 1], key=lambda i: s)",
+    "refusals within hasattr": NUMPY
+    + "class A:\n    @property\n    def p(self):\n        return np.linalg.inv(np.eye(256))\n"
+    + "for i in range(9999):\n    hasattr(A(), 'p')",
+    "misspelled names": NUMPY + "for i in range(9999):\n    hasattr(np, 'linalgx')",
+    "eigenvalues": NUMPY + "for i in range(99):\n    np.linalg.eigvalsh(np.eye(256))",
+    "polynomials": NUMPY + "x = np.polymul(np.ones(30000), np.ones(30000))",
+    "chebyshev": NUMPY + "x = np.polynomial.chebyshev.chebval(np.zeros(1), np.ones(60000))",
+    "unravel": NUMPY + "x = np.unravel_index(3, [2 ** 62] * 9000)",
+    "long keys": "t = (1,) * 9900\nfor i in range(9000):\n    {t}",
+    "copied views": NUMPY
+    + phi(
+        "x = np.zeros((len(observation), 900))\nv = x[:, 9:]\nfor i in range(4000):\n    v.copy()\nreturn [v[:, :1]]"
+    ),
+    "text of rows": phi("return ['%999999999s' % len(observation)]"),
+    "product of texts": NUMPY + "x = math.prod([10 ** 9], start='a')",
+    "lists of arrays": NUMPY + "x = [np.zeros(60000).tolist() for i in range(3000)]",
+    "long tuples": NUMPY + "x = list(itertools.product(*[[1]] * 1500, [0, 1], repeat=13))",
+    "indices of a matrix": NUMPY + "x = np.tril_indices(2, 0, 500000000)",
+    "covariance": NUMPY + "x = np.cov(np.zeros((1, 1)), np.zeros((15000, 1)))",
+    "text of long texts": "s = ['a' * 9000] * 9000\nx = str(s)",
+    "many letters": NUMPY + phi("return [np.einsum('b1->b', observation)]"),
+    "many axes": NUMPY + phi("return [np.sin(observation.reshape((-1,) + (1,) * 32 + (17,)))]"),
+    "large product": NUMPY + phi("return [np.einsum('bi,bj,bk,bl->b', *[observation] * 4)[:, None]]"),
+    "first row": NUMPY + phi("return [np.repeat(observation[0, 0][None, None], len(observation), axis=0)]"),
 }
 
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attack_is_refused(name):
-    with pytest.raises(Refused):
+    with pytest.raises(Refused) as refusal:
         read(ATTACKS[name], 17, 6)
+    assert refusal.value.code != "E-BUG"
 
 
 @pytest.mark.parametrize("name", list(ATTACKS)[:16])
@@ -119,3 +149,21 @@ def test_refusal_cannot_be_caught():
     )
     with pytest.raises(Refused, match="E-ROWS"):
         read(source, 17, 6)
+
+
+def test_program_sees_no_address():
+    source = """import numpy as np
+
+class A:
+    pass
+
+try:
+    raise ValueError(np.zeros(3), A(), len, lambda: 0)
+except ValueError as error:
+    text = str(error)
+assert "0x" not in text + str(A()) + str([A]) + repr(len) + f"{A}"
+
+def evaluation_func(observation, action):
+    return [action[:, :1]]
+"""
+    assert read(source, 17, 6).factor_count == 1

@@ -54,7 +54,10 @@ class BatchSize:
         return BatchSize(factor) if factor > 0 and not rest else self.refuse()
 
     def refuse(self, *_: Any) -> Never:
-        raise Refused("E-ROWS", "a factor cannot depend on the number of rows, and no loop can go over them: compute with columns, x[:, i]")
+        raise Refused(
+            "E-ROWS",
+            "a factor cannot depend on the number of rows, and no loop can go over them: compute with columns, x[:, i]",
+        )
 
     def __hash__(self) -> int:
         return hash(self.factor)
@@ -78,6 +81,12 @@ class Operand:
 
     __array_ufunc__ = None
     __hash__ = object.__hash__
+
+    def __repr__(self) -> str:
+        return "<array>"
+
+    def __bool__(self) -> bool:
+        raise Refused("E-FLOW", "a condition that differs from row to row: use np.where instead of if")
 
     __add__, __radd__ = _binary("add")
     __sub__, __rsub__ = _binary("subtract")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import functools
 import math
 from collections.abc import Iterator as Iterate
 from typing import TYPE_CHECKING, Any
@@ -128,11 +129,11 @@ def attribute(interpreter: Interpreter, owner: Any, name: str) -> Any:
         case Named(module):
             return module_attribute(module, name)
         case Array():
-            return array_attribute(owner, name)
+            return array_attribute(interpreter, owner, name)
         case Complex() if name in ("real", "imag"):
             return getattr(owner, name)
         case Complex() if name in ("shape", "ndim", "size"):
-            return array_attribute(owner.real, name)
+            return array_attribute(interpreter, owner.real, name)
         case Complex():
             return Bound(lambda *args, **kwargs: call_with_complex(name, [owner, *args], kwargs))
         case complex() if name in ("real", "imag"):
@@ -186,8 +187,10 @@ def module_attribute(module: str, name: str) -> Any:
     raise Refused("E-ATTRIBUTE", f"{full[:80]} is not available{hint(full)}")
 
 
+@functools.lru_cache(maxsize=256)
 def hint(full: str) -> str:
     """What to write instead of a name that is not available."""
+    full = full[:80]
     if full in HINTS:
         return f": {HINTS[full]}"
     names = [f"np.{name}" for name in FUNCTIONS] + list(python_functions.BUILTINS)
@@ -195,7 +198,7 @@ def hint(full: str) -> str:
     return f": is {near[0]} meant?" if near else ""
 
 
-def array_attribute(array: Array, name: str) -> Any:
+def array_attribute(interpreter: Interpreter, array: Array, name: str) -> Any:
     match name:
         case "shape" | "ndim":
             return getattr(array, name)
@@ -208,11 +211,11 @@ def array_attribute(array: Array, name: str) -> Any:
         case "dtype":
             return Named({"float": "np.float32", "int": "np.int64", "bool": "np.bool_"}[array.kind])
         case "flat":
-            return list(call_numpy("ravel", [array], {}))
+            return list(interpreter.items(call_numpy("ravel", [array], {})))
         case "item":
             return Bound(lambda *index: (array[index] if index else array).number())
         case "tolist":
-            return Bound(lambda: _constant(array).tolist())
+            return Bound(lambda: _to_list(interpreter, array))
         case "fill":
             return Bound(lambda value: array.__setitem__(..., value))
         case "sort":
@@ -230,10 +233,12 @@ def _refuse_view() -> None:
     raise Refused("E-ATTRIBUTE", ".view of another type is not available: use astype")
 
 
-def _constant(array: Array) -> np.ndarray:
-    if array.constant is None:
+def _to_list(interpreter: Interpreter, array: Array) -> Any:
+    values = array.constant
+    if values is None:
         raise Refused("E-FLOW", "numbers that differ from row to row cannot become a list: compute with the array")
-    return array.constant
+    interpreter.meter.pay_for_list(values.size)
+    return values.tolist()
 
 
 def array_method(array: Array, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:

@@ -23,13 +23,16 @@ def make_class(interpreter: Interpreter, statement: ast.ClassDef, scope: Scope) 
     """The class of a definition."""
     bases = [interpreter.evaluate(base, scope) for base in statement.bases]
     own = [base for base in bases if isinstance(base, Class)]
-    names = {str(base) for base in bases if not isinstance(base, Class)}
+    names = {
+        base.name if isinstance(base, Named) else "that is no class" for base in bases if not isinstance(base, Class)
+    }
     if not names <= BASES:
         raise Refused("E-PYTHON", f"a class cannot have the base {min(names - BASES)[:60]}")
     body = Scope(scope.closure, "class")
     interpreter.run(statement.body, body)
     fields = body.pop("__annotations__", [])
-    above = [*own, *(base for cls in own for base in cls.bases)]
+    above = list(dict.fromkeys([*own, *(base for cls in own for base in cls.bases)]))
+    interpreter.meter.pay(len(above))
     cls = Class(statement.name, dict(body), above, fields, "typing.NamedTuple" in names)
     for value in cls.attributes.values():
         if isinstance(value, Function):

@@ -112,7 +112,7 @@ for _name, _function in _OPERATIONS.items():
 COMPLEX_OPERATIONS["power"] = _power
 
 COMPLEX_FUNCTIONS: dict[str, Callable[..., Any]] = {
-    **{name: lambda *x, op=name, **_: COMPLEX_OPERATIONS[op](*x) for name in COMPLEX_OPERATIONS},
+    **COMPLEX_OPERATIONS,
     "absolute": lambda x: COMPLEX_OPERATIONS["abs"](x),
     "square": lambda x: _multiply(as_complex(x), as_complex(x)),
     "real": lambda x: as_complex(x).real,

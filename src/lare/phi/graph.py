@@ -75,6 +75,7 @@ class Limits:
 
     array: int = 1 << 16
     """The most numbers of one array, for each row."""
+    axes: int = 16
     operations: int = 1000
     chain: int = 400
     """The most operations that need each other's results."""
@@ -85,7 +86,7 @@ class Limits:
 
 
 OPERATION_COST = 200
-UNLIMITED = Limits(*[2**62] * 5)
+UNLIMITED = Limits(*[2**62] * 6)
 """For graphs that LaRe itself builds."""
 
 
@@ -142,8 +143,19 @@ class Graph:
 
     @property
     def size(self) -> int:
-        """How many numbers its operations compute for each row."""
-        return sum(math.prod(node.shape) for node in self.operations)
+        """How many numbers its operations compute for each row; products of arrays count all their terms."""
+        return sum(self._cost(node) for node in self.operations)
+
+    def _cost(self, node: Node) -> int:
+        if node.op != "einsum":
+            return math.prod(node.shape)
+        terms = node.option.partition("->")[0].replace("...", "").split(",")
+        sizes = {
+            c: n
+            for term, i in zip(terms, node.inputs, strict=True)
+            for c, n in zip(term, self.nodes[i].shape, strict=True)
+        }
+        return math.prod(sizes.values())
 
     @property
     def depth(self) -> int:
@@ -244,7 +256,9 @@ class Builder:
         return self._indices[key]
 
     def check_size(self, shape: Sequence[int]) -> int:
-        """Return how many numbers an array of this shape has. Raises `Refused` for none, or for too many."""
+        """Return how many numbers an array of this shape has. Raises `Refused` for none, or for too many numbers or axes."""
+        if len(shape) > self.limits.axes:
+            raise Refused("E-COST", f"an array of {len(shape)} axes: at most {self.limits.axes} are available")
         size = math.prod(shape)
         if size > self.limits.array:
             raise Refused(
@@ -362,6 +376,7 @@ class Builder:
     def gather(self, x: int, positions: np.ndarray) -> int:
         """An array of the numbers at fixed positions of another."""
         node = self.nodes[x]
+        self.spend(positions.size)
         if node.op in ROW_OPS:
             return self.add(node.op, (), positions.shape, node.kind)
         if node.op == "constant":
@@ -404,7 +419,13 @@ class Builder:
             for letter, size in zip(term, self.nodes[i].shape, strict=True):
                 if sizes.setdefault(letter, size) != size:
                     raise ValueError(f"a product of axes of lengths {sizes[letter]} and {size}")
+        self.check_size(list(sizes.values())[:16])
         self.spend(math.prod(sizes.values()))
+        letters = dict(zip(sizes, string.ascii_letters, strict=False))  # a, b, c ..., so that others are free
+        if len(sizes) > 20:
+            raise Refused("E-COST", "np.einsum with more than 20 letters")
+        terms, result = ["".join(letters[c] for c in term) for term in terms], "".join(letters[c] for c in result)
+        sizes = {letters[c]: size for c, size in sizes.items()}
         kind = widest([self.nodes[i].kind for i in inputs] + ["int"])
         pattern = ",".join("..." + term for term in terms) + "->..." + result
         shape = tuple(sizes[letter] for letter in result)
@@ -429,6 +450,8 @@ class Builder:
             node, inputs = self.nodes[old], tuple(new_index[i] for i in self.nodes[old].inputs)
             option = _gather(node.option, nodes[inputs[0]].shape) if node.op == "gather" else node.option
             nodes.append(node._replace(inputs=inputs, option=option))
+            if node.op in ROW_OPS:
+                raise Refused("E-ROWS", ROW_OPS[node.op])
         graph = Graph(tuple(nodes), {name: new_index[i] for name, i in outputs.items()})
         if graph.size > self.limits.numbers:
             most = self.limits.numbers

@@ -264,7 +264,7 @@ class Interpreter:
             if handler is None:
                 raise
             if handler.name is not None:
-                scope.assign(handler.name, str(error)[:200])
+                scope.assign(handler.name, error.message if isinstance(error, Raised) else type(error).__name__)
             self.run(handler.body, scope)
         else:
             self.run(statement.orelse, scope)
@@ -273,12 +273,11 @@ class Interpreter:
         if handler.type is None:
             return True
         names = self.evaluate(handler.type, scope)
+        names = [name.name for name in (names if isinstance(names, tuple) else (names,)) if isinstance(name, Named)]
         classes = [cls.__name__ for cls in type(error).__mro__]
         if isinstance(error, Raised):
             classes = python_functions.ERRORS.get(error.name, [error.name, "Exception"])
-        return any(
-            str(name).rpartition(".")[2] in classes for name in (names if isinstance(names, tuple) else (names,))
-        )
+        return any(name.rpartition(".")[2] in classes for name in names)
 
     def check(self, test: ast.expr, message: ast.expr | None, scope: Scope) -> None:
         """Carry out `assert`. A condition that differs from row to row is left out, as under `python -O`."""
@@ -289,16 +288,23 @@ class Interpreter:
                 raise
             return
         if not passed:
-            raise Raised("AssertionError", str(self.evaluate(message, scope))[:200] if message is not None else "")
+            raise Raised("AssertionError", "" if message is None else self.shown(self.evaluate(message, scope)))
 
     def raise_error(self, error: ast.expr | None, scope: Scope) -> None:
         name, message = "Exception", ""
         if isinstance(error, ast.Call):
-            message = " ".join(str(self.evaluate(x, scope))[:200] for x in error.args if not isinstance(x, ast.Starred))
+            message = " ".join(
+                self.shown(self.evaluate(x, scope)) for x in error.args if not isinstance(x, ast.Starred)
+            )
             error = error.func
         if error is not None:
-            name = str(self.evaluate(error, scope))[:50]
+            value = self.evaluate(error, scope)
+            name = value.name if isinstance(value, (Named, Class)) else name
         raise Raised(name, message)
+
+    def shown(self, value: Any) -> str:
+        """A value in a message."""
+        return formatted(self.meter, value, "")[:200]
 
     def scope_with(self, name: str, scope: Scope | None) -> Scope:
         while scope is not None and name not in scope:
@@ -371,7 +377,10 @@ class Interpreter:
                 turns = self.turns(generators, scope)
                 return {as_key(self.evaluate(key, inner)): self.evaluate(value, inner) for inner in turns}
             case ast.JoinedStr(values=values):
-                return checked_text("".join(str(self.evaluate(value, scope)) for value in values))
+                text = ""
+                for value in values:
+                    text = checked_text(text + self.evaluate(value, scope))
+                return text
             case ast.FormattedValue(value=value, conversion=_, format_spec=spec):
                 format_spec = "" if spec is None else self.evaluate(spec, scope)
                 return formatted(self.meter, self.evaluate(value, scope), format_spec)
@@ -433,6 +442,8 @@ class Interpreter:
                 *(value if isinstance(value, (Operand, int, complex)) else as_array(value) for value in (x, y))
             )
         if isinstance(x, BatchSize) or isinstance(y, BatchSize):
+            if not isinstance(x, (int, float, BatchSize)) or not isinstance(y, (int, float, BatchSize)):
+                raise TypeError(f"the number of rows and a {_type_name(x if isinstance(y, BatchSize) else y)}")
             return function(x, y)
         if isinstance(x, NUMBERS) and isinstance(y, NUMBERS):
             if isinstance(x, int) and isinstance(y, int) and name in ("pow", "lshift"):
@@ -512,6 +523,7 @@ class Interpreter:
             if not isinstance(more, dict) or not all(isinstance(key, str) for key in more):
                 raise TypeError("** needs a dictionary whose keys are texts")
             kwargs |= more
+            self.meter.pay(len(more))
         self.line = self.builder.line = node.lineno
         return self.call(function, args, kwargs)
 

@@ -16,7 +16,7 @@ import numpy as np
 from lare.phi.arrays import Array, BatchSize, Operand, as_array
 from lare.phi.graph import Refused
 from lare.phi.numpy_functions import call_numpy
-from lare.phi.numpy_functions.registry import KIND_OF_DTYPE, astype
+from lare.phi.numpy_functions.registry import KIND_OF_DTYPE, astype, dtype_name, kind_of
 from lare.phi.text import formatted
 from lare.phi.values import (
     LONGEST_LIST,
@@ -29,6 +29,7 @@ from lare.phi.values import (
     Set,
     as_key,
     checked_number,
+    checked_text,
     type_of,
 )
 
@@ -105,7 +106,12 @@ _extreme("min", min)
 
 
 def _key_function(interpreter: Interpreter, key: Any) -> Callable[[Any], Any] | None:
-    return None if key is None else lambda item: interpreter.call(key, [item], {})
+    def sort_key(item: Any) -> Any:
+        value = interpreter.call(key, [item], {})
+        interpreter.meter.pay_for_all_within([value])
+        return value
+
+    return None if key is None else sort_key
 
 
 @builtin("sorted")
@@ -150,17 +156,21 @@ def _math(name: str) -> None:
                 "E-FLOW", f"math.{name} takes one number, not an array: use np.{SAME_IN_NUMPY.get(name, name)}"
             )
         plain = [
-            x if isinstance(x, int) else [*interpreter.items(x)] if isinstance(x, (list, tuple)) else float(x)
+            [float(item) for item in interpreter.items(x)]
+            if isinstance(x, (list, tuple))
+            else x
+            if isinstance(x, int)
+            else float(x)
             for x in args
         ]
-        return checked_number(getattr(math, name)(*plain, **kwargs))
+        return checked_number(getattr(math, name)(*plain, **{key: float(x) for key, x in kwargs.items()}))
 
     builtin(f"math.{name}")(of_numbers)
 
 
 for _name in (
     "acos acosh asin asinh atan atan2 atanh ceil copysign cos cosh degrees erf erfc exp expm1 fabs floor fmod gamma hypot isfinite "
-    "isinf isnan isclose lgamma log log10 log1p log2 modf pow radians sin sinh sqrt tan tanh trunc remainder dist prod gcd lcm"
+    "isinf isnan isclose lgamma log log10 log1p log2 modf pow radians sin sinh sqrt tan tanh trunc remainder dist gcd lcm"
 ).split():
     _math(_name)
 
@@ -227,8 +237,15 @@ def next_(_: Interpreter, iterator: Any, *default: Any) -> Any:
     return iterator.pop(0) if iterator else default[0]
 
 
+def _operator(op: type[ast.operator]) -> Callable[..., Any]:
+    return lambda interpreter, x, y: interpreter.binary(op(), x, y)
+
+
 BUILTINS |= {
     "abs": lambda _, x: abs(x),
+    "math.prod": lambda interpreter, values, start=1: functools.reduce(
+        lambda x, y: interpreter.binary(ast.Mult(), x, y), interpreter.items(values), start
+    ),
     "pow": lambda interpreter, x, y: interpreter.binary(ast.Pow(), x, y),
     "bool": lambda interpreter, x=False: interpreter.truth(x),
     "all": lambda interpreter, values: all(map(interpreter.truth, interpreter.items(values))),
@@ -267,13 +284,16 @@ BUILTINS |= {
         default if default_factory is None else interpreter.call(default_factory, [], {})
     ),
     **{
-        f"operator.{name}": lambda interpreter, x, y, op=op: interpreter.binary(op(), x, y)
+        f"operator.{name}": _operator(op)
         for name, op in {
             "add": ast.Add, "sub": ast.Sub, "mul": ast.Mult, "truediv": ast.Div, "floordiv": ast.FloorDiv, "mod": ast.Mod,
             "pow": ast.Pow, "and_": ast.BitAnd, "or_": ast.BitOr, "xor": ast.BitXor, "matmul": ast.MatMult,
         }.items()
     },
-    **{name: lambda _, *message: " ".join(map(str, message))[:200] for name in ERRORS},
+    **{
+        name: lambda interpreter, *message: " ".join(formatted(interpreter.meter, x, "") for x in message)[:200]
+        for name in ERRORS
+    },
 }  # fmt: skip
 
 
@@ -281,7 +301,8 @@ def _itertool(name: str, count: Callable[..., int]) -> None:
     """A function of itertools, whose results are counted and paid for first."""
 
     def results(interpreter: Interpreter, *args: Any, **kwargs: Any) -> Iterator:
-        if any(isinstance(x, int) and x > 20 for x in (*args, *kwargs.values())) and name not in ("islice", "repeat"):
+        many = len(args) > 20 or any(isinstance(x, int) and x > 20 for x in (*args, *kwargs.values()))
+        if many and name not in ("chain", "islice", "repeat"):
             raise Refused("E-COST", f"itertools.{name} of more than 20 entries at a time")
         plain = [x if isinstance(x, int) or x is None else list(interpreter.items(x)) for x in args]
         interpreter.meter.pay_for_list(min(count(*plain, **kwargs), LONGEST_LIST + 1))
@@ -295,10 +316,10 @@ _itertool("pairwise", len)
 _itertool("combinations", lambda x, r: math.comb(len(x), r) * max(r, 1))
 _itertool("combinations_with_replacement", lambda x, r: math.comb(len(x) + r, r) * max(r, 1))
 _itertool("permutations", lambda x, r=None: math.perm(min(len(x), 30), r) * 20)
-_itertool("product", lambda *x, repeat=1: math.prod(map(len, x)) ** operator.index(repeat))
+_itertool("product", lambda *x, repeat=1: math.prod(map(len, x)) ** operator.index(repeat) * (len(x) * repeat or 1))
 _itertool("islice", lambda x, *ends: len(x))
-_itertool("repeat", lambda x, times: times)
-_itertool("zip_longest", lambda *x, fillvalue=None: sum(map(len, x)))
+_itertool("repeat", lambda x, times: max(times, 0))
+_itertool("zip_longest", lambda *x, fillvalue=None: len(x) * max(map(len, x)))
 
 
 @builtin("np.ndindex")
@@ -329,14 +350,21 @@ def isinstance_(_: Interpreter, value: Any, kinds: Any) -> bool:
     wanted = kinds if isinstance(kinds, tuple) else (kinds,)
     if isinstance(value, Instance):
         return any(cls in wanted for cls in (value.cls, *value.cls.bases)) or Named("object") in wanted
-    own = str(type_of(value))
-    return any(str(kind) in (own, "object", *_ABOVE.get(own, ())) for kind in wanted)
+    own = type_of(value).name
+    names = (own, "object", *_ABOVE.get(own, ()))
+    return any(isinstance(kind, Named) and kind.name in names for kind in wanted)
 
 
 @builtin("hasattr")
 def hasattr_(interpreter: Interpreter, value: Any, name: str) -> bool:
+    """Whether there is an attribute. No code of the program is carried out to find out."""
+    interpreter.meter.pay(len(name) + 100)
+    if isinstance(value, Instance):
+        return name in value.attributes or value.cls.has(name) or value.cls.has("__getattr__")
+    if isinstance(value, Class):
+        return value.has(name)
     try:
-        interpreter.attribute(value, str(name))
+        interpreter.attribute(value, name)
     except (Refused, AttributeError):
         return False
     return True
@@ -346,37 +374,36 @@ def hasattr_(interpreter: Interpreter, value: Any, name: str) -> bool:
 def getattr_(interpreter: Interpreter, value: Any, name: str, *default: Any) -> Any:
     if default and not hasattr_(interpreter, value, name):
         return default[0]
-    return interpreter.attribute(value, str(name))
+    return interpreter.attribute(value, checked_text(name))
 
 
 @builtin("np.finfo", "np.iinfo")
 def finfo(_: Interpreter, dtype: Any) -> Any:
-    name = str(dtype).removeprefix("np.")
-    kind = KIND_OF_DTYPE[name]
-    if kind == "int":
+    name = dtype_name(dtype)
+    if kind_of(dtype) == "int":
         return np.iinfo(np.int32 if "32" in name else np.int64)
     return np.finfo(np.float64 if name in ("float", "float64", "double", "f8") else np.float32)
 
 
 @builtin("np.issubdtype")
 def issubdtype(_: Interpreter, dtype: Any, kind: Any) -> bool:
-    names = [str(name).removeprefix("np.") for name in (dtype, kind)]
+    names = [dtype_name(dtype), dtype_name(kind)]
     return names[1] in ("number", "generic") or KIND_OF_DTYPE.get(names[0]) == KIND_OF_DTYPE.get(names[1], "")
+
+
+def _conversion(name: str) -> Callable[..., Any]:
+    return lambda _, x=0: astype(x, name)
 
 
 BUILTINS |= {
     "type": lambda _, value: value.cls if isinstance(value, Instance) else type_of(value),
     "object": lambda _: Instance(Class("object", {})),
-    "callable": lambda _, value: isinstance(value, (Function, Bound, Class)) or str(value) in BUILTINS,
-    "np.dtype": lambda _, dtype: Named(f"np.{str(dtype).removeprefix('np.')}"),
+    "callable": lambda _, value: isinstance(value, (Function, Bound, Class)) or getattr(value, "name", "") in BUILTINS,
+    "np.dtype": lambda _, dtype: Named(f"np.{dtype_name(dtype)}") if kind_of(dtype) else None,
     "np.isscalar": lambda _, value: isinstance(value, (*NUMBERS, str)),
     "np.vectorize": lambda interpreter, function, *_, **__: Bound(
         lambda *args, **kwargs: interpreter.call(function, [as_array(x) for x in args], kwargs)
     ),
-    **{
-        f"np.{name}": lambda _, x=0, name=name: astype(x, name)
-        for name in KIND_OF_DTYPE
-        if name.isidentifier() and len(name) > 2
-    },
+    **{f"np.{name}": _conversion(name) for name in KIND_OF_DTYPE if name.isidentifier() and len(name) > 2},
 }
 BUILTINS["np.frompyfunc"] = BUILTINS["np.vectorize"]

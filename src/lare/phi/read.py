@@ -5,6 +5,7 @@ evaluate(graph, {"observation": observation, "action": action})["factors"]
 """
 
 import ast
+import warnings
 
 from lare.phi.arrays import Array
 from lare.phi.attributes import module_attribute
@@ -32,7 +33,8 @@ def read(source: str, observation_size: int, action_size: int, most_factors: int
     builder, tree = Builder(), None
     interpreter = Interpreter(builder, has_yield="yield" in source)
     try:
-        with building(builder):
+        with building(builder), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             tree = parse(source)
             interpreter.run(tree.body, interpreter.module)
             return _graph(interpreter, observation_size, action_size, most_factors)
@@ -45,9 +47,11 @@ def read(source: str, observation_size: int, action_size: int, most_factors: int
         line = interpreter.line
     except (RecursionError, MemoryError):
         code, message, line = "E-COST", "the code is nested too deeply", interpreter.line
+    except Exception as error:  # no text may stop the process that reads it
+        code, message, line = "E-BUG", f"an error of LaRe, please report it: {_message(error)}", interpreter.line
     first = f"{code} line {line}: {' '.join(message[:LONGEST_MESSAGE].split())}"
     further = [] if tree is None else _unavailable_names(tree, interpreter.module)
-    raise Refused(code, "\n".join(dict.fromkeys([first, *further[:MOST_MESSAGES]])), line) from None
+    raise Refused(code, "\n".join(dict.fromkeys([first, *further])), line) from None
 
 
 def _message(error: Exception) -> str:
@@ -72,6 +76,8 @@ def _unavailable_names(tree: ast.Module, module: Scope) -> list[str]:
                 owner = module_attribute(owner.name, name) if isinstance(owner, Named) else None
         except Refused as refusal:
             messages.append(f"{refusal.code} line {node.lineno}: {refusal}")
+            if len(messages) == MOST_MESSAGES:
+                break
     return messages
 
 

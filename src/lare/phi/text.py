@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 FORMAT = re.compile(r"[<>^=]?[-+ ]?#?0?\d{0,2}[,_]?(\.\d{1,2})?[bdeEfFgGnosxX%]?")
 """Format specifications of bounded width."""
-PERCENT = re.compile(r"%(%|[-+ #0]*\d{0,2}(\.\d{1,2})?[sdifeEgGr])")
+PERCENT = re.compile(r"%(%|[-+ #0]*\d{0,2}(\.\d{1,2})?[sdifeEgG])")
 
 TEXT_METHODS = frozenset(
     "upper lower strip lstrip rstrip split rsplit startswith endswith title capitalize isdigit isalpha removeprefix removesuffix "
@@ -39,7 +39,15 @@ def formatted(meter: Meter, value: Any, spec: str) -> str:
         raise Refused("E-PYTHON", f"the format {spec[:40]!r} is not available")
     if isinstance(value, (bool, int, float, str)):
         return checked_text(format(value, spec))
+    checked_text(" " * min(_text_length(value), LONGEST_TEXT + 1))
     return checked_text(str(value)) if _is_plain(value) else f"<{type_of(value)}>"
+
+
+def _text_length(value: Any) -> int:
+    """About how long the text of a value is."""
+    if isinstance(value, (list, tuple)):
+        return sum(map(_text_length, value))
+    return 4 * len(value) if isinstance(value, str) else 4
 
 
 def _is_plain(value: Any) -> bool:
@@ -66,6 +74,8 @@ def combined(meter: Meter, name: str, x: Any, y: Any) -> Any:
         return Set({key: None for key in (x | y if name in ("or", "xor") else x) if keep(key)})
     if name == "mod" and isinstance(x, str):
         values = y if isinstance(y, tuple) else (y,)
+        texts = sum(len(value) for value in values if isinstance(value, str))
+        checked_text(" " * min(len(x) + texts + 100 * len(values), LONGEST_TEXT + 1))
         if "%" in PERCENT.sub("", x) or not all(isinstance(value, (bool, int, float, str)) for value in values):
             raise Refused("E-PYTHON", "this format is not available: use an f-string")
         return checked_text(x % values)
@@ -108,6 +118,7 @@ def _format_fields(interpreter: Interpreter, text: str, args: Sequence[Any], kwa
             value = args[int(field or number)] if field.isdigit() or not field else kwargs[field]
             number += not field
             pieces.append(formatted(interpreter.meter, value, spec or ""))
+            checked_text(" " * min(sum(map(len, pieces)), LONGEST_TEXT + 1))
     return checked_text("".join(pieces))
 
 

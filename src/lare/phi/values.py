@@ -14,8 +14,17 @@ MOST_STEPS = 40_000
 """The most steps of a program: statements, expressions, and entries of lists that are made or looked into."""
 LONGEST_LIST = 10_000
 LONGEST_TEXT = 10_000
+LONGEST_KEY = 16
+"""The most entries of a tuple that is the key of a dictionary."""
 MOST_BITS = 63
 """The most bits of an integer."""
+
+
+class _Value:
+    """A value whose text tells nothing of the process."""
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__.lower()}>"
 
 
 @dataclass(frozen=True)
@@ -28,8 +37,8 @@ class Named:
         return self.name
 
 
-@dataclass(eq=False)
-class Function:
+@dataclass(eq=False, repr=False)
+class Function(_Value):
     """A function of the program."""
 
     name: str
@@ -43,23 +52,23 @@ class Function:
     """The class whose method it is."""
 
 
-@dataclass(eq=False)
-class Bound:
+@dataclass(eq=False, repr=False)
+class Bound(_Value):
     """A function, or a method of Python's or NumPy's types, with its first argument."""
 
     call: Callable[..., Any]
 
 
-@dataclass(eq=False)
-class Decorated:
+@dataclass(eq=False, repr=False)
+class Decorated(_Value):
     """A function in a class: a static method, a class method or a property."""
 
     kind: str
     function: Any
 
 
-@dataclass(eq=False)
-class Class:
+@dataclass(eq=False, repr=False)
+class Class(_Value):
     """A class of the program."""
 
     name: str
@@ -80,8 +89,8 @@ class Class:
         return any(name in cls.attributes for cls in (self, *self.bases))
 
 
-@dataclass(eq=False)
-class Instance:
+@dataclass(eq=False, repr=False)
+class Instance(_Value):
     """An object of a class of the program."""
 
     cls: Class
@@ -142,7 +151,7 @@ class Meter:
         self.steps = 0
 
     def pay(self, steps: int = 1) -> None:
-        self.steps += steps
+        self.steps += max(steps, 0)
         if self.steps > MOST_STEPS:
             raise Refused("E-COST", f"the program takes more than {MOST_STEPS} steps")
 
@@ -165,6 +174,10 @@ class Meter:
                 rest.extend(value.values())
             elif isinstance(value, (list, tuple)):
                 rest.extend(value)
+            elif isinstance(value, slice):
+                rest.extend((value.start, value.stop, value.step))
+            elif isinstance(value, str):
+                self.pay(len(value) // 100)
             elif isinstance(value, Instance):
                 rest.extend(value.attributes.values())
 
@@ -185,7 +198,9 @@ def checked_text(text: str) -> str:
 def as_key(value: Any) -> Any:
     """A value as the key of a dictionary. Raises `TypeError` if it is none."""
     parts = value if isinstance(value, tuple) else (value,)
-    if not all(isinstance(part, (str, bool, int, float, Named)) or part is None for part in parts):
+    if len(parts) > LONGEST_KEY or not all(
+        isinstance(part, (str, bool, int, float, Named)) or part is None for part in parts
+    ):
         raise TypeError("the keys of dictionaries and the entries of sets are texts, numbers, or tuples of them")
     return value
 
@@ -211,7 +226,7 @@ class Raised(Exception):
 
     def __init__(self, name: str, message: str):
         super().__init__(f"the program raises {name}{': ' + message if message else ''}")
-        self.name = name
+        self.name, self.message = name, message
 
 
 def type_of(value: Any) -> Named:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
 from collections.abc import Callable
@@ -236,44 +237,53 @@ INDEXED = {"r_": Concatenator(False), "c_": Concatenator(True), "mgrid": Grid(Fa
 
 # --- of constants alone, by NumPy itself --------------------------------------------------------------------------------
 
+LARGEST_CONSTANT, LARGEST_SYSTEM = 1024, 64
+"""The most numbers of each argument of these functions, and the most of those that solve equations."""
 
-def _register_constant(name: str, cost: Callable[..., Any]) -> None:
+
+def register_constant_function(name: str, options: str = "", largest: int = LARGEST_CONSTANT) -> None:
+    """A function that NumPy itself computes, of constants. `options` are the keywords that it takes."""
+    function: Any = functools.reduce(getattr, name.split("."), np)
+
     def of_constants(*args: Any, **kwargs: Any) -> Any:
-        values, more = [_plain(x, name) for x in args], {key: _plain(x, name) for key, x in kwargs.items()}
-        builder = current_builder()
-        builder.check_size([max(1, int(cost(*values, **more)))])
-        builder.spend(sum(np.size(x) for x in values))
-        result = getattr(np, name)(*values, **more)
+        unknown = set(kwargs) - set(options.split())
+        if unknown or len(args) > 3:
+            raise Refused("E-NUMPY", f"np.{name} takes constants, and {options or 'no keywords'}")
+        values = [plain_constant(x, name, largest) for x in args]
+        more = {key: plain_constant(x, name, largest) for key, x in kwargs.items()}
+        current_builder().spend(20 * sum(np.size(x) for x in values))
+        result = function(*values, **more)
         return tuple(map(as_array, result)) if isinstance(result, (tuple, list)) else as_array(result)
 
     numpy_function(name)(of_constants)
 
 
-def _plain(x: Any, name: str) -> Any:
-    """A constant as NumPy takes it."""
-    if isinstance(x, (bool, int, float, str)) or x is None or (isinstance(x, tuple) and all(type(n) is int for n in x)):
+def plain_constant(x: Any, name: str, largest: int) -> Any:
+    """A small constant as NumPy takes it: a number, or an array of at most two axes."""
+    if isinstance(x, (bool, float)) or x is None:
         return x
-    return constant_of(x, f"the arguments of np.{name}")
+    values = constant_of(x, f"the arguments of np.{name}")
+    if values.ndim > 2 or values.size > largest or (values.dtype.kind == "i" and np.abs(values).max() > largest):
+        raise Refused("E-COST", f"np.{name} of more than {largest} numbers, or of larger integers")
+    return values.item() if values.ndim == 0 else values
 
 
-def _square(n: Any, *_: Any, **__: Any) -> int:
-    return int(n) ** 2 if isinstance(n, int) else np.size(n) ** 2
+for _name, _options in {
+    "nonzero": "", "flatnonzero": "", "argwhere": "", "union1d": "", "intersect1d": "", "setdiff1d": "", "setxor1d": "",
+    "unique": "return_index return_inverse return_counts", "array_equal": "", "trim_zeros": "", "i0": "", "hanning": "",
+    "hamming": "", "blackman": "", "bartlett": "", "kaiser": "", "histogram": "bins", "bincount": "minlength",
+    "vander": "N increasing", "triu_indices_from": "k", "tril_indices_from": "k",
+}.items():  # fmt: skip
+    register_constant_function(_name, _options)
+for _name, _options in {
+    "roots": "", "poly": "", "polyfit": "deg", "tril_indices": "k m", "triu_indices": "k m", "diag_indices": "",
+    "cov": "ddof rowvar", "corrcoef": "rowvar", "gcd": "", "lcm": "", "allclose": "rtol atol",
+}.items():  # fmt: skip
+    register_constant_function(_name, _options, LARGEST_SYSTEM)
 
 
-for _name in "tril_indices triu_indices roots corrcoef cov diag_indices".split():
-    _register_constant(_name, _square)
-for _name in "hanning hamming blackman bartlett".split():
-    _register_constant(_name, lambda n: n)
-for _name in (
-    "nonzero flatnonzero argwhere unique union1d intersect1d setdiff1d setxor1d gcd lcm array_equal allclose triu_indices_from "
-    "tril_indices_from trim_zeros i0 poly"
-).split():
-    _register_constant(_name, lambda *values, **_: sum(np.size(x) for x in values))
-_register_constant("kaiser", lambda n, beta: n)
-_register_constant("indices", lambda dimensions, **_: math.prod(dimensions) * len(dimensions))
-_register_constant("vander", lambda x, N=None, increasing=False: np.size(x) * (N or np.size(x)))  # noqa: N803
-_register_constant("bincount", lambda x, weights=None, minlength=0: max(int(np.max(x)) + 1, minlength))
-_register_constant(
-    "histogram", lambda a, bins=10, *_, **__: np.size(a) + (bins if isinstance(bins, int) else np.size(bins))
-)
-_register_constant("polyfit", lambda x, y, deg, **_: np.size(x) * (deg + 1))
+@numpy_function()
+def indices(dimensions: Any, dtype: Any = "int") -> Array:
+    sizes = [operator.index(n) for n in dimensions]
+    current_builder().check_size([*sizes, len(sizes)])
+    return astype(np.indices(sizes), dtype)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import string
 from collections.abc import Callable
 from typing import Any
@@ -15,6 +16,10 @@ from lare.phi.numpy_functions.reductions import along
 from lare.phi.numpy_functions.registry import FUNCTIONS, constant_of, numpy_function
 from lare.phi.numpy_functions.shapes import diagonal, ravel
 
+PATTERN = re.compile(
+    r"(?=.{1,120}$)([a-zA-Z]*(\.\.\.)?[a-zA-Z]*)(,[a-zA-Z]*(\.\.\.)?[a-zA-Z]*)*(->(?!.*(\w).*\6)[a-zA-Z]*(\.\.\.)?[a-zA-Z]*)?"
+)
+"""The subscripts of np.einsum. A letter stands once in the result."""
 LARGEST_INVERSE = 4
 """The largest matrix that is inverted by its cofactors."""
 
@@ -24,6 +29,10 @@ def einsum(subscripts: Any, *operands: Array, optimize: Any = False) -> Array:
     """A letter for each axis. The batch axis must have the same letter in all arrays, and be kept."""
     if not isinstance(subscripts, str):
         raise Refused("E-NUMPY", "np.einsum takes its subscripts as a text, such as 'bij,bj->bi'")
+    if not PATTERN.fullmatch("".join(subscripts.split())) or len(operands) > 8:
+        raise Refused(
+            "E-NUMPY", f"np.einsum({subscripts[:40]!r}): use at most 8 arrays and 20 letters, such as 'bij,bj->bi'"
+        )
     left, arrow, right = "".join(subscripts.split()).partition("->")
     terms = left.split(",")
     unused = [letter for letter in string.ascii_letters if letter not in left]
@@ -169,6 +178,7 @@ def inv(a: Array) -> Any:
     """The inverse by cofactors, of at most 4 x 4 numbers; of a constant, by NumPy. Not finite for a singular matrix."""
     n = _check_square(a, "inv")
     if a.constant is not None:
+        current_builder().spend(n * math.prod(a.row_shape))
         return as_array(np.linalg.inv(a.constant))
     if n > LARGEST_INVERSE:
         raise Refused(
@@ -226,6 +236,7 @@ def eigvalsh(a: Array, UPLO: Any = "L") -> Any:  # noqa: N803
     """
     n = _check_square(a, "eigvalsh")
     if a.constant is not None:
+        current_builder().spend(10 * n * math.prod(a.row_shape))
         return as_array(np.linalg.eigvalsh(a.constant, UPLO))
     if n > 3:
         raise Refused("E-NUMPY", "np.linalg.eigvalsh of matrices larger than 3 x 3 is not available")

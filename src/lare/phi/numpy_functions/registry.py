@@ -121,10 +121,16 @@ def as_numbers(x: Any) -> Array:
 
 def kind_of(dtype: Any) -> Kind:
     """The kind of a type: "float32", np.float32, float, x.dtype. Raises `Refused` for other types."""
-    name = str(dtype).removeprefix("np.")
+    name = dtype_name(dtype)
     if name not in KIND_OF_DTYPE:
         raise Refused("E-NUMPY", f"{name[:40]!r} is no available type: use float, np.float32, int or bool")
     return KIND_OF_DTYPE[name]
+
+
+def dtype_name(dtype: Any) -> str:
+    """The name of a type without np., for a text or for what is known by its name; else an empty text."""
+    name = dtype if isinstance(dtype, str) else getattr(dtype, "name", "")
+    return name.removeprefix("np.") if isinstance(name, str) else ""
 
 
 def constant_of(x: Any, what: str) -> Any:

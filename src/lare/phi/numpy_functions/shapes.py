@@ -295,6 +295,8 @@ def rot90(m: Array, k: int = 1, axes: Any = (0, 1)) -> Array:
 def roll(a: Array, shift: Any, axis: Any = None) -> Array:
     a.row_axes(axis)
     shifts = [operator.index(s) for s in (shift if isinstance(shift, (tuple, list)) else [shift])]
+    if len(shifts) > 4:
+        raise Refused("E-COST", "np.roll along more than 4 axes")
     if axis is None:
         return a.rearranged(lambda positions: np.roll(positions, shifts[0]), a.batch_axis)
     at = [a.axis(i) for i in (axis if isinstance(axis, (tuple, list)) else [axis])]
@@ -312,8 +314,12 @@ def repeat(a: Array, repeats: Any, axis: Any = None) -> Array:
             BATCH.refuse()
         return Array(a.node, at)
     times = constant_of(repeats, "the repetitions of np.repeat")
-    lengths = int(np.sum(np.abs(times))) if times.ndim else int(abs(times)) * (1 if at is None else a.row_shape[at])
-    current_builder().check_size([lengths or 1, math.prod(size for i, size in enumerate(a.row_shape) if i != at)])
+    counts = [operator.index(count) for count in times.ravel().tolist()]
+    size = math.prod(a.row_shape) if at is None else a.row_shape[at]
+    if min(counts) < 0 or len(counts) not in (1, size):
+        raise ValueError("np.repeat needs one number of repetitions, or one for each entry, and none below 0")
+    length = sum(counts) if len(counts) > 1 else counts[0] * size
+    current_builder().check_size([length, math.prod(a.row_shape) // size])
     if at is None:
         a, at = ravel(a), 0
     return a.rearranged(lambda positions: np.repeat(positions, times, at), a.batch_axis)

@@ -12,6 +12,7 @@ import numpy as np
 
 from lare.phi.arrays import Array, as_array, elementwise
 from lare.phi.graph import current_builder
+from lare.phi.numpy_functions.creation import LARGEST_SYSTEM, plain_constant, register_constant_function
 from lare.phi.numpy_functions.reductions import along
 from lare.phi.numpy_functions.registry import as_float, as_numbers, constant_of, numpy_function
 
@@ -76,6 +77,7 @@ def _interval(x: Array, places: np.ndarray) -> Any:
 @numpy_function()
 def unravel_index(indices: Array, shape: Any, order: Any = "C") -> tuple[Any, ...]:
     sizes = [operator.index(size) for size in (shape if isinstance(shape, (tuple, list)) else [shape])]
+    current_builder().check_size(sizes)
     strides = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
     return tuple((indices // stride) % size for stride, size in zip(strides, sizes, strict=True))
 
@@ -83,6 +85,7 @@ def unravel_index(indices: Array, shape: Any, order: Any = "C") -> tuple[Any, ..
 @numpy_function()
 def ravel_multi_index(multi_index: Any, dims: Any, mode: Any = "raise", order: Any = "C") -> Any:
     sizes = [operator.index(size) for size in dims]
+    current_builder().check_size(sizes)
     strides = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
     terms = [elementwise("multiply", index, stride) for index, stride in zip(multi_index, strides, strict=True)]
     return functools.reduce(lambda x, y: elementwise("add", x, y), terms)
@@ -119,7 +122,7 @@ def rising_polyval(x: Array, c: Any, tensor: Any = True) -> Any:
 
 def _register_series_value(name: str, to_powers: Callable[[Any], np.ndarray]) -> None:
     def value(x: Array, c: Any, tensor: Any = True) -> Any:
-        return rising_polyval(x, to_powers(constant_of(c, f"the coefficients of {name}")))
+        return rising_polyval(x, to_powers(plain_constant(c, name, LARGEST_SYSTEM)))
 
     numpy_function(f"polynomial.{name}")(value)
 
@@ -144,19 +147,10 @@ def poly1d(c_or_r: Array) -> Polynomial:
     return Polynomial(c_or_r)
 
 
-def _register_coefficients(name: str, function: Callable[..., Any], count: int) -> None:
-    def coefficients(*args: Any) -> Any:
-        arrays = [constant_of(x, f"the coefficients of np.{name}") for x in args[:count]]
-        result = function(*arrays, *args[count:])
-        return tuple(map(as_array, result)) if isinstance(result, tuple) else as_array(result)
-
-    numpy_function(name)(coefficients)
-
-
-for _name, _count in {"polyadd": 2, "polysub": 2, "polymul": 2, "polyder": 1, "polyint": 1, "polydiv": 2}.items():
-    _register_coefficients(_name, getattr(np, _name), _count)
-for _name, _count in {"polyder": 1, "polyint": 1, "polymul": 2, "polyadd": 2}.items():
-    _register_coefficients(f"polynomial.polynomial.{_name}", getattr(np.polynomial.polynomial, _name), _count)
+for _name in "polyadd polysub polymul polyder polyint polydiv".split():
+    register_constant_function(_name, "m", LARGEST_SYSTEM)
+for _name in "polyder polyint polymul polyadd".split():
+    register_constant_function(f"polynomial.polynomial.{_name}", "m", LARGEST_SYSTEM)
 
 
 # --- sets ---------------------------------------------------------------------------------------------------------------
