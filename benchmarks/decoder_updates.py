@@ -75,7 +75,8 @@ def judged(learner: Learner, steps: Trajectory, config: TrainConfig) -> tuple[fl
 def curve(name: str, updates: int) -> Iterator[tuple[int, tuple[float, float]]]:
     config = config_of(name)
     learner = of_seed(new_learners(jax.random.key(0)[None], config))
-    learner = common.store(learner, random_episodes(1, STORED, config), jnp.asarray(no_factors(STORED)), config)
+    steps, factors = random_episodes(1, STORED, config), jnp.asarray(no_factors(STORED))
+    learner = common.store_with_factors(learner, steps, factors, config)
     others = random_episodes(99, JUDGED, config)
     fit = jax.jit(partial(common.fit_often, config=config))
     for done in range(AT_A_TIME, updates + 1, AT_A_TIME):

@@ -42,7 +42,7 @@ def measured(name: str, way: str) -> dict[str, Any]:
         begun = session.start(run)
         try:
             steps = begun.collector.collect(begun.actor, 0)
-            begun.learner = begun.functions.store(begun.learner, steps, session.annotate(run, begun.config, steps))
+            begun.learner, _ = begun.functions.store(begun.learner, steps)
             jax.block_until_ready(begun.learner)
             start = time.process_time()
             with mock.patch.object(first_fit, "SMALLER", 1 if way == LARGE else first_fit.SMALLER):

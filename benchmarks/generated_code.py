@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import lare
+from lare.algorithms.settings import TD3Settings
 from lare.latent.factors import compute_factors
 from lare.latent.verify import verify
 from lare.phi.evaluate import evaluate
@@ -310,7 +311,7 @@ def iteration_costs(task: str, settings: lare.Settings, rounds: int = 5) -> dict
 
 
 ITERATIONS = {
-    "HalfCheetah-v4": lare.Settings(method="lare-bayes", algorithm="td3", td3={"warmup": 100}),
+    "HalfCheetah-v4": lare.Settings(method="lare-bayes", algorithm="td3", td3=TD3Settings(warmup=100)),
     "CN-6": lare.Settings(method="lare-bayes", algorithm="ippo"),
     "CN-30": lare.Settings(method="lare-bayes", algorithm="ippo"),
     "SMAX-2s3z": lare.Settings(method="lare-rd", algorithm="qmix"),

@@ -137,7 +137,7 @@ def fill(session: Session, transitions: int) -> None:
         ended = ((start + 1 + np.arange(rollout)) % EPISODE == 0)[None, :, None]
         action = numbers(1, env.action_size)
         steps = Trajectory(shown(np.zeros_like(ended)), action, action, shown(ended))
-        session.learner = session.functions.store(session.learner, steps, numbers(1, *config.factors))
+        session.learner, _ = session.functions.store(session.learner, steps)
     session.step = transitions
 
 

@@ -30,7 +30,6 @@ def main(episodes: int = 40) -> float:
             true.append(info["true_reward"])  # used only by the last line of this function
             before, over = after, terminated or truncated
         r_hat = credit.rewards_at(steps)  # your algorithm trains on these; ask again whenever it samples
-    credit.close()
     return float(np.corrcoef(r_hat, true)[0, 1])
 
 

@@ -100,7 +100,6 @@ def of_entries(steps: Steps, judges: Judges, functions: Sequence[LatentFunction]
         found.append(
             np.abs(correlations(function.of_steps(steps.before, steps.action, steps.after, judges), steps.reward))
         )
-        function.close()
     mean, size, best = (np.mean([measure(one) for one in found]) for measure in (np.nanmean, len, np.nanmax))
     return of_states, f"{mean:.2f} ({size:.1f}), {best:.2f}"
 
