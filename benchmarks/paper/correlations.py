@@ -95,11 +95,10 @@ def of_entries(steps: Steps, judges: Judges, functions: Sequence[LatentFunction]
     of_states = f"{np.nanmean(state):.2f} ({len(state)}), {np.nanmax(state):.2f}"
     if not functions:
         return of_states, "-"
-    found = []
-    for function in functions:
-        found.append(
-            np.abs(correlations(function.of_steps(steps.before, steps.action, steps.after, judges), steps.reward))
-        )
+    found = [
+        np.abs(correlations(function.of_steps(steps.before, steps.action, steps.after, judges), steps.reward))
+        for function in functions
+    ]
     mean, size, best = (np.mean([measure(one) for one in found]) for measure in (np.nanmean, len, np.nanmax))
     return of_states, f"{mean:.2f} ({size:.1f}), {best:.2f}"
 
