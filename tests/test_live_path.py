@@ -78,7 +78,6 @@ def test_from_a_live_model_to_a_trained_policy(serve, command, tmp_path):
     size = "--method lare-linear --td3.warmup 50 --td3.hidden 8 8".split()
     status, _, err = command("train", "Reacher-v4", "--function", "phi.py", "--out", "run", *length, *size)
     assert status == 0
-    assert "the latent function runs in a process of its own" in err
     assert KEY.encode() not in everything_written(tmp_path)
 
 

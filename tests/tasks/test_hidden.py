@@ -51,8 +51,6 @@ def test_only_what_is_paid_differs_from_the_usual_task(name):
 def test_the_recorded_replies_are_those_of_the_usual_task():
     hidden, usual = (lare.design(lare.load_task(name)) for name in ("HalfCheetahTarget-v4", "HalfCheetah-v4"))
     assert hidden.source == usual.source
-    hidden.close()
-    usual.close()
 
 
 def test_registering_again_changes_nothing():

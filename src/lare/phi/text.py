@@ -126,9 +126,7 @@ def _list_method(
     interpreter: Interpreter, values: list[Any], name: str, args: Sequence[Any], kwargs: dict[str, Any]
 ) -> Any:
     if name == "sort":
-        from lare.phi.python_functions import sorted_
-
-        values[:] = sorted_(interpreter, values, **kwargs)
+        values[:] = interpreter.call(Named("sorted"), [values], kwargs)
         return None
     if name == "extend":
         args = [list(interpreter.items(args[0]))]
@@ -146,9 +144,7 @@ def _dict_method(
     if name in ("get", "pop", "setdefault"):
         as_key(args[0])
     if name == "update":
-        from lare.phi.python_functions import dict_
-
-        values |= dict_(interpreter, *args, **kwargs)
+        values |= interpreter.call(Named("dict"), args, kwargs)
         interpreter.meter.pay_for_list(len(values))
         return None
     result = getattr(dict, name)(values, *args)

@@ -52,7 +52,7 @@ def _factors(graph: Graph, observation: Array, action: Array) -> Float[Array, "*
 
 
 def host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Float[np.ndarray, "*lead rows factors"]:
-    """The factors z of steps, computed on the host.
+    """The factors z of steps, computed on the host; none for a method without phi.
 
     Raises:
         LareError: a factor is not finite; the input is saved in the run directory.
@@ -60,7 +60,7 @@ def host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Float[np.n
     steps = jax.tree.map(np.asarray, steps)
     lead = np.shape(steps.after.terminated)
     factors = np.zeros((*lead, config.judged_rows, max(config.factors, default=0)), np.float32)
-    for i, (function, team) in enumerate(zip(run.functions, config.env.teams, strict=True)):
+    for i, (function, team) in enumerate(zip(run.functions, config.env.teams, strict=False)):
         before, action = rows_of(config.judged_from, team, steps.before, steps.taken)
         after, _ = rows_of(config.judged_from, team, steps.after, steps.taken)
         columns = run.factors(function, *(rows.reshape(-1, rows.shape[-1]) for rows in (before, action, after)))

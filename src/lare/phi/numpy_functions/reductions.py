@@ -9,7 +9,7 @@ from typing import Any
 from lare.phi.arrays import ALL, Array, as_array, broadcast, concatenate, elementwise, stack
 from lare.phi.graph import ELEMENTWISE, Refused, current_builder
 from lare.phi.numpy_functions.elementwise import UNARY, power
-from lare.phi.numpy_functions.registry import FUNCTIONS, as_arrays, as_numbers, as_operand, constant_of, numpy_function
+from lare.phi.numpy_functions.registry import FUNCTIONS, as_arrays, as_numbers, constant_of, numpy_function
 
 UFUNC_REDUCTIONS = {
     "add": "sum", "multiply": "prod", "maximum": "max", "minimum": "min", "logical_and": "all", "logical_or": "any",
@@ -39,7 +39,7 @@ def _flat(x: Array) -> Array:
 
 
 def _register_reduction(name: str, op: str, *aliases: str) -> None:
-    def reduce(a: Array, axis: Any = None, keepdims: Any = False, initial: Any = None, where: Any = True) -> Any:
+    def reduce(a: Array, axis: Any = None, *, keepdims: Any = False, initial: Any = None, where: Any = True) -> Any:
         if where is not True:
             if initial is None and op not in NEUTRAL:
                 raise Refused("E-NUMPY", f"np.{op} with where= needs initial=")
@@ -98,6 +98,7 @@ def average(a: Array, axis: Any = None, weights: Any = None, *, keepdims: Any = 
 def var(
     a: Array,
     axis: Any = None,
+    *,
     ddof: Any = 0,
     keepdims: Any = False,
     where: Any = True,
@@ -114,13 +115,16 @@ def var(
 def std(
     a: Array,
     axis: Any = None,
+    *,
     ddof: Any = 0,
     keepdims: Any = False,
     where: Any = True,
     mean: Any = None,
     correction: Any = None,
 ) -> Any:
-    return elementwise("sqrt", as_operand(var(a, axis, ddof, keepdims, where, mean, correction)))
+    return elementwise(
+        "sqrt", var(a, axis, ddof=ddof, keepdims=keepdims, where=where, mean=mean, correction=correction)
+    )
 
 
 @numpy_function()
@@ -137,7 +141,7 @@ def count_nonzero(a: Array, axis: Any = None, *, keepdims: Any = False) -> Array
 
 
 def _register_without_nan(name: str, substitute: int | float) -> None:
-    def reduce(a: Array, axis: Any = None, keepdims: Any = False) -> Any:
+    def reduce(a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
         is_nan = elementwise("isnan", a)
         result = along(name, elementwise("where", is_nan, substitute, a), axis, keepdims)
         if name in ("max", "min"):  # NaN if nothing else is there
@@ -164,13 +168,14 @@ def nanmean(a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
 
 
 @numpy_function()
-def nanvar(a: Array, axis: Any = None, ddof: Any = 0, keepdims: Any = False) -> Any:
-    return var(elementwise("where", elementwise("isnan", a), 0, a), axis, ddof, keepdims, _not_nan(a))
+def nanvar(a: Array, axis: Any = None, *, ddof: Any = 0, keepdims: Any = False) -> Any:
+    a, where = elementwise("where", elementwise("isnan", a), 0, a), _not_nan(a)
+    return var(a, axis, ddof=ddof, keepdims=keepdims, where=where)
 
 
 @numpy_function()
-def nanstd(a: Array, axis: Any = None, ddof: Any = 0, keepdims: Any = False) -> Any:
-    return elementwise("sqrt", nanvar(a, axis, ddof, keepdims))
+def nanstd(a: Array, axis: Any = None, *, ddof: Any = 0, keepdims: Any = False) -> Any:
+    return elementwise("sqrt", nanvar(a, axis, ddof=ddof, keepdims=keepdims))
 
 
 def _not_nan(a: Array) -> Any:
@@ -236,7 +241,7 @@ def _register_ufunc_methods(ufunc: str) -> None:
     def reduce(array: Array, axis: Any = 0, keepdims: Any = False, initial: Any = None, where: Any = True) -> Any:
         if ufunc in UFUNC_REDUCTIONS:
             more = {"initial": initial, "where": where} if initial is not None or where is not True else {}
-            return FUNCTIONS[UFUNC_REDUCTIONS[ufunc]](array, axis, keepdims, **more)
+            return FUNCTIONS[UFUNC_REDUCTIONS[ufunc]](array, axis, keepdims=keepdims, **more)
         for at in reversed(array.row_axes(axis)):
             slices = [array[(*(ALL,) * at, slice(i, i + 1) if keepdims else i)] for i in range(array.row_shape[at])]
             array = functools.reduce(lambda x, y: elementwise(ufunc, x, y), slices)
