@@ -110,6 +110,7 @@ ATTACKS = {
     "covariance": NUMPY + "x = np.cov(np.zeros((1, 1)), np.zeros((15000, 1)))",
     "text of long texts": "s = ['a' * 9000] * 9000\nx = str(s)",
     "many letters": NUMPY + phi("return [np.einsum('b1->b', observation)]"),
+    "letters that could be split": NUMPY + phi("return [np.einsum('aaaaaaaaaa,' * 40 + '1', observation)]"),
     "many axes": NUMPY + phi("return [np.sin(observation.reshape((-1,) + (1,) * 32 + (17,)))]"),
     "large product": NUMPY + phi("return [np.einsum('bi,bj,bk,bl->b', *[observation] * 4)[:, None]]"),
     "first row": NUMPY + phi("return [np.repeat(observation[0, 0][None, None], len(observation), axis=0)]"),

@@ -16,9 +16,8 @@ from lare.phi.numpy_functions.reductions import along
 from lare.phi.numpy_functions.registry import FUNCTIONS, constant_of, numpy_function
 from lare.phi.numpy_functions.shapes import diagonal, ravel
 
-PATTERN = re.compile(
-    r"(?=.{1,120}$)([a-zA-Z]*(\.\.\.)?[a-zA-Z]*)(,[a-zA-Z]*(\.\.\.)?[a-zA-Z]*)*(->(?!.*(\w).*\6)[a-zA-Z]*(\.\.\.)?[a-zA-Z]*)?"
-)
+_TERM = r"[a-zA-Z]*+(\.\.\.)?[a-zA-Z]*+"
+PATTERN = re.compile(rf"{_TERM}(,{_TERM})*+(->{_TERM})?")
 """The subscripts of np.einsum. A letter stands once in the result."""
 LARGEST_INVERSE = 4
 """The largest matrix that is inverted by its cofactors."""
@@ -29,7 +28,9 @@ def einsum(subscripts: Any, *operands: Array, optimize: Any = False) -> Array:
     """A letter for each axis. The batch axis must have the same letter in all arrays, and be kept."""
     if not isinstance(subscripts, str):
         raise Refused("E-NUMPY", "np.einsum takes its subscripts as a text, such as 'bij,bj->bi'")
-    if not PATTERN.fullmatch("".join(subscripts.split())) or len(operands) > 8:
+    compact = "".join(subscripts.split())
+    kept = [letter for letter in compact.partition("->")[2] if letter != "."]
+    if not PATTERN.fullmatch(compact) or len(set(kept)) < len(kept) or len(operands) > 8:
         raise Refused(
             "E-NUMPY", f"np.einsum({subscripts[:40]!r}): use at most 8 arrays and 20 letters, such as 'bij,bj->bi'"
         )
