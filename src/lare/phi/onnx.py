@@ -103,6 +103,8 @@ class _Writer:
     def write(self, node: Node, x: list[str]) -> str:
         """Add an operation of the graph, and return the name of its result."""
         inputs, op, kind, option = [self.graph.nodes[i] for i in node.inputs], self.op, node.kind, node.option
+        if node.op == "where" and kind == "bool":  # ONNX Runtime has no Where of truth values
+            return self.cast(op("Where", x[0], *(self.cast(value, "int") for value in x[1:])), "bool")
         if node.op in SAME:
             return op(SAME[node.op], *x)
         if node.op in COMPARISONS:
