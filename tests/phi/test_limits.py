@@ -67,6 +67,7 @@ ATTACKS = {
     "meshgrid": NUMPY + "x = np.meshgrid(*[np.arange(99)] * 9)",
     "fancy index": NUMPY + "x = np.eye(9)[np.zeros((9999, 1), int), np.zeros((1, 9999), int)]",
     "einsum": NUMPY + "x = np.einsum('a,b,c,d->', *[np.ones(999)] * 4)",
+    "einsum of many letters": NUMPY + "x = np.einsum('abcdefghi,jklmnopqr->', *[np.ones((2,) * 9)] * 2)",
     "outer": NUMPY + "x = np.multiply.outer(np.ones(9999), np.ones(9999))",
     "windows": NUMPY + "x = np.lib.stride_tricks.sliding_window_view(np.ones(60000), 30000)",
     "tril_indices": NUMPY + "x = np.tril_indices(60000)",

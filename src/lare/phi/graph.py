@@ -150,12 +150,7 @@ class Graph:
         if node.op != "einsum":
             return math.prod(node.shape)
         terms = node.option.partition("->")[0].replace("...", "").split(",")
-        sizes = {
-            c: n
-            for term, i in zip(terms, node.inputs, strict=True)
-            for c, n in zip(term, self.nodes[i].shape, strict=True)
-        }
-        return math.prod(sizes.values())
+        return math.prod(_letter_sizes(terms, [self.nodes[i].shape for i in node.inputs]).values())
 
     @property
     def depth(self) -> int:
@@ -414,16 +409,13 @@ class Builder:
 
     def einsum(self, terms: Sequence[str], result: str, inputs: Sequence[int]) -> int:
         """`numpy.einsum`, with a letter for each axis of a row."""
-        sizes: dict[str, int] = {}
-        for term, i in zip(terms, inputs, strict=True):
-            for letter, size in zip(term, self.nodes[i].shape, strict=True):
-                if sizes.setdefault(letter, size) != size:
-                    raise ValueError(f"a product of axes of lengths {sizes[letter]} and {size}")
-        self.check_size(list(sizes.values())[:16])
-        self.spend(math.prod(sizes.values()))
-        letters = dict(zip(sizes, string.ascii_letters, strict=False))  # a, b, c ..., so that others are free
+        sizes = _letter_sizes(terms, [self.nodes[i].shape for i in inputs])
         if len(sizes) > 20:
             raise Refused("E-COST", "np.einsum with more than 20 letters")
+        terms_computed = math.prod(sizes.values())
+        self.check_size([terms_computed])
+        self.spend(terms_computed)
+        letters = dict(zip(sizes, string.ascii_letters, strict=False))  # a, b, c ..., so that others are free
         terms, result = ["".join(letters[c] for c in term) for term in terms], "".join(letters[c] for c in result)
         sizes = {letters[c]: size for c, size in sizes.items()}
         kind = widest([self.nodes[i].kind for i in inputs] + ["int"])
@@ -515,6 +507,16 @@ class Builder:
         if rows is None or not self.is_constant(x):
             return x
         return self.gather(x, np.broadcast_to(all_positions(shape), (rows, *shape)))
+
+
+def _letter_sizes(terms: Sequence[str], shapes: Sequence[tuple[int, ...]]) -> dict[str, int]:
+    """The length of the axis that each letter of an einsum stands for."""
+    sizes: dict[str, int] = {}
+    for term, shape in zip(terms, shapes, strict=True):
+        for letter, size in zip(term, shape, strict=True):
+            if sizes.setdefault(letter, size) != size:
+                raise ValueError(f"a product of axes of lengths {sizes[letter]} and {size}")
+    return sizes
 
 
 def widest(kinds: Sequence[str]) -> Kind:
