@@ -122,7 +122,7 @@ ATTACKS = {
 def test_attack_is_refused(name):
     with pytest.raises(Refused) as refusal:
         read(ATTACKS[name], 17, 6)
-    assert refusal.value.code != "E-BUG"
+    assert refusal.value.code not in ("E-BUG", "E-FORM")  # E-FORM: it ran to its end
 
 
 @pytest.mark.parametrize("name", list(ATTACKS)[:16])

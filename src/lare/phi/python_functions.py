@@ -19,7 +19,6 @@ from lare.phi.numpy_functions import call_numpy
 from lare.phi.numpy_functions.registry import KIND_OF_DTYPE, astype, dtype_name, kind_of
 from lare.phi.text import formatted
 from lare.phi.values import (
-    LONGEST_LIST,
     Bound,
     Class,
     Function,
@@ -182,7 +181,9 @@ def factorial(_: Interpreter, n: Any) -> int:
 
 @builtin("math.comb")
 def comb(_: Interpreter, n: Any, k: Any) -> int:
-    return checked_number(math.comb(min(operator.index(n), 99), min(operator.index(k), 99)))
+    n, k = operator.index(n), operator.index(k)
+    # Of 2k or more things, 34 <= k can be chosen in more ways than an integer may count.
+    return checked_number(math.comb(n, min(k, n - k, 34) if 0 <= k <= n else k))
 
 
 # --- lists and their like -----------------------------------------------------------------------------------------------
@@ -202,7 +203,7 @@ def len_(_: Interpreter, x: Any) -> Any:
 @builtin("range")
 def range_(interpreter: Interpreter, *ends: Any) -> range:
     result = range(*(operator.index(end) for end in ends))
-    interpreter.meter.pay_for_list(min(len(result), LONGEST_LIST + 1))
+    interpreter.meter.pay_for_list(len(result))
     return result
 
 
@@ -305,7 +306,7 @@ def _itertool(name: str, count: Callable[..., int]) -> None:
         if many and name not in ("chain", "islice", "repeat"):
             raise Refused("E-COST", f"itertools.{name} of more than 20 entries at a time")
         plain = [x if isinstance(x, int) or x is None else list(interpreter.items(x)) for x in args]
-        interpreter.meter.pay_for_list(min(count(*plain, **kwargs), LONGEST_LIST + 1))
+        interpreter.meter.pay_for_list(count(*plain, **kwargs))
         return Iterator(getattr(itertools, name)(*plain, **kwargs))
 
     builtin(f"itertools.{name}")(results)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from lare.phi.arrays import Array, BatchSize, Operand
 from lare.phi.graph import Refused
-from lare.phi.values import LONGEST_LIST, LONGEST_TEXT, Meter, Named, Set, as_key, checked_text, type_of
+from lare.phi.values import Meter, Named, Set, as_key, check_text_length, checked_text, type_of
 
 if TYPE_CHECKING:
     from lare.phi.interpreter import Interpreter
@@ -39,7 +39,7 @@ def formatted(meter: Meter, value: Any, spec: str) -> str:
         raise Refused("E-PYTHON", f"the format {spec[:40]!r} is not available")
     if isinstance(value, (bool, int, float, str)):
         return checked_text(format(value, spec))
-    checked_text(" " * min(_text_length(value), LONGEST_TEXT + 1))
+    check_text_length(_text_length(value))
     return checked_text(str(value)) if _is_plain(value) else f"<{type_of(value)}>"
 
 
@@ -60,7 +60,7 @@ def combined(meter: Meter, name: str, x: Any, y: Any) -> Any:
     """An operator on texts, lists, dictionaries and sets, by the name of Python's method."""
     for value, times in ((x, y), (y, x)):
         if name == "mul" and isinstance(value, (list, tuple, str)) and isinstance(times, int):
-            meter.pay_for_list(min(len(value) * max(times, 0), LONGEST_LIST + 1))
+            meter.pay_for_list(len(value) * max(times, 0))
             return value * times
     if (name == "add" and type(x) is type(y) and isinstance(x, (list, tuple, str))) or (
         name == "or" and type(x) is type(y) is dict
@@ -75,7 +75,7 @@ def combined(meter: Meter, name: str, x: Any, y: Any) -> Any:
     if name == "mod" and isinstance(x, str):
         values = y if isinstance(y, tuple) else (y,)
         texts = sum(len(value) for value in values if isinstance(value, str))
-        checked_text(" " * min(len(x) + texts + 100 * len(values), LONGEST_TEXT + 1))
+        check_text_length(len(x) + texts + 100 * len(values))
         if "%" in PERCENT.sub("", x) or not all(isinstance(value, (bool, int, float, str)) for value in values):
             raise Refused("E-PYTHON", "this format is not available: use an f-string")
         return checked_text(x % values)
@@ -105,7 +105,7 @@ def _text_method(interpreter: Interpreter, text: str, name: str, args: Sequence[
         length = (text.count(args[0]) if args[0] else len(text) + 1) * len(args[1])
     elif name == "zfill":
         length = operator.index(args[0])
-    checked_text(" " * min(length, LONGEST_TEXT + 1))
+    check_text_length(length)
     return getattr(str, name)(text, *args)
 
 
@@ -118,7 +118,7 @@ def _format_fields(interpreter: Interpreter, text: str, args: Sequence[Any], kwa
             value = args[int(field or number)] if field.isdigit() or not field else kwargs[field]
             number += not field
             pieces.append(formatted(interpreter.meter, value, spec or ""))
-            checked_text(" " * min(sum(map(len, pieces)), LONGEST_TEXT + 1))
+            check_text_length(sum(map(len, pieces)))
     return checked_text("".join(pieces))
 
 

@@ -159,7 +159,7 @@ class Meter:
         """Pay for a new list of these entries, or of this many, and return it."""
         count = values if isinstance(values, int) else len(values)
         if count > LONGEST_LIST:
-            raise Refused("E-COST", f"a list of {count} entries is too long: at most {LONGEST_LIST}")
+            raise Refused("E-COST", f"a list is too long: it may have at most {LONGEST_LIST} entries")
         self.pay(count)
         return values
 
@@ -189,9 +189,14 @@ def checked_number(value: Any) -> Any:
     return value
 
 
+def check_text_length(length: int) -> None:
+    """Raises `Refused` if a text of this length, which need not be made yet, is too long."""
+    if length > LONGEST_TEXT:
+        raise Refused("E-COST", f"a text is too long: it may have at most {LONGEST_TEXT} characters")
+
+
 def checked_text(text: str) -> str:
-    if len(text) > LONGEST_TEXT:
-        raise Refused("E-COST", f"a text of {len(text)} characters is too long: at most {LONGEST_TEXT}")
+    check_text_length(len(text))
     return text
 
 

@@ -1,0 +1,48 @@
+"""Functions of Python's own modules give Python's numbers."""
+
+import collections
+import functools
+import itertools
+import math
+import operator
+
+import numpy as np
+import pytest
+
+from lare.phi.evaluate import evaluate
+from lare.phi.read import read
+from toys import phi
+
+MODULES = {module.__name__: module for module in (math, itertools, functools, operator, collections)}
+EXPRESSIONS = """
+    math.acos(0.3) | math.acosh(1.5) | math.asin(0.3) | math.asinh(0.3) | math.atan(2) | math.atan2(1, -2) | math.atanh(0.3)
+    math.ceil(1.2) | math.ceil(-1.2) | math.floor(-1.2) | math.trunc(-1.7) | math.copysign(3, -0.0) | math.fabs(-2)
+    math.cos(1) | math.cosh(1) | math.sin(1) | math.sinh(1) | math.tan(1) | math.tanh(1) | math.degrees(1) | math.radians(90)
+    math.erf(0.5) | math.erfc(0.5) | math.gamma(4.5) | math.lgamma(4.5) | math.exp(1) | math.expm1(0.1)
+    math.log(8) | math.log(8, 2) | math.log10(1000) | math.log1p(0.1) | math.log2(8) | math.sqrt(2) | math.pow(2, 0.5)
+    math.fmod(-7, 3) | math.remainder(7, 4) | math.modf(1.25)[0] | math.hypot(3, 4) | math.dist([1, 2], [4, 6])
+    math.isclose(1, 1 + 1e-12) | math.isclose(1, 1.1, rel_tol=0.2) | math.isfinite(1) | math.isinf(math.inf) | math.isnan(0)
+    math.gcd(12, 18) | math.lcm(4, 6) | math.factorial(0) | math.factorial(20) | math.prod([2, 3, 4]) | math.prod([2], start=5)
+    math.comb(5, 2) | math.comb(200, 2) | math.comb(200, 198) | math.comb(66, 33) | math.comb(3, 5) | math.comb(10 ** 6, 2)
+    math.comb(10 ** 15, 1) | math.comb(5, 0) | math.pi + math.e + math.tau
+    abs(-3) | pow(2, 10) | 7 // 2 | -7 // 2 | -7 % 3 | 7.5 % -2 | divmod(-7, 3)[1] | round(2.567, 1) | round(2.5) | int(-2.7)
+    int('12') | float('1e-3') | bool(3) | max(3, 1, 2) | min([3, 1, 2]) | max([1, -3], key=abs) | sum([1, 2, 3], 4)
+    len('abc') | len({1, 2, 2}) | sorted([3, 1, 2])[0] | sorted([3, 1, 2], reverse=True)[0] | list(reversed([1, 2]))[0]
+    sum(i * x for i, x in enumerate([1, 2, 3], 1)) | sum(a * b for a, b in zip([1, 2], [3, 4])) | sum(range(2, 20, 3))
+    sum(map(abs, [-1, -2])) | sum(filter(None, [0, 1, 2])) | next(iter([5, 6])) | any([0, 1]) | all([0, 1]) | len('ab' * 3)
+    sum(a * b for a, b in itertools.combinations([1, 2, 3], 2)) | len(list(itertools.product([1, 2], [3, 4, 5])))
+    len(list(itertools.permutations([1, 2, 3]))) | sum(itertools.accumulate([1, 2, 3])) | sum(itertools.chain([1], [2, 3]))
+    sum(b - a for a, b in itertools.pairwise([1, 4, 9])) | sum(itertools.islice([1, 2, 3, 4], 2)) | sum(itertools.repeat(2, 3))
+    len(list(itertools.combinations_with_replacement([1, 2, 3], 2))) | sum(itertools.starmap(pow, [(2, 3), (3, 2)]))
+    functools.reduce(operator.mul, [1, 2, 3, 4]) | operator.itemgetter(1)([5, 6]) | operator.truediv(1, 4) | operator.neg(3)
+    collections.OrderedDict([('a', 2)])['a'] | float('%.3f' % 1.23456) | float('{:.1f}'.format(2.25)) | float(f'{1.5:.2f}')
+"""
+
+
+@pytest.mark.parametrize("expression", [e.strip() for e in EXPRESSIONS.replace("\n", "|").split("|") if e.strip()])
+def test_number_is_that_of_python(expression):
+    imports = "".join(f"import {name}\n" for name in MODULES)
+    graph = read(imports + phi(f"return [observation[:, :1] * 0 + {expression}]"), 17, 6)
+    inputs = {"observation": np.ones((2, 17)), "action": np.ones((2, 6))}
+    factors = evaluate(graph, inputs, dtype=np.float64)["factors"]
+    np.testing.assert_allclose(factors, float(eval(expression, dict(MODULES))), rtol=1e-15)
