@@ -99,7 +99,7 @@ def of_entries(steps: Steps, judges: Judges, functions: Sequence[LatentFunction]
         np.abs(correlations(function.of_steps(steps.before, steps.action, steps.after, judges), steps.reward))
         for function in functions
     ]
-    mean, size, best = (np.mean([measure(one) for one in found]) for measure in (np.nanmean, len, np.nanmax))
+    mean, size, best = (np.mean([float(measure(one)) for one in found]) for measure in (np.nanmean, len, np.nanmax))
     return of_states, f"{mean:.2f} ({size:.1f}), {best:.2f}"
 
 

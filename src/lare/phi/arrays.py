@@ -403,6 +403,16 @@ class Masked(Operand):
         return self.mask[(..., *(None,) * (array.ndim - self.mask.ndim))]
 
 
+class Complex(Operand):
+    """A complex array, as two real ones. `complex_numbers.py` says what can be done with it."""
+
+    def __init__(self, real: Any, imag: Any):
+        self.real, self.imag = real, imag
+
+    def __getitem__(self, index: Any) -> Complex:
+        return Complex(self.real[index], self.imag[index])
+
+
 def _is_mask(entries: Sequence[Any]) -> bool:
     return any(isinstance(entry, Array) and entry.kind == "bool" for entry in entries)
 
@@ -457,7 +467,7 @@ COMPLEX_OPERATIONS: dict[str, Callable[..., Any]] = {}
 
 def elementwise(op: str, *operands: Any) -> Any:
     """An operation on each number of arrays, which are broadcast to each other."""
-    if any(isinstance(operand, complex) or type(operand).__name__ == "Complex" for operand in operands):
+    if any(isinstance(operand, (complex, Complex)) for operand in operands):
         if op not in COMPLEX_OPERATIONS:
             raise Refused("E-NUMPY", f"{op} of complex numbers is not available: use np.abs, np.angle, .real or .imag")
         return COMPLEX_OPERATIONS[op](*operands)
@@ -468,7 +478,7 @@ def elementwise(op: str, *operands: Any) -> Any:
         result = elementwise(op, *(value.values if isinstance(value, Masked) else value for value in operands))
         return Masked(result, *masks.values())
     arrays = [as_array(operand) for operand in operands]
-    batch_axis = _common_batch_axis(arrays)
+    batch_axis = common_batch_axis(arrays)
     nodes = [array.node for array in arrays]
     builder = current_builder()
     return Array(builder.where(*nodes) if op == "where" else builder.elementwise(op, *nodes), batch_axis)
@@ -499,13 +509,13 @@ def power(x: Any, exponent: Any) -> Any:
 
 def invert(x: Any) -> Any:
     """~x: not, of truth values; -x - 1, of integers."""
-    kind = (x.values if hasattr(x, "values") else x).kind
+    kind = (x.values if isinstance(x, Masked) else x).kind
     if kind == "float":
         raise TypeError("~ of fractional numbers: it acts on conditions, as ~(x > 0)")
     return elementwise("logical_not", x) if kind == "bool" else elementwise("subtract", -1, x)
 
 
-def _common_batch_axis(arrays: Sequence[Array]) -> int | None:
+def common_batch_axis(arrays: Sequence[Array]) -> int | None:
     """The batch axis of arrays that are broadcast to each other."""
     ndim = max(array.ndim for array in arrays)
     from_end = {array.ndim - array.batch_axis for array in arrays if array.batch_axis is not None}
@@ -527,7 +537,7 @@ def broadcast(array: Array, row_shape: Sequence[int], batch_axis: int | None) ->
     current_builder().check_size(row_shape)
     target = Array(current_builder().constant(np.broadcast_to(np.zeros(()), row_shape)), batch_axis)
     shape = np.broadcast_shapes(array.row_shape, tuple(row_shape))
-    if _common_batch_axis([array, target]) != batch_axis or shape != tuple(row_shape):
+    if common_batch_axis([array, target]) != batch_axis or shape != tuple(row_shape):
         raise ValueError(f"an array of the shape {array.shape} cannot be broadcast to the shape {target.shape}")
     return array.rearranged(lambda positions: np.broadcast_to(positions, row_shape), batch_axis)
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lare.phi.arrays import COMPLEX_OPERATIONS, Array, Operand, as_array, elementwise
+from lare.phi.arrays import COMPLEX_OPERATIONS, Array, Complex, Operand, as_array, elementwise
 from lare.phi.graph import Refused, current_builder
-from lare.phi.numpy_functions import FUNCTIONS, call_numpy
+from lare.phi.numpy_functions import call_numpy
 from lare.phi.numpy_functions.registry import numpy_function
 
 LONGEST_TRANSFORM = 256
@@ -20,16 +20,6 @@ PART_BY_PART = frozenset(
     "broadcast_to repeat tile split hsplit array_split array asarray hstack vstack column_stack atleast_1d atleast_2d".split()
 )
 """Functions that act on the real and on the imaginary part in the same way."""
-
-
-class Complex(Operand):
-    """A complex array."""
-
-    def __init__(self, real: Any, imag: Any):
-        self.real, self.imag = real, imag
-
-    def __getitem__(self, index: Any) -> Complex:
-        return Complex(self.real[index], self.imag[index])
 
 
 def as_complex(value: Any) -> Complex:
@@ -49,11 +39,9 @@ def is_complex(value: Any) -> bool:
 
 
 def call_with_complex(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
-    """Call a function of NumPy of which an argument is complex."""
+    """Call a function of NumPy. At least one argument is complex."""
     if name in COMPLEX_FUNCTIONS:
         return COMPLEX_FUNCTIONS[name](*args, **kwargs)
-    if name.startswith("fft."):
-        return FUNCTIONS[name](*args, **kwargs)
     if name not in PART_BY_PART:
         raise Refused("E-NUMPY", f"np.{name} of complex numbers is not available: use np.abs, np.angle, .real or .imag")
 
@@ -165,6 +153,9 @@ def _transform(a: Any, axis: int, sign: float, half: bool) -> Complex:
 
     real = product(x.real, cos) - product(x.imag, sin)
     return Complex(real, product(x.real, sin) + product(x.imag, cos))
+
+
+COMPLEX_FUNCTIONS |= {"fft.fft": fft, "fft.ifft": ifft, "fft.rfft": rfft}
 
 
 def _register_frequencies(name: str) -> None:

@@ -116,18 +116,10 @@ class Interpreter:
                 )
             case ast.While(test=test, body=body, orelse=orelse):
                 self.loop(iter(lambda: lambda: self.truth(self.evaluate(test, scope)), None), body, orelse, scope)
-            case ast.FunctionDef():
-                scope.assign(
-                    statement.name,
-                    classes.decorated(self, self.function(statement, scope), statement.decorator_list, scope),
-                )
-            case ast.ClassDef():
-                scope.assign(
-                    statement.name,
-                    classes.decorated(
-                        self, classes.make_class(self, statement, scope), statement.decorator_list, scope
-                    ),
-                )
+            case ast.FunctionDef() | ast.ClassDef():
+                is_class = isinstance(statement, ast.ClassDef)
+                value = classes.make_class(self, statement, scope) if is_class else self.function(statement, scope)
+                scope.assign(statement.name, classes.decorated(self, value, statement.decorator_list, scope))
             case ast.Try():
                 self.attempt(statement, scope)
             case ast.With(items=items, body=body):

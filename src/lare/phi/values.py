@@ -116,8 +116,9 @@ class Scope(dict):
         self.yielded: list[Any] | None = None
         """What a generator has yielded."""
         self.owner: Class | None = None
+        """The class whose method is called."""
         self.instance: Any = None
-        """The class whose method is called, and the object that it is called on."""
+        """The object that the method is called on."""
 
     def find(self, name: str) -> Any:
         """The value of a name. Raises `NameError` if there is none."""
@@ -227,7 +228,7 @@ class Continue(Exception):
 
 
 class Raised(Exception):
-    """The program raised an error. `names` are those of its class and of the classes above it."""
+    """The program raised an error. `name` is that of its class."""
 
     def __init__(self, name: str, message: str):
         super().__init__(f"the program raises {name}{': ' + message if message else ''}")

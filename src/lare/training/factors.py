@@ -58,7 +58,7 @@ def host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Float[np.n
         LareError: a factor is not finite; the input is saved in the run directory.
     """
     steps = jax.tree.map(np.asarray, steps)
-    lead = np.shape(steps.after.terminated)
+    lead = steps.taken.shape[:-2]
     factors = np.zeros((*lead, config.judged_rows, max(config.factors, default=0)), np.float32)
     for i, (function, team) in enumerate(zip(run.functions, config.env.teams, strict=False)):
         before, action = rows_of(config.judged_from, team, steps.before, steps.taken)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from lare.data.replay import Replay, StoredSteps, oldest_transition, read
 from lare.data.sampling import episodes_since, in_order
+from lare.data.trajectory import Trajectory
 from lare.float64 import float64
 from lare.latent.function import LatentFunction
 from lare.latent.improve import Model, improve
@@ -24,6 +25,7 @@ from lare.tasks.play import Episode, rows_of
 from lare.tasks.spec import TaskSpec
 from lare.training.config import TrainConfig
 from lare.training.episodes import Credit, fit_those_due, from_stored
+from lare.training.factors import host_factors
 from lare.training.learner import Learner, init_credit
 from lare.training.reflect import evidence_of
 from lare.training.seeds import of_seed
@@ -142,12 +144,9 @@ def factors_again(run: Run, config: TrainConfig, buffer: Replay) -> Float[Array,
                 timestep({name: column[env, at] for name, column in columns.items()})
                 for at in (some, (some + 1) % capacity)
             )
-            taken = env_action(columns["action"][env, some], config.env)
-            for place, (function, team) in enumerate(zip(run.functions, config.env.teams, strict=True)):
-                before, action = rows_of(config.judged_from, team, shown, taken)
-                after, _ = rows_of(config.judged_from, team, led_to, taken)
-                z = run.factors(function, *(part.reshape(-1, part.shape[-1]) for part in (before, action, after)))
-                found[env, some, config.judged(place), : z.shape[1]] = z.reshape(*action.shape[:-1], -1)
+            action = columns["action"][env, some]
+            steps = Trajectory(shown, action, env_action(action, config.env), led_to)
+            found[env, some] = host_factors(run, config, steps)
     return jnp.asarray(found)
 
 

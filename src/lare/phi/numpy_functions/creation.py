@@ -241,8 +241,20 @@ LARGEST_CONSTANT, LARGEST_SYSTEM = 1024, 64
 """The most numbers of each argument of these functions, and the most of those that solve equations."""
 
 
-def register_constant_function(name: str, options: str = "", largest: int = LARGEST_CONSTANT) -> None:
-    """A function that NumPy itself computes, of constants. `options` are the keywords that it takes."""
+def register_constant_function(
+    name: str,
+    options: str = "",
+    largest: int = LARGEST_CONSTANT,
+    work: Callable[[Any], int] = lambda x: 20 * np.size(x),
+) -> None:
+    """Register a function of constants that NumPy itself computes.
+
+    Args:
+        name: its name behind `np.`.
+        options: the keywords that it takes.
+        largest: the most numbers of an argument, and the largest integer.
+        work: what it costs to compute, for each of its arguments.
+    """
     function: Any = functools.reduce(getattr, name.split("."), np)
 
     def of_constants(*args: Any, **kwargs: Any) -> Any:
@@ -251,7 +263,7 @@ def register_constant_function(name: str, options: str = "", largest: int = LARG
             raise Refused("E-NUMPY", f"np.{name} takes constants, and {options or 'no keywords'}")
         values = [plain_constant(x, name, largest) for x in args]
         more = {key: plain_constant(x, name, largest) for key, x in kwargs.items()}
-        current_builder().spend(20 * sum(np.size(x) for x in values))
+        current_builder().spend(sum(map(work, values)))
         result = function(*values, **more)
         return tuple(map(as_array, result)) if isinstance(result, (tuple, list)) else as_array(result)
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import re
 import string
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from lare.phi.arrays import ALL, Array, as_array, elementwise, stack
 from lare.phi.graph import Refused, current_builder
+from lare.phi.numpy_functions.creation import register_constant_function
 from lare.phi.numpy_functions.reductions import along
 from lare.phi.numpy_functions.registry import FUNCTIONS, constant_of, numpy_function
 from lare.phi.numpy_functions.shapes import diagonal, ravel
@@ -34,7 +34,7 @@ def einsum(subscripts: Any, *operands: Array, optimize: Any = False) -> Array:
         raise Refused(
             "E-NUMPY", f"np.einsum({subscripts[:40]!r}): use at most 8 arrays and 20 letters, such as 'bij,bj->bi'"
         )
-    left, arrow, right = "".join(subscripts.split()).partition("->")
+    left, arrow, right = compact.partition("->")
     terms = left.split(",")
     unused = [letter for letter in string.ascii_letters if letter not in left]
     ndims = [a.ndim - len(term) + 3 for a, term in zip(operands, terms, strict=True) if "..." in term]
@@ -298,18 +298,7 @@ def _correlate(a: Array, v: Array, mode: str, reverse: bool) -> Any:
     return full[start : start + length]
 
 
-def _register_for_constants(name: str, function: Callable[..., Any]) -> None:
-    def constant_only(a: Array) -> Any:
-        if a.constant is None:
-            raise Refused("E-NUMPY", f"np.{name} of numbers that differ from row to row is not available")
-        current_builder().spend(math.prod(a.row_shape) * max(a.row_shape, default=1))
-        result = function(a.constant)
-        return tuple(map(as_array, result)) if isinstance(result, tuple) else as_array(result)
-
-    numpy_function(name)(constant_only)
-
-
 for _name in (
     "linalg.pinv linalg.cholesky linalg.matrix_rank linalg.cond linalg.eigh linalg.svd linalg.svdvals linalg.qr".split()
 ):
-    _register_for_constants(_name, getattr(np.linalg, _name.partition(".")[2]))
+    register_constant_function(_name, work=lambda x: np.size(x) * max(np.shape(x), default=1))

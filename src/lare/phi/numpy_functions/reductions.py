@@ -94,37 +94,28 @@ def average(a: Array, axis: Any = None, weights: Any = None, *, keepdims: Any = 
     return _sum(a * weights, axis, keepdims) / _sum(weights, axis, keepdims)
 
 
-@numpy_function()
-def var(
-    a: Array,
-    axis: Any = None,
-    *,
-    ddof: Any = 0,
-    keepdims: Any = False,
-    where: Any = True,
-    mean: Any = None,
-    correction: Any = None,
-) -> Any:
-    center = FUNCTIONS["mean"](a, axis, keepdims=True, where=where) if mean is None else mean
-    deviation = elementwise("subtract", as_numbers(a), center)
-    square = elementwise("multiply", deviation, deviation)
-    return _sum(square, axis, keepdims, where) / (_count(a, axis, keepdims, where) - (correction or ddof))
+def _register_spread(name: str, has_root: bool) -> None:
+    def spread(
+        a: Array,
+        axis: Any = None,
+        *,
+        ddof: Any = 0,
+        keepdims: Any = False,
+        where: Any = True,
+        mean: Any = None,
+        correction: Any = None,
+    ) -> Any:
+        center = FUNCTIONS["mean"](a, axis, keepdims=True, where=where) if mean is None else mean
+        deviation = elementwise("subtract", as_numbers(a), center)
+        total = _sum(elementwise("multiply", deviation, deviation), axis, keepdims, where)
+        variance = total / (_count(a, axis, keepdims, where) - (correction or ddof))
+        return elementwise("sqrt", variance) if has_root else variance
+
+    numpy_function(name)(spread)
 
 
-@numpy_function()
-def std(
-    a: Array,
-    axis: Any = None,
-    *,
-    ddof: Any = 0,
-    keepdims: Any = False,
-    where: Any = True,
-    mean: Any = None,
-    correction: Any = None,
-) -> Any:
-    return elementwise(
-        "sqrt", var(a, axis, ddof=ddof, keepdims=keepdims, where=where, mean=mean, correction=correction)
-    )
+_register_spread("var", has_root=False)
+_register_spread("std", has_root=True)
 
 
 @numpy_function()
@@ -170,7 +161,7 @@ def nanmean(a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
 @numpy_function()
 def nanvar(a: Array, axis: Any = None, *, ddof: Any = 0, keepdims: Any = False) -> Any:
     a, where = elementwise("where", elementwise("isnan", a), 0, a), _not_nan(a)
-    return var(a, axis, ddof=ddof, keepdims=keepdims, where=where)
+    return FUNCTIONS["var"](a, axis, ddof=ddof, keepdims=keepdims, where=where)
 
 
 @numpy_function()

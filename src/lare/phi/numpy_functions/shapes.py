@@ -15,9 +15,9 @@ from lare.phi.arrays import (
     BATCH,
     Array,
     BatchSize,
-    _common_batch_axis,
     as_array,
     broadcast,
+    common_batch_axis,
     concatenate,
     elementwise,
     stack,
@@ -347,7 +347,7 @@ def broadcast_to(array: Array, shape: Any) -> Array:
 
 @numpy_function()
 def broadcast_arrays(*args: Array) -> list[Array]:
-    shape, batch_axis = np.broadcast_shapes(*(a.row_shape for a in args)), _common_batch_axis(args)
+    shape, batch_axis = np.broadcast_shapes(*(a.row_shape for a in args)), common_batch_axis(args)
     return [broadcast(a, shape, batch_axis) for a in args]
 
 
