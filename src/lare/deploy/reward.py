@@ -71,7 +71,7 @@ def reward_graph(credit: Decomposition | None, config: TrainConfig, team_index: 
 
 
 class _StepInputs:
-    """The arrays of a step. The graph gets those that are asked for."""
+    """The input arrays of a step. An array becomes an input of the graph when it is first used."""
 
     def __init__(self, config: TrainConfig, rows: tuple[int, ...]):
         width = config.env.action_size * (config.env.agents if config.of_state else 1)

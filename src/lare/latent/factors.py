@@ -1,4 +1,4 @@
-"""Computes the factors of steps with NumPy, and refuses those that are not finite."""
+"""Compute the factors of steps with NumPy. Factors that are not finite are an error."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ CHUNK = 1 << 22
 
 
 class LatentRewardError(LareError):
-    """A function gave a factor that is not finite. `observation` and `action` are the batch."""
+    """A factor is not finite. `observation` and `action` are the batch for which it was computed."""
 
     def __init__(self, message: str, observation: np.ndarray, action: np.ndarray):
         super().__init__(message)
@@ -26,7 +26,7 @@ def compute_factors(
     observation: Float[np.ndarray, "batch observation"],
     action: Float[np.ndarray, "batch action"],
 ) -> Float[np.ndarray, "batch factors"]:
-    """The factors of a batch, which may not be finite."""
+    """Compute the factors of a batch. They are not checked: they may be infinite or NaN."""
     rows = max(1, CHUNK // max(graph.size, 1))
     chunks = [
         evaluate(graph, {"observation": observation[i : i + rows], "action": action[i : i + rows]})["factors"]

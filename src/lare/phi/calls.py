@@ -8,7 +8,7 @@ from lare.phi.values import Function
 
 
 def bind_arguments(function: Function, args: Sequence[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """The names of a call: its arguments, and the defaults of those that are missing."""
+    """Return the value of each parameter: its argument, or its default if there is none."""
     parameters = function.parameters
     positional = [parameter.arg for parameter in (*parameters.posonlyargs, *parameters.args)]
     values = dict(zip(positional[len(positional) - len(function.defaults) :], function.defaults, strict=True))

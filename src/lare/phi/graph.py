@@ -113,7 +113,7 @@ class Gather(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """Operations in order, each after those that it needs."""
+    """Operations, sorted: each one stands after the operations whose results it reads."""
 
     nodes: tuple[Node, ...]
     outputs: dict[str, int]
