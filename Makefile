@@ -7,9 +7,9 @@ BIN := $(VENV)/bin
 .PHONY: demo test test-long check docs site setup clean
 
 demo: setup ## Train HalfCheetah on episodic rewards with recorded replies, and draw the report
-	@if [ -e runs/demo ]; then $(BIN)/lare train --resume runs/demo; \
-	else $(BIN)/lare train HalfCheetah-v4 --steps 60000 --out runs/demo; fi
-	@$(BIN)/lare report runs/demo
+	@if [ -e runs/demo ]; then $(BIN)/lare-rl train --resume runs/demo; \
+	else $(BIN)/lare-rl train HalfCheetah-v4 --steps 60000 --out runs/demo; fi
+	@$(BIN)/lare-rl report runs/demo
 
 test: check ## Lint, format, types, tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal

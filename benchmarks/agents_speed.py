@@ -2,7 +2,7 @@
 
     python benchmarks/agents_speed.py
 
-The contenders take turns; a turn is ten updates of one session, by the same `Session.advance` that `lare train` calls, so that
+The contenders take turns; a turn is ten updates of one session, by the same `Session.advance` that `lare-rl train` calls, so that
 each part of the work has the same share as in a whole run. A run of 1000 updates takes as long as a hundred turns and its
 evaluations. The picture of the cost by the number of agents is docs/pictures/agents-cost.svg.
 """
@@ -15,11 +15,11 @@ from typing import Any
 
 import tyro
 
-import lare
-from lare.credit.methods import METHODS
-from lare.experiments import figures
-from lare.tasks.particles.table import find_particle_task
-from lare.training.session import Session
+import lare_rl
+from lare_rl.credit.methods import METHODS
+from lare_rl.envs.particles.catalogue import find_particle_task
+from lare_rl.report import figures
+from lare_rl.training.session import Session
 from measure import advance, interleave, new_session, show, summary, write
 
 TASKS = ("TriangleArea", "CN-6", "CN-15", "CN-30")
@@ -32,7 +32,7 @@ PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "agents-cost.svg"
 
 
 def session(directory: Path, task_name: str, method: str, seeds: int = 1) -> Session:
-    return new_session(directory, task_name, lare.Settings(method=method, seed=SEED, seeds=seeds))
+    return new_session(directory, task_name, lare_rl.Settings(method=method, seed=SEED, seeds=seeds))
 
 
 def turn(of: Session) -> None:

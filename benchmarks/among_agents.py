@@ -14,14 +14,14 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from lare.experiments.watch import on_device, proxy_of
-from lare.run.directory import Run, open_run
-from lare.tasks.env import JaxEnv
-from lare.tasks.table import make_env
-from lare.training.compiled import module_of
-from lare.training.factors import host_factors
-from lare.training.seeds import of_seed
-from lare.training.session import load_learner
+from lare_rl.envs.families import make_env
+from lare_rl.envs.interface import JaxEnv
+from lare_rl.evaluation.watch import on_device, proxy_of
+from lare_rl.runs.directory import Run, open_run
+from lare_rl.training.compiled import module_of
+from lare_rl.training.factors import host_factors
+from lare_rl.training.seed_axis import of_seed
+from lare_rl.training.session import load_learner
 from measure import apart, correlation, write
 
 EPISODES, KEY = 100, 7

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lare.credit import evidence
-from lare.credit.basis import pairs
-from lare.run.directory import read_config
+from lare_rl.credit import evidence
+from lare_rl.credit.basis import pairs
+from lare_rl.runs.directory import read_config
 from measure import write
 from stored import of_each_seed
 

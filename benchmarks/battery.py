@@ -16,13 +16,13 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
-import lare
-from lare.algorithms.settings import SACSettings
-from lare.credit import basis
-from lare.data import replay
-from lare.training.learner import Paid, rewards
-from lare.training.seeds import of_seed
-from lare.training.session import load_learner
+import lare_rl
+from lare_rl.algorithms.settings import SACSettings
+from lare_rl.credit import basis
+from lare_rl.data import replay
+from lare_rl.training.learner import Paid, rewards
+from lare_rl.training.seed_axis import of_seed
+from lare_rl.training.session import load_learner
 from measure import write
 
 STEPS, WARMUP, SEEDS = 10_000, 2_000, 5
@@ -73,9 +73,9 @@ def make(**kwargs: object) -> gymnasium.Env:
 gymnasium.register("benchmarks/Battery-v0", entry_point=make, max_episode_steps=HALF_HOURS)
 
 
-def task() -> lare.TaskSpec:
+def task() -> lare_rl.TaskSpec:
     """The task without texts for a language model: no row has a `phi`."""
-    return lare.TaskSpec(
+    return lare_rl.TaskSpec(
         name="Battery",
         environment="benchmarks/Battery-v0",
         observation_size=4,
@@ -86,7 +86,7 @@ def task() -> lare.TaskSpec:
     )
 
 
-def beside_a_potential(run: lare.Run) -> list[dict[str, float]]:
+def beside_a_potential(run: lare_rl.Run) -> list[dict[str, float]]:
     """How far the proxy rewards of each seed are the true rewards plus the difference of a quadratic function of the state."""
     config, learner, _, _ = load_learner(run)
     found = []
@@ -114,7 +114,7 @@ def main(out: str) -> None:
     table = {}
     for name, (method, most) in ROWS.items():
         basis.MOST_PAIRED = most
-        settings = lare.Settings(
+        settings = lare_rl.Settings(
             method=method,
             algorithm="sac",
             steps=STEPS,
@@ -123,13 +123,13 @@ def main(out: str) -> None:
             sac=SACSettings(warmup=WARMUP),
         )
         place = Path(out) / name.replace(" ", "-")
-        run = lare.open_run(place) if place.exists() else lare.train(task(), settings, out=place, listeners=[])
+        run = lare_rl.open_run(place) if place.exists() else lare_rl.train(task(), settings, out=place, listeners=[])
         last = [line for line in run.metrics() if line["step"] == STEPS]
         table[name] = {key: [line[key] for line in last] for key in KEYS if key in last[0]}
         for key, each in table[name].items():
             print(f"{name:20s} {key:20s} {np.mean(each):8.3f} ± {np.std(each, ddof=1):.3f}", flush=True)
     basis.MOST_PAIRED = ROWS["bayes"][1]
-    potential = beside_a_potential(lare.open_run(Path(out) / "bayes"))
+    potential = beside_a_potential(lare_rl.open_run(Path(out) / "bayes"))
     print(potential)
     write("battery", {"steps": STEPS, "warmup": WARMUP, "algorithm": "sac", "rows": table, "potential": potential})
 

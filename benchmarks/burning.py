@@ -5,7 +5,7 @@ import time
 import numpy as np
 from jaxtyping import Float
 
-from lare.tasks.env import EnvSpec, Team, Timestep
+from lare_rl.envs.interface import EnvSpec, Team, Timestep
 
 
 class Burns:

@@ -10,9 +10,9 @@ import sys
 
 import numpy as np
 
-from lare.experiments.agents import sample
-from lare.experiments.credit import correlations
-from lare.run.directory import open_run
+from lare_rl.evaluation.episode_credit import correlations
+from lare_rl.evaluation.team_matches import sample
+from lare_rl.runs.directory import open_run
 from measure import write
 
 

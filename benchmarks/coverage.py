@@ -3,7 +3,7 @@
     python benchmarks/coverage.py
 
 Draws scores of one task from a normal and from an exponential distribution, 5,000 times each. Counts the bootstrap intervals of
-`lare compare` (percentiles of 2,000 samples) that contain the interquartile mean of the distribution and, for two methods with the
+`lare-rl compare` (percentiles of 2,000 samples) that contain the interquartile mean of the distribution and, for two methods with the
 same distribution, 0. Writes results/coverage.json.
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from lare.experiments.statistics import REPETITIONS, interquartile_means
+from lare_rl.compare.statistics import REPETITIONS, interquartile_means
 from measure import write
 
 CASES = 5000

@@ -13,19 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare.algorithms.table import ALGORITHMS
-from lare.credit import arel
-from lare.credit.methods import find_method
-from lare.credit.settings import CreditSettings
-from lare.data.trajectory import Trajectory
-from lare.experiments.watch import on_device, proxy_of
-from lare.tasks.particles.env import ParticleJaxEnv
-from lare.tasks.particles.task import STEPS
-from lare.training import learner as common
-from lare.training.compiled import module_of, new_learners
-from lare.training.config import TrainConfig
-from lare.training.learner import Learner
-from lare.training.seeds import of_seed
+from lare_rl.algorithms.table import ALGORITHMS
+from lare_rl.credit import arel
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.methods import find_method
+from lare_rl.data.trajectory import Trajectory
+from lare_rl.envs.particles.particle_env import ParticleJaxEnv
+from lare_rl.envs.particles.task import STEPS
+from lare_rl.evaluation.watch import on_device, proxy_of
+from lare_rl.training import learner as common
+from lare_rl.training.compiled import module_of, new_learners
+from lare_rl.training.learner import Learner
+from lare_rl.training.seed_axis import of_seed
+from lare_rl.training.static_config import TrainConfig
 from measure import apart, correlation, write
 
 ENV, STORED, JUDGED, AT_A_TIME = ParticleJaxEnv("CN-6"), 1600, 200, 100

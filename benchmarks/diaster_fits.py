@@ -15,16 +15,16 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from lare.credit import accuracy, decomposition
-from lare.credit.methods import METHODS
-from lare.credit.settings import RECENT, CreditSettings
-from lare.data import replay
-from lare.run.directory import open_run
-from lare.training import learner as common
-from lare.training.config import TrainConfig
-from lare.training.learner import Learner, Paid
-from lare.training.seeds import of_seed
-from lare.training.session import load_learner
+from lare_rl.credit import accuracy, decomposition
+from lare_rl.credit.decoder_settings import RECENT, CreditSettings
+from lare_rl.credit.methods import METHODS
+from lare_rl.data import replay
+from lare_rl.runs.directory import open_run
+from lare_rl.training import learner as common
+from lare_rl.training.learner import Learner, Paid
+from lare_rl.training.seed_axis import of_seed
+from lare_rl.training.session import load_learner
+from lare_rl.training.static_config import TrainConfig
 from measure import write
 
 AT_A_TIME = 50

@@ -15,11 +15,11 @@ from unittest import mock
 import jax
 import numpy as np
 
-import lare
-from lare.run.decide import decide
-from lare.run.directory import create
-from lare.training import first_fit, session
-from lare.training.streams import Stream, stream_keys
+import lare_rl
+from lare_rl.config.resolve import decide
+from lare_rl.runs.directory import create
+from lare_rl.training import first_fit, session
+from lare_rl.training.streams import Stream, stream_keys
 from measure import write
 
 LARGE = "held-out, updates as large as later ones"
@@ -35,10 +35,10 @@ def main() -> None:
 
 
 def measured(name: str, way: str) -> dict[str, Any]:
-    task = lare.load_task(name)
-    settings = lare.Settings(method="lare-rd", seeds=3, first_fit="published" if way == "published" else "held-out")
+    task = lare_rl.load_task(name)
+    settings = lare_rl.Settings(method="lare-rd", seeds=3, first_fit="published" if way == "published" else "held-out")
     with tempfile.TemporaryDirectory() as there:
-        run = create(Path(there) / "run", task, decide(settings, task), [lare.design(task)])
+        run = create(Path(there) / "run", task, decide(settings, task), [lare_rl.design(task)])
         begun = session.start(run)
         try:
             steps = begun.collector.collect(begun.actor, 0)

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-import lare
+import lare_rl
 from basis import ASKED, CHOSEN, fitted, scores, standardised
-from lare.credit.basis import pairs
-from lare.run.directory import read_config
+from lare_rl.credit.basis import pairs
+from lare_rl.runs.directory import read_config
 from measure import write
 from missing_factors import FACTORS, source
 from stored import of_each_seed
@@ -30,15 +30,15 @@ EPISODES = (15, 30, 55)
 ASKED_OF = ("target speed", "no more than 3 m/s", "an entry no factor sees")
 
 
-def functions() -> Iterator[tuple[str, lare.LatentFunction]]:
-    task = lare.load_task(TASK)
+def functions() -> Iterator[tuple[str, lare_rl.LatentFunction]]:
+    task = lare_rl.load_task(TASK)
     for draw in range(5):
-        yield f"draw {draw}", lare.design(task, draw=draw)
+        yield f"draw {draw}", lare_rl.design(task, draw=draw)
     with TemporaryDirectory() as place:
         for name in (*(f"without-{factor}" for factor in FACTORS[TASK]), "irrelevant"):
             path = Path(place) / f"{name}.py"
             path.write_text(source(TASK, name))
-            yield name, lare.load_function(path, task)
+            yield name, lare_rl.load_function(path, task)
 
 
 def groups_of(z: Array | None, x: Array) -> Iterator[tuple[str, list[Array]]]:
@@ -50,7 +50,7 @@ def groups_of(z: Array | None, x: Array) -> Iterator[tuple[str, list[Array]]]:
 
 
 def main(directory: str) -> None:
-    chosen: dict[str, lare.LatentFunction | None] = {**dict(functions()), "none": None}
+    chosen: dict[str, lare_rl.LatentFunction | None] = {**dict(functions()), "none": None}
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for after, action, _, paid, ends in of_each_seed(directory):
         truths = scores(after, action, paid, SPEED)

@@ -22,20 +22,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import lare
-from lare.algorithms.settings import TD3Settings
-from lare.latent.factors import compute_factors
-from lare.latent.verify import verify
-from lare.phi.evaluate import evaluate
-from lare.phi.graph import Graph, Refused
-from lare.phi.read import read
-from lare.training.compiled import compiled
-from lare.training.factors import compiles
+import lare_rl
+from lare_rl.algorithms.settings import TD3Settings
+from lare_rl.latent.factors import compute_factors
+from lare_rl.latent.verify import verify
+from lare_rl.phi.evaluate import evaluate
+from lare_rl.phi.graph import Graph, Refused
+from lare_rl.phi.read import read
+from lare_rl.training.compiled import compiled
+from lare_rl.training.factors import compiles
 from measure import interleave, new_session, write
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from phi.corpus import Program, benign, hostile, recorded, varied
-from phi.test_limits import ATTACKS
+from helpers.attacks import ATTACKS
+from helpers.corpus import Program, benign, hostile, recorded, varied
 
 SEED = 0
 
@@ -97,8 +97,8 @@ def programs() -> None:
     attacks = [Program(name, (17, 6), source) for name, source in ATTACKS.items()]
     read_all(benign())  # what is loaded at first use
     figures = {name: read_all(corpus) for name, corpus in (*corpora().items(), ("attacks", attacks))}
-    task = lare.load_task("HalfCheetah-v4")
-    phi = lare.design(task, candidates=1)
+    task = lare_rl.load_task("HalfCheetah-v4")
+    phi = lare_rl.design(task, candidates=1)
     verify(phi.source, task)
     seconds = []
     for _ in range(20):
@@ -285,7 +285,7 @@ def graph_costs(program: Program) -> dict[str, float]:
     return costs
 
 
-def iteration_costs(task: str, settings: lare.Settings, rounds: int = 5) -> dict[str, float]:
+def iteration_costs(task: str, settings: lare_rl.Settings, rounds: int = 5) -> dict[str, float]:
     """Milliseconds of an iteration, of storing its steps, and of storing them without phi."""
     with tempfile.TemporaryDirectory() as folder:
         session = new_session(Path(folder) / "run", task, settings)
@@ -311,10 +311,10 @@ def iteration_costs(task: str, settings: lare.Settings, rounds: int = 5) -> dict
 
 
 ITERATIONS = {
-    "HalfCheetah-v4": lare.Settings(method="lare-bayes", algorithm="td3", td3=TD3Settings(warmup=100)),
-    "CN-6": lare.Settings(method="lare-bayes", algorithm="ippo"),
-    "CN-30": lare.Settings(method="lare-bayes", algorithm="ippo"),
-    "SMAX-2s3z": lare.Settings(method="lare-rd", algorithm="qmix"),
+    "HalfCheetah-v4": lare_rl.Settings(method="lare-bayes", algorithm="td3", td3=TD3Settings(warmup=100)),
+    "CN-6": lare_rl.Settings(method="lare-bayes", algorithm="ippo"),
+    "CN-30": lare_rl.Settings(method="lare-bayes", algorithm="ippo"),
+    "SMAX-2s3z": lare_rl.Settings(method="lare-rd", algorithm="qmix"),
 }
 
 

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-import lare
-from lare.credit.settings import CreditSettings
-from lare.experiments import figures
+import lare_rl
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.report import figures
 
 PUBLISHED = {"credit": CreditSettings(normalise=False)}
 
@@ -62,9 +62,9 @@ def run(directory: Path, wanted: list[str]) -> None:
         task, label = name.split("/")
         out = directory / name
         if out.exists():
-            lare.resume(out)
+            lare_rl.resume(out)
         else:
-            lare.train(task, lare.Settings(**COMMON, **EXPERIMENTS[task][label]), out=out)
+            lare_rl.train(task, lare_rl.Settings(**COMMON, **EXPERIMENTS[task][label]), out=out)
 
 
 def keep(directory: Path) -> None:

@@ -15,12 +15,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-import lare
-from lare.run.decide import decide
-from lare.run.directory import create
-from lare.source import source
-from lare.training.session import Session, start
-from lare.training.train import chosen_functions
+import lare_rl
+from lare_rl.config.resolve import decide
+from lare_rl.runs.directory import create
+from lare_rl.training.session import Session, start
+from lare_rl.training.train import chosen_functions
+from lare_rl.util.provenance import source
 
 PACKAGES = (
     "lare-rl",
@@ -144,9 +144,9 @@ def machine() -> dict[str, Any]:
     return {"processor": model, "cores": os.cpu_count(), "usable": usable, "backend": jax.default_backend()}
 
 
-def new_session(directory: Path, task_name: str, settings: lare.Settings) -> Session:
-    """The session that `lare.train` starts, without its loop."""
-    task = lare.load_task(task_name)
+def new_session(directory: Path, task_name: str, settings: lare_rl.Settings) -> Session:
+    """The session that `lare_rl.train` starts, without its loop."""
+    task = lare_rl.load_task(task_name)
     resolved = decide(settings, task)
     return start(create(directory, task, resolved, chosen_functions(task, resolved, None)))
 

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import lare
+import lare_rl
 from learning import read
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -53,7 +53,7 @@ def source(task: str, function: str) -> str:
     """The recorded function, whole or without a factor, or an irrelevant function."""
     if function == "irrelevant":
         return f"import numpy as np\n\n\ndef evaluation_func(observation, action):\n    return {IRRELEVANT[task]}\n"
-    recorded = lare.design(lare.load_task(task)).source
+    recorded = lare_rl.design(lare_rl.load_task(task)).source
     if function == "all":
         return recorded
     left = [name for name in FACTORS[task] if name != function.removeprefix("without-")]
@@ -68,7 +68,7 @@ def run(directory: Path, wanted: list[str]) -> None:
         task, method, function = name.split("/")
         out = directory / name
         if out.exists():
-            lare.resume(out)
+            lare_rl.resume(out)
             continue
         phi = directory / f"{task}-{function}.py"
         phi.parent.mkdir(parents=True, exist_ok=True)
@@ -76,7 +76,7 @@ def run(directory: Path, wanted: list[str]) -> None:
         settings = dict(SETTINGS[task])
         if method == "lare-bayes":
             settings.pop("first_fit", None)
-        lare.train(task, lare.Settings(method=method, **settings), function=phi, out=out)
+        lare_rl.train(task, lare_rl.Settings(method=method, **settings), function=phi, out=out)
 
 
 def keep(directory: Path) -> None:

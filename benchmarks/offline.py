@@ -1,9 +1,9 @@
-"""An offline learner on logged episodes: trained on true rewards, on the return at the end, and on rewards by `lare relabel`.
+"""An offline learner on logged episodes: trained on true rewards, on the return at the end, and on rewards by `lare-rl relabel`.
 
-    lare train HalfCheetah-v4 --method dense --steps 60000 --evaluate-every 20000 --out RUN
+    lare-rl train HalfCheetah-v4 --method dense --steps 60000 --evaluate-every 20000 --out RUN
     python benchmarks/offline.py RUN
 
-The log has all 60 episodes of the run's training, from random actions on. `lare relabel` sees only the return of each episode.
+The log has all 60 episodes of the run's training, from random actions on. `lare-rl relabel` sees only the return of each episode.
 The learner is TD3+BC, `examples/offline_td3_bc.py`, with seeds 0 to 2 for each kind of rewards. The returns of all evaluations,
 and how well the proxy rewards agree with the true ones, are written to results/offline.json.
 """
@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import lare
-from lare.data import replay
-from lare.logs.source import open_logs
-from lare.training.seeds import of_seed
-from lare.training.session import load_learner
+import lare_rl
+from lare_rl.data import replay
+from lare_rl.logs.source import open_logs
+from lare_rl.training.seed_axis import of_seed
+from lare_rl.training.session import load_learner
 from measure import write
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
@@ -29,7 +29,7 @@ UPDATES, SEEDS = 50_000, (0, 1, 2)
 METHODS = ("lare-bayes", "bayes")
 
 
-def write_log(run: lare.Run, out: Path) -> list[float]:
+def write_log(run: lare_rl.Run, out: Path) -> list[float]:
     """Write the training episodes of a run's first seed as .npz files with their scores. Returns the episodes' returns."""
     _, learner, host, _ = load_learner(run)
     buffer = of_seed(learner).replay
@@ -63,7 +63,7 @@ def scores(log: Path, rewards: str, environment: str) -> list[list[float]]:
 
 
 def main(run: str) -> None:
-    opened = lare.open_run(run)
+    opened = lare_rl.open_run(run)
     task = opened.config.task
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "log"
@@ -71,8 +71,8 @@ def main(run: str) -> None:
         found = {}
         for method in METHODS:
             out = Path(folder) / method
-            phi = lare.design(task) if method.startswith("lare-") else None
-            told = lare.relabel(log, out, method=method, phi=phi, task=task)
+            phi = lare_rl.design(task) if method.startswith("lare-") else None
+            told = lare_rl.relabel(log, out, method=method, phi=phi, task=task)
             found[method] = {"held-out R^2": told.return_r2, "correlation with true rewards": agreement(out)}
             found[method]["returns"] = scores(out, "rewards", task.environment)
         found["return at the end"] = {"returns": scores(log, "end", task.environment)}

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lare.experiments.scores import last_quarter
-from lare.experiments.statistics import mann_whitney, mann_whitney_u
+from lare_rl.compare.scores import last_quarter
+from lare_rl.compare.statistics import mann_whitney, mann_whitney_u
 from learning import mean_and_spread, read
 
 

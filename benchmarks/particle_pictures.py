@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare.tasks.particles.drawing import draw
-from lare.tasks.particles.table import find_particle_task
+from lare_rl.envs.particles.catalogue import find_particle_task
+from lare_rl.envs.particles.drawing import draw
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 

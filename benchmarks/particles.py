@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import tyro
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare.tasks.particles.table import find_particle_task
-from lare.tasks.particles.task import ACTIONS, STEPS, ParticleTask
-from lare.tasks.particles.world import State
+from lare_rl.envs.particles.catalogue import find_particle_task
+from lare_rl.envs.particles.task import ACTIONS, STEPS, ParticleTask
+from lare_rl.envs.particles.world import State
 from measure import interleave, show, summary, write
 
 with warnings.catch_warnings():

@@ -26,11 +26,11 @@ import tyro
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-import lare
-from lare.plugs.gymnasium import Credit
-from lare.plugs.pettingzoo import CreditParallel
-from lare.plugs.torchrl import CreditTransform
-from lare.tasks.particles.pettingzoo import ParticleEnv
+import lare_rl
+from lare_rl.envs.particles.parallel_env import ParticleEnv
+from lare_rl.integrations.gymnasium import Credit
+from lare_rl.integrations.pettingzoo import CreditParallel
+from lare_rl.integrations.torchrl import CreditTransform
 from measure import interleave, show, summary, write
 from plugs_sb3 import TASK, assigner, environment_of, ppo, sbx_sac
 
@@ -40,7 +40,7 @@ PLAIN, PLUG = "plain", "with the plug"
 Turns = Mapping[str, Callable[[], object]]
 
 
-def of_gymnasium(task: lare.TaskSpec) -> Turns:
+def of_gymnasium(task: lare_rl.TaskSpec) -> Turns:
     """An episode of random actions."""
     plain = environment_of(task, dense=False)
 
@@ -60,7 +60,7 @@ def of_pettingzoo() -> Turns:
         "observation_space": one.observation_space("agent_0"),
         "action_space": one.action_space("agent_0"),
     }
-    credit = lare.CreditAssigner("bayes", **spaces, agents=6, max_steps=25)
+    credit = lare_rl.CreditAssigner("bayes", **spaces, agents=6, max_steps=25)
 
     def play(environment: Any) -> None:
         for episode in range(STEPS // 25):
@@ -71,7 +71,7 @@ def of_pettingzoo() -> Turns:
     return {PLAIN: partial(play, one), PLUG: partial(play, CreditParallel(ParticleEnv("CN-6"), credit))}
 
 
-def of_torchrl(task: lare.TaskSpec) -> Turns:
+def of_torchrl(task: lare_rl.TaskSpec) -> Turns:
     """An episode goes into the buffer, and a batch is drawn for each of its steps."""
     environment, rows = environment_of(task, dense=False), []
     observation, _ = environment.reset(seed=0)
@@ -99,7 +99,7 @@ def of_torchrl(task: lare.TaskSpec) -> Turns:
     return {PLAIN: partial(train, buffer()), PLUG: partial(train, plugged)}
 
 
-def of_ppo(task: lare.TaskSpec) -> Turns:
+def of_ppo(task: lare_rl.TaskSpec) -> Turns:
     """A rollout, and the updates on it."""
 
     def learning(rewards: str) -> Callable[[], object]:
@@ -109,7 +109,7 @@ def of_ppo(task: lare.TaskSpec) -> Turns:
     return {PLAIN: learning("episodic"), PLUG: learning("lare-bayes")}
 
 
-def of_sbx(task: lare.TaskSpec) -> Turns:
+def of_sbx(task: lare_rl.TaskSpec) -> Turns:
     """A step and an update."""
 
     def learning(rewards: str) -> Callable[[], object]:
@@ -127,7 +127,7 @@ def main(rounds: int = 5, sbx: bool = False) -> None:
         rounds: number of turns of each contender, after one that is not counted.
         sbx: measure only SBX's SAC.
     """
-    task = lare.load_task(TASK)
+    task = lare_rl.load_task(TASK)
     contenders = {
         "Gymnasium": (partial(of_gymnasium, task), STEPS),
         "PettingZoo": (of_pettingzoo, STEPS),

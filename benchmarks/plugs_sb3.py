@@ -1,4 +1,4 @@
-"""The cost of `lare.plugs.sb3` in Stable-Baselines3, and learning curves with it.
+"""The cost of `lare_rl.integrations.sb3` in Stable-Baselines3, and learning curves with it.
 
     python benchmarks/plugs_sb3.py cost                                      results/plugs/sb3_cost.json
     python benchmarks/plugs_sb3.py learn --algorithm td3 --rewards lare-bayes   results/plugs/td3-lare-bayes.jsonl
@@ -26,9 +26,9 @@ from stable_baselines3 import PPO, TD3
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import lare
+import lare_rl
 from evaluations import Evaluations, evaluate
-from lare.plugs.sb3 import CreditCallback, CreditReplayBuffer
+from lare_rl.integrations.sb3 import CreditCallback, CreditReplayBuffer
 from measure import PPO as PPO_COMMON
 from measure import TD3 as TD3_SETTINGS
 from measure import interleave, provenance, show, summary, write
@@ -37,19 +37,19 @@ TASK, RESULTS = "HalfCheetah-v4", Path(__file__).parent / "results" / "plugs"
 PPO_SETTINGS: dict[str, Any] = {**PPO_COMMON, "policy_kwargs": {"net_arch": [256, 256], "activation_fn": torch.nn.Tanh}}
 
 
-def assigner(method: str, task: lare.TaskSpec, seed: int, **more: Any) -> lare.CreditAssigner:
+def assigner(method: str, task: lare_rl.TaskSpec, seed: int, **more: Any) -> lare_rl.CreditAssigner:
     """An assigner, with the function of the recorded replies if the method needs one."""
-    phi = lare.design(task) if method.startswith("lare-") else None
-    return lare.CreditAssigner(method, phi, task=task, seed=seed, **more)
+    phi = lare_rl.design(task) if method.startswith("lare-") else None
+    return lare_rl.CreditAssigner(method, phi, task=task, seed=seed, **more)
 
 
-def environment_of(task: lare.TaskSpec, dense: bool) -> gymnasium.Env:
+def environment_of(task: lare_rl.TaskSpec, dense: bool) -> gymnasium.Env:
     """The environment with a true reward at every step, or with the return at the end."""
     made = gymnasium.make(task.environment)
-    return made if dense else lare.EpisodicReward(made)
+    return made if dense else lare_rl.EpisodicReward(made)
 
 
-def plug_of(task: lare.TaskSpec, rewards: str, seed: int) -> dict[str, Any]:
+def plug_of(task: lare_rl.TaskSpec, rewards: str, seed: int) -> dict[str, Any]:
     """The plug's arguments for an algorithm with a replay buffer; empty if it learns from its environment's rewards."""
     if rewards in ("dense", "episodic"):
         return {}
@@ -57,7 +57,7 @@ def plug_of(task: lare.TaskSpec, rewards: str, seed: int) -> dict[str, Any]:
     return {"replay_buffer_class": CreditReplayBuffer, "replay_buffer_kwargs": {"credit": credit}}
 
 
-def td3(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> TD3:
+def td3(task: lare_rl.TaskSpec, rewards: str, seed: int, warmup: int) -> TD3:
     """TD3 on the true rewards (`dense`), on the return (`episodic`), or on those of a method."""
     environment, plug = environment_of(task, rewards == "dense"), plug_of(task, rewards, seed)
     noise = NormalActionNoise(np.zeros(task.action_size), 0.1 * np.ones(task.action_size))
@@ -74,7 +74,7 @@ def td3(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> TD3:
     )
 
 
-def sbx_sac(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> Any:
+def sbx_sac(task: lare_rl.TaskSpec, rewards: str, seed: int, warmup: int) -> Any:
     """SBX's SAC, likewise. SBX is imported here, because the others do not need it."""
     from sbx import SAC
 
@@ -84,7 +84,7 @@ def sbx_sac(task: lare.TaskSpec, rewards: str, seed: int, warmup: int) -> Any:
     return SAC("MlpPolicy", environment_of(task, rewards == "dense"), **settings)
 
 
-def ppo(task: lare.TaskSpec, rewards: str, seed: int) -> tuple[PPO, list[CreditCallback]]:
+def ppo(task: lare_rl.TaskSpec, rewards: str, seed: int) -> tuple[PPO, list[CreditCallback]]:
     """PPO, normalised by VecNormalize, and the callback with which it learns from a method."""
     environment = VecNormalize(DummyVecEnv([partial(environment_of, task, rewards == "dense")]))
     settings: Any = PPO_SETTINGS | {"policy_kwargs": dict(PPO_SETTINGS["policy_kwargs"])}
@@ -102,7 +102,7 @@ def cost(rounds: int = 4, steps: int = 1000, methods: tuple[str, ...] = ("lare-b
         steps: environment steps in a turn, a multiple of an episode.
         methods: methods of the plug.
     """
-    task = lare.load_task(TASK)
+    task = lare_rl.load_task(TASK)
     models = {name: td3(task, name, 0, steps) for name in ("episodic", *methods)}
 
     def advance(model: TD3, by: int = steps) -> None:
@@ -140,7 +140,7 @@ def learn(
         episodes: number of episodes in one evaluation.
         warmup: random steps before the first update; ppo has none.
     """
-    spec = lare.load_task(task)
+    spec = lare_rl.load_task(task)
     RESULTS.mkdir(parents=True, exist_ok=True)
     out = RESULTS / f"{algorithm}-{rewards}.jsonl"
     with out.open("a") as file:

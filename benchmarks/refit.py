@@ -15,19 +15,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare.credit import accuracy, decomposition, descent
-from lare.credit.decomposition import Decomposition, Episodes
-from lare.credit.methods import Fit
-from lare.credit.settings import RECENT
-from lare.data import replay
-from lare.data.sampling import CreditSample, sample_parts
-from lare.normalise import Scale
-from lare.run.directory import open_run
-from lare.training import learner as common
-from lare.training.config import TrainConfig
-from lare.training.learner import Learner
-from lare.training.seeds import of_seed
-from lare.training.session import load_learner
+from lare_rl.credit import accuracy, decomposition, descent
+from lare_rl.credit.decoder_settings import RECENT
+from lare_rl.credit.decomposition import Decomposition, Episodes
+from lare_rl.credit.methods import Fit
+from lare_rl.data import replay
+from lare_rl.data.sampling import CreditSample, sample_parts
+from lare_rl.nn.normalise import Scale
+from lare_rl.runs.directory import open_run
+from lare_rl.training import learner as common
+from lare_rl.training.learner import Learner
+from lare_rl.training.seed_axis import of_seed
+from lare_rl.training.session import load_learner
+from lare_rl.training.static_config import TrainConfig
 from measure import write
 
 UPDATES, STRETCH = 20_000, 5_000

@@ -1,4 +1,4 @@
-"""Steps per second of `lare.relabel`, in closed form: a million synthetic steps of 11 entries and 3 actions, in memory.
+"""Steps per second of `lare_rl.relabel`, in closed form: a million synthetic steps of 11 entries and 3 actions, in memory.
 
     python benchmarks/relabel.py [STEPS]
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-import lare
+import lare_rl
 from measure import write
 
 LENGTH, ENTRIES, ACTIONS = 1000, 11, 3
@@ -51,7 +51,7 @@ def main(steps: int) -> None:
     making = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        found = lare.relabel(Log(steps // LENGTH), Path(folder) / "new", told=told)
+        found = lare_rl.relabel(Log(steps // LENGTH), Path(folder) / "new", told=told)
         end = time.perf_counter()
     figures = {
         "steps": found.steps,

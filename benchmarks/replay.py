@@ -23,19 +23,19 @@ import numpy as np
 import psutil
 import tyro
 
-import lare
-from lare.algorithms.settings import TD3Settings
-from lare.algorithms.table import ALGORITHMS
-from lare.credit.methods import find_method
-from lare.credit.settings import CreditSettings
-from lare.data import replay
-from lare.data.replay import Replay
-from lare.data.trajectory import Trajectory
-from lare.tasks.env import EnvSpec, Team, Timestep
-from lare.training import off_policy
-from lare.training.config import TrainConfig
-from lare.training.learner import features
-from lare.training.session import Session
+import lare_rl
+from lare_rl.algorithms.settings import TD3Settings
+from lare_rl.algorithms.table import ALGORITHMS
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.methods import find_method
+from lare_rl.data import replay
+from lare_rl.data.replay import Replay
+from lare_rl.data.trajectory import Trajectory
+from lare_rl.envs.interface import EnvSpec, Team, Timestep
+from lare_rl.training import off_policy
+from lare_rl.training.learner import features
+from lare_rl.training.session import Session
+from lare_rl.training.static_config import TrainConfig
 from measure import advance, interleave, new_session, show, summary, write
 
 SEED, EPISODE, UPDATES = 0, 1000, 50
@@ -151,7 +151,7 @@ def memory(transitions: int) -> None:
     """Fill a replay, continue training, and measure the memory."""
     stages = {"packages imported": used()}
     with tempfile.TemporaryDirectory() as place:
-        settings = lare.Settings(method="lare-rrdu", seed=SEED)
+        settings = lare_rl.Settings(method="lare-rrdu", seed=SEED)
         session = new_session(Path(place) / "run", "HumanoidStandup-v4", settings)
         jax.block_until_ready(session.learner)
         stages["session begun"] = used()

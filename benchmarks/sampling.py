@@ -7,8 +7,8 @@ For CN-6 and PP-6: the mean absolute correlation over 1,000 episodes of random a
 
 import numpy as np
 
-import lare
-from lare.experiments.credit import correlations
+import lare_rl
+from lare_rl.evaluation.episode_credit import correlations
 from measure import write
 from paper.correlations import random_steps
 
@@ -18,7 +18,7 @@ EPISODES, SAMPLE = 1000, 40
 def main() -> None:
     found = {}
     for name in ("CN-6", "PP-6"):
-        steps = random_steps(lare.load_task(name), EPISODES)
+        steps = random_steps(lare_rl.load_task(name), EPISODES)
         pieces = [np.array_split(part, EPISODES // SAMPLE) for part in (steps.after, steps.reward)]
         of_pieces = [mean(*piece) for piece in zip(*pieces, strict=True)]
         found[name] = {"all": mean(steps.after, steps.reward), "least": min(of_pieces), "most": max(of_pieces)}

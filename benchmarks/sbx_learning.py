@@ -1,6 +1,6 @@
 """Learning curves of SBX's algorithms on the true rewards, for a comparison with ours.
 
-    python benchmarks/sbx_learning.py OUT --algorithm sac      OUT/metrics.jsonl, as `lare train --method dense` writes it
+    python benchmarks/sbx_learning.py OUT --algorithm sac      OUT/metrics.jsonl, as `lare-rl train --method dense` writes it
 
 Hyperparameters and protocol are ours. Differences remain: SBX's targets move at every update, not at every second one. Its TD3's
 actor ascends the smaller of the two critics, not the first. For its PPO, Stable-Baselines3's VecNormalize normalises observations

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import tyro
 
-import lare
-from lare.algorithms.settings import TD3Settings
+import lare_rl
+from lare_rl.algorithms.settings import TD3Settings
 from measure import advance, interleave, new_session, show, summary, write
 
 TASK, BEFORE = "HalfCheetah-v4", 2000
@@ -30,7 +30,9 @@ def main(rounds: int = 7, steps: int = 1000, seeds: int = 5, method: str = "lare
     contenders = {}
     with tempfile.TemporaryDirectory() as place:
         for number in (1, seeds):
-            settings = lare.Settings(method=method, seeds=number, evaluation_episodes=1, td3=TD3Settings(warmup=BEFORE))
+            settings = lare_rl.Settings(
+                method=method, seeds=number, evaluation_episodes=1, td3=TD3Settings(warmup=BEFORE)
+            )
             session = new_session(Path(place) / str(number), TASK, settings)
             advance(session, BEFORE)
             contenders[f"seeds: {number}"] = partial(advance, session, steps)

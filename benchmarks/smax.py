@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import tyro
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare.tasks.smax import NAMES
-from lare.tasks.smax.env import SMAX
+from lare_rl.envs.smax import NAMES
+from lare_rl.envs.smax.smax_env import SMAX
 from measure import interleave, show, summary, write
 
 STEPS = 60

@@ -24,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from lare.tasks.smax import NAMES, battle, enemy, observation
-from lare.tasks.smax.env import MOST, reward
-from lare.tasks.smax.scenarios import UNIT_TYPES, Scenario, find_scenario
+from lare_rl.envs.smax import NAMES, battle, enemy, observation
+from lare_rl.envs.smax.scenarios import UNIT_TYPES, Scenario, find_scenario
+from lare_rl.envs.smax.smax_env import MOST, reward
 from measure import write
 
 streams = sys.stdout, sys.stderr

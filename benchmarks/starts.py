@@ -20,11 +20,11 @@ import numpy as np
 from jaxtyping import Array
 
 from basis import SPEED, scores
-from lare.credit import evidence
-from lare.credit.basis import Basis, expand
-from lare.credit.closed_form import ROUNDS
-from lare.credit.evidence import Posterior, Sums
-from lare.credit.judging import r2_and_error
+from lare_rl.credit import evidence
+from lare_rl.credit.basis import Basis, expand
+from lare_rl.credit.closed_form import ROUNDS
+from lare_rl.credit.evidence import Posterior, Sums
+from lare_rl.credit.factor_fit import r2_and_error
 from measure import write
 from stored import of_each_seed
 

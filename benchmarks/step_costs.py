@@ -3,7 +3,7 @@ the updates.
 
     python benchmarks/step_costs.py
 
-The methods of an algorithm take turns; a turn is a number of steps of one session, by the same `Session.advance` that `lare train`
+The methods of an algorithm take turns; a turn is a number of steps of one session, by the same `Session.advance` that `lare-rl train`
 calls. Algorithms that consume transitions update at every step, after random steps that fill the replay with whole episodes. A turn
 of ppo is one rollout of 2000 steps with its updates. For many agents, see `agents_speed.py`.
 """
@@ -15,10 +15,10 @@ from pathlib import Path
 import jax
 import tyro
 
-import lare
-from lare.algorithms.table import ALGORITHMS, Consumes
-from lare.credit.methods import METHODS
-from lare.training.session import Session
+import lare_rl
+from lare_rl.algorithms.table import ALGORITHMS, Consumes
+from lare_rl.credit.methods import METHODS
+from lare_rl.training.session import Session
 from measure import advance, interleave, new_session, show, summary, write
 
 TASK, SEED, BEFORE, ROLLOUT = "HalfCheetah-v4", 0, 2000, 2000
@@ -31,7 +31,7 @@ def session(directory: Path, algorithm: str, method: str) -> Session:
     chosen = ALGORITHMS[algorithm]
     rollouts = chosen.consumes is Consumes.ROLLOUTS
     figures = {} if rollouts else {algorithm: chosen.settings.model_copy(update={"warmup": BEFORE})}
-    settings = lare.Settings(
+    settings = lare_rl.Settings(
         **{"method": method, "algorithm": algorithm, "seed": SEED, "evaluation_episodes": 1, **figures}
     )
     started = new_session(directory / method, TASK, settings)

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare.data import replay
-from lare.run.directory import open_run
-from lare.training.seeds import of_seed
-from lare.training.session import load_learner
+from lare_rl.data import replay
+from lare_rl.runs.directory import open_run
+from lare_rl.training.seed_axis import of_seed
+from lare_rl.training.session import load_learner
 
 
 class Stored(NamedTuple):

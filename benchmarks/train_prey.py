@@ -22,9 +22,8 @@ import optax
 import tyro
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lare.networks import MLP, descend, start_adam
-from lare.tasks.particles import prey
-from lare.tasks.particles.predator_prey import (
+from lare_rl.envs.particles import prey
+from lare_rl.envs.particles.predator_prey import (
     SIZES,
     Size,
     chase,
@@ -35,9 +34,10 @@ from lare.tasks.particles.predator_prey import (
     reward_preys,
     world,
 )
-from lare.tasks.particles.prey import Layers, shipped_prey
-from lare.tasks.particles.task import ACTIONS, STEPS
-from lare.tasks.particles.world import State, move, push
+from lare_rl.envs.particles.prey import Layers, shipped_prey
+from lare_rl.envs.particles.task import ACTIONS, STEPS
+from lare_rl.envs.particles.world import State, move, push
+from lare_rl.nn.networks import MLP, descend, start_adam
 from measure import write
 
 TARGET = 29.5

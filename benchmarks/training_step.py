@@ -24,9 +24,9 @@ import tyro
 from jax import Array
 from stable_baselines3.common.noise import NormalActionNoise
 
-import lare
-from lare.algorithms.settings import TD3Settings
-from lare.training.session import Session
+import lare_rl
+from lare_rl.algorithms.settings import TD3Settings
+from lare_rl.training.session import Session
 from measure import TD3, advance, interleave, new_session, ratio, show, summary, write
 
 TASK, SEED = "HalfCheetah-v4", 0
@@ -36,7 +36,7 @@ ROLLOUTS = (1, 10, 50, 200, 1000)
 
 
 def ours(directory: Path, method: str, warmup: int = WARMUP, rollout: int = 50) -> Session:
-    settings = lare.Settings(
+    settings = lare_rl.Settings(
         method=method, seed=SEED, rollout_steps=rollout, evaluation_episodes=1, td3=TD3Settings(warmup=warmup)
     )
     session = new_session(directory / f"{method}-{rollout}", TASK, settings)

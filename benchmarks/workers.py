@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from burning import Burns
-from lare.tasks.workers import Envs, LocalEnvs, WorkerEnvs
+from lare_rl.envs.workers import Envs, LocalEnvs, WorkerEnvs
 from measure import interleave, show, summary, write
 
 REFERENCE = "one process"

@@ -90,7 +90,7 @@ def python_reference(homes: dict[str, str]) -> str:
 
 
 def command_line_reference(commands: Any) -> str:
-    """What `lare COMMAND --help` prints."""
+    """What `lare-rl COMMAND --help` prints."""
     lines = ["# Command line", ""]
     for name in commands:
         call = [sys.executable, "-c", "from lare.cli import main; main()", name, "--help"]

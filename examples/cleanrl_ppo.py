@@ -23,8 +23,8 @@ from gymnasium.wrappers.utils import RunningMeanStd
 from torch import optim
 from torch.distributions.normal import Normal
 
-import lare  # LaRe
-from lare.plugs.gymnasium import VectorCredit  # LaRe
+import lare_rl  # LaRe
+from lare_rl.integrations.gymnasium import VectorCredit  # LaRe
 
 
 @dataclass
@@ -96,10 +96,10 @@ def main(args: Args) -> list[float]:
     )
     envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
     if args.method != "dense":  # LaRe
-        task = lare.load_task(args.env_id) if args.method.startswith("lare-") else None  # LaRe
-        phi = lare.design(task) if task else None  # LaRe
+        task = lare_rl.load_task(args.env_id) if args.method.startswith("lare-") else None  # LaRe
+        phi = lare_rl.design(task) if task else None  # LaRe
         spaces = {"observation_space": envs.single_observation_space, "action_space": envs.single_action_space}  # LaRe
-        credit = lare.CreditAssigner(args.method, phi, task=task, **spaces, scale_rewards=True)  # LaRe
+        credit = lare_rl.CreditAssigner(args.method, phi, task=task, **spaces, scale_rewards=True)  # LaRe
         envs = VectorCredit(envs, credit, pay="environment")  # LaRe
     envs = gym.wrappers.vector.ClipAction(envs)
     envs = gym.wrappers.vector.NormalizeReward(envs, gamma=args.gamma)

@@ -23,8 +23,8 @@ import tyro
 from gymnasium.vector import AutoresetMode
 from torch import optim
 
-import lare  # LaRe
-from lare.plugs.gymnasium import VectorCredit  # LaRe
+import lare_rl  # LaRe
+from lare_rl.integrations.gymnasium import VectorCredit  # LaRe
 
 
 @dataclass
@@ -113,10 +113,10 @@ def main(args: Args) -> list[float]:
     )
     envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
     if args.method != "dense":  # LaRe
-        task = lare.load_task(args.env_id) if args.method.startswith("lare-") else None  # LaRe
-        phi = lare.design(task) if task else None  # LaRe
+        task = lare_rl.load_task(args.env_id) if args.method.startswith("lare-") else None  # LaRe
+        phi = lare_rl.design(task) if task else None  # LaRe
         spaces = {"observation_space": envs.single_observation_space, "action_space": envs.single_action_space}  # LaRe
-        credit = lare.CreditAssigner(args.method, phi, task=task, **spaces, capacity=args.buffer_size)  # LaRe
+        credit = lare_rl.CreditAssigner(args.method, phi, task=task, **spaces, capacity=args.buffer_size)  # LaRe
         envs = VectorCredit(envs, credit, pay="environment")  # LaRe
 
     actor, target_actor = Actor(envs), Actor(envs)

@@ -1,11 +1,11 @@
 """TD3+BC on logged episodes (Fujimoto and Gu, 2021), in one file, in the style of CORL.
 
-    lare relabel DATASET --out NEW
+    lare-rl relabel DATASET --out NEW
     python examples/offline_td3_bc.py NEW --rewards rewards --environment Pendulum-v1     # on r_hat
     python examples/offline_td3_bc.py NEW --rewards paid                                  # on the rewards of the log
     python examples/offline_td3_bc.py NEW --rewards end                                   # on the return, at the end
 
-NEW is the output of `lare relabel`: a directory of .npz files, or a Minari id. Actions must be rows of numbers.
+NEW is the output of `lare-rl relabel`: a directory of .npz files, or a Minari id. Actions must be rows of numbers.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from lare.logs.source import open_logs
+from lare_rl.logs.source import open_logs
 
 BATCH, GAMMA, TAU, ALPHA, NOISE, CLIP, DELAY = 256, 0.99, 0.005, 2.5, 0.2, 0.5, 2
 

@@ -9,15 +9,17 @@ which the assigner never receives.
 import gymnasium
 import numpy as np
 
-import lare
+import lare_rl
 
 
 def main(episodes: int = 40) -> float:
     """Play. Gives the correlation of r_hat with the true rewards of the last episode."""
-    task = lare.load_task("HalfCheetah-v4")
-    phi = lare.design(task)  # from the recorded replies; `lare.load_function("phi.py", task)` for your own function
-    credit = lare.CreditAssigner("lare-bayes", phi, task=task)
-    environment = lare.EpisodicReward(gymnasium.make(task.environment))  # pays at the end of an episode
+    task = lare_rl.load_task("HalfCheetah-v4")
+    phi = lare_rl.design(
+        task
+    )  # from the recorded replies; `lare_rl.load_function("phi.py", task)` for your own function
+    credit = lare_rl.CreditAssigner("lare-bayes", phi, task=task)
+    environment = lare_rl.EpisodicReward(gymnasium.make(task.environment))  # pays at the end of an episode
     environment.action_space.seed(0)
     r_hat, true = np.zeros(0), []
     for number in range(episodes):

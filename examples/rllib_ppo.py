@@ -19,8 +19,8 @@ any number.
 
 With a latent function (docs/bring-your-own-task.md), create the assigner like this:
 
-    task = lare.load_task("pendulum.toml")
-    credit = lare.CreditAssigner("lare-bayes", lare.load_function("phi.py", task), task=task)
+    task = lare_rl.load_task("pendulum.toml")
+    credit = lare_rl.CreditAssigner("lare-bayes", lare_rl.load_function("phi.py", task), task=task)
 
 It ran with RLlib 2.60.0, torch 2.13.0, Python 3.11 and Gymnasium 1.2.2, the version that this RLlib requires: use a
 separate virtual environment. It took a minute on one core. Seed 0 printed, after warnings of RLlib itself:
@@ -43,8 +43,8 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.core.columns import Columns
 
-import lare
-from lare.plugs.gymnasium import Credit
+import lare_rl
+from lare_rl.integrations.gymnasium import Credit
 
 
 class PayCredit(ConnectorV2):
@@ -69,10 +69,10 @@ def main(iterations: int = 40, seed: int = 0) -> list[float]:
     # Before the assigner: Ray forks, and JAX warns about forks once it runs.
     ray.init(include_dashboard=False)
     one = gymnasium.make("Pendulum-v1")
-    credit = lare.CreditAssigner("bayes", observation_space=one.observation_space, action_space=one.action_space)
+    credit = lare_rl.CreditAssigner("bayes", observation_space=one.observation_space, action_space=one.action_space)
 
     def make(**settings):
-        env = lare.EpisodicReward(gymnasium.make("Pendulum-v1", **settings))
+        env = lare_rl.EpisodicReward(gymnasium.make("Pendulum-v1", **settings))
         return Credit(env, credit, pay="environment")
 
     # Register with Gymnasium: Ray's `register_env` would copy the assigner, and the steps would go to the copy.

@@ -15,8 +15,8 @@ sampled, it asks the assigner for the current proxy rewards of these steps.
 
 With a latent function (docs/bring-your-own-task.md), create the assigner like this:
 
-    task = lare.load_task("pendulum.toml")
-    credit = lare.CreditAssigner("lare-bayes", lare.load_function("phi.py", task), task=task)
+    task = lare_rl.load_task("pendulum.toml")
+    credit = lare_rl.CreditAssigner("lare-bayes", lare_rl.load_function("phi.py", task), task=task)
 
 It ran with skrl 2.1.1, Gymnasium 1.4.0, torch 2.13.0 and Python 3.11, for a minute on one core. Seed 0 printed:
 
@@ -42,8 +42,8 @@ from skrl.trainers.torch import SequentialTrainer
 from skrl.utils import set_seed
 from torch import nn
 
-import lare
-from lare.plugs.gymnasium import VectorCredit
+import lare_rl
+from lare_rl.integrations.gymnasium import VectorCredit
 
 
 class CreditMemory(RandomMemory):
@@ -100,11 +100,11 @@ def main(steps: int = 10_000, seed: int = 0) -> list[float]:
     """Train. Gives the mean returns of the first ten episodes and of the last ten."""
     torch.set_num_threads(1)
     set_seed(seed)
-    makers = [lambda: lare.EpisodicReward(gymnasium.make("Pendulum-v1"))] * 2
+    makers = [lambda: lare_rl.EpisodicReward(gymnasium.make("Pendulum-v1"))] * 2
     envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)  # every row is a step
     envs = RecordEpisodeStatistics(envs, buffer_length=steps)
     observations, actions = envs.single_observation_space, envs.single_action_space
-    credit = lare.CreditAssigner("bayes", observation_space=observations, action_space=actions)
+    credit = lare_rl.CreditAssigner("bayes", observation_space=observations, action_space=actions)
     env = wrap_env(VectorCredit(envs, credit, pay="environment"), verbose=False)
 
     memory = CreditMemory(credit, memory_size=50_000, num_envs=2)

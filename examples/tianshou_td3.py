@@ -14,8 +14,8 @@ reads rewards. The rewards of the environment are not kept.
 
 With a latent function (docs/bring-your-own-task.md), create the assigner like this:
 
-    task = lare.load_task("pendulum.toml")
-    credit = lare.CreditAssigner("lare-bayes", lare.load_function("phi.py", task), task=task)
+    task = lare_rl.load_task("pendulum.toml")
+    credit = lare_rl.CreditAssigner("lare-bayes", lare_rl.load_function("phi.py", task), task=task)
 
 It ran with Tianshou 2.0.1, Gymnasium 1.4.0, torch 2.13.0 and Python 3.11, for 90 seconds on one core. Seed 0
 printed:
@@ -43,7 +43,7 @@ from tianshou.trainer import OffPolicyTrainerParams
 from tianshou.utils.net.common import Net
 from tianshou.utils.net.continuous import ContinuousActorDeterministic, ContinuousCritic
 
-import lare
+import lare_rl
 
 
 class CreditReplayBuffer(VectorReplayBuffer):
@@ -77,12 +77,12 @@ def main(steps: int = 10_000, seed: int = 0) -> list[float]:
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     np.random.seed(seed)
-    environments = DummyVectorEnv([lambda: lare.EpisodicReward(gymnasium.make("Pendulum-v1"))] * 2)
+    environments = DummyVectorEnv([lambda: lare_rl.EpisodicReward(gymnasium.make("Pendulum-v1"))] * 2)
     tests = DummyVectorEnv([lambda: gymnasium.make("Pendulum-v1")] * 2)
     environments.seed(seed)
     tests.seed(seed + 1000)
     observations, actions = environments.observation_space[0], environments.action_space[0]
-    credit = lare.CreditAssigner("bayes", observation_space=observations, action_space=actions)
+    credit = lare_rl.CreditAssigner("bayes", observation_space=observations, action_space=actions)
 
     net = Net(state_shape=observations.shape, hidden_sizes=(128, 128))
     actor = ContinuousActorDeterministic(preprocess_net=net, action_shape=actions.shape)

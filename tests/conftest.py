@@ -13,21 +13,24 @@ import jax
 import numpy as np
 import pytest
 
-from jax_toys import Echo, echo_spec
-from lare import cli
-from lare.algorithms.settings import PPOSettings
-from lare.algorithms.table import ALGORITHMS
-from lare.deploy import export
-from lare.experiments import evaluation, policy, watch
-from lare.latent.function import LatentFunction, verified
-from lare.phi.graph import Gather, Graph
-from lare.run.settings import Settings
-from lare.tasks.spec import TaskSpec
-from lare.tasks.table import FAMILIES, Family
-from lare.training import explain
-from lare.training import session as sessions
-from lare.training.compiled import compiled
-from toys import PHI, REWARD, Chase, toy_spec
+from helpers.jax_toys import Echo, echo_spec
+from helpers.toys import PHI, REWARD, Chase, toy_spec
+from helpers.untrained_runs import made
+from lare_rl import cli
+from lare_rl.algorithms.settings import PPOSettings
+from lare_rl.algorithms.table import ALGORITHMS
+from lare_rl.compare import statistics
+from lare_rl.config.settings import Settings
+from lare_rl.envs.families import FAMILIES, Family
+from lare_rl.evaluation import evaluate as evaluation
+from lare_rl.evaluation import policy, watch
+from lare_rl.export import export
+from lare_rl.latent.function import LatentFunction, verified
+from lare_rl.phi.graph import Gather, Graph
+from lare_rl.tasks.spec import TaskSpec
+from lare_rl.training import explain
+from lare_rl.training import session as sessions
+from lare_rl.training.compiled import compiled
 
 # Most of a small run's time is compilation, and many tests compile the same. JAX may have been imported already, and
 # some tests start processes of their own.
@@ -52,21 +55,10 @@ for option, value in CACHE.items():
     os.environ.setdefault(option.upper(), str(value))
     jax.config.update(option, value)
 
-collect_ignore = [
-    "toys.py",
-    "tiers.py",
-    "jax_toys.py",
-    "hosts.py",
-    "parallel_toys.py",
-    "servers.py",
-    "recipes.py",
-    "programs.py",
-    "shown.py",
-    "logged.py",
-]
+collect_ignore_glob = ["helpers/*"]
 """No tests in there, and looking for doctests would import it, and register its environments, a second time."""
 
-__all__ = ["PHI", "Chase", "toy_spec"]
+__all__ = ["PHI", "Chase", "made", "toy_spec"]
 
 
 def pytest_collection_finish():
@@ -160,7 +152,7 @@ def command(monkeypatch, capsys, tmp_path):
     monkeypatch.setenv("COLUMNS", "120")
 
     def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["lare", *map(str, arguments)])
+        monkeypatch.setattr(sys, "argv", ["lare-rl", *map(str, arguments)])
         status = 0
         try:
             cli.main()
@@ -239,3 +231,9 @@ def small_many():
         return Settings(**(values | changes))
 
     return build
+
+
+@pytest.fixture(autouse=True)
+def few_bootstrap_samples(monkeypatch):
+    """Two thousand of them take seconds; tests of the intervals themselves ask for more."""
+    monkeypatch.setattr(statistics, "REPETITIONS", 50)

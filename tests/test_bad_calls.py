@@ -14,16 +14,16 @@ import pytest
 SETUP = """
 import json, sys
 import numpy as np
-import lare
-from lare.errors import LareError
-from lare.latent.function import verified
-from toys import PHI, pick_spec, toy_spec
+import lare_rl
+from lare_rl.errors import LareError
+from lare_rl.latent.function import verified
+from helpers.toys import PHI, pick_spec, toy_spec
 task = toy_spec()
 phi = verified(PHI, task)
 tiny = dict(method="dense", steps=60, rollout_steps=12, evaluate_every=60, evaluation_episodes=1)
 td3 = {"hidden": (8,), "batch_size": 8, "warmup": 36}
-run = lare.train(task, lare.Settings(**tiny, td3=td3), out="run", listeners=[])
-policy = lare.policy_of("run")
+run = lare_rl.train(task, lare_rl.Settings(**tiny, td3=td3), out="run", listeners=[])
+policy = lare_rl.policy_of("run")
 listening = lambda *_: None
 for call in json.load(sys.stdin):
     try:
@@ -35,50 +35,48 @@ for call in json.load(sys.stdin):
     print(json.dumps(said))
 """
 
-LISTENER = (
-    "a listener must have the methods started, stepped, evaluated, said and stopped (lare.training.progress.Listener): "
-)
-TASK = "a task is a shipped name, the path of a task file, or a lare.TaskSpec; it is "
+LISTENER = "a listener must have the methods started, stepped, evaluated, said and stopped (lare_rl.training.progress.Listener): "
+TASK = "a task is a shipped name, the path of a task file, or a lare_rl.TaskSpec; it is "
 POLICY = "an observation is 2 numbers, and a batch has rows of them: "
 CALLS = {
-    "lare.train(task, {'method': 'rrdu'})": "settings must be a lare.Settings, such as "
-    "lare.Settings(method='rrdu', steps=100_000), and are {'method': 'rrdu'}",
-    "lare.train(7)": f"{TASK}7",
-    "lare.train({'name': 'x'})": f"{TASK}{{'name': 'x'}}",
-    "lare.train(task, function=7)": "a latent function must be the path of its file, or come from lare.design or "
-    "lare.load_function, and is 7: write its source to a file, which is verified",
-    "lare.train(task, listeners=[7])": f"{LISTENER}7 does not",
-    "lare.train(task, function='none.py')": "the function file none.py does not exist",
-    "lare.resume(7)": "a run must be a directory, or come from lare.train or lare.open_run, and is 7",
-    "lare.resume('none')": "none is not a run: there is no config.json in it",
-    "lare.evaluate_run(7)": "a run must be a directory, or come from lare.train or lare.open_run, and is 7",
-    "lare.evaluate_run('run', 1.5)": "episodes = 1.5: a whole number, 1 or more",
-    "lare.policy_of('none')": "none is not a run: there is no config.json in it",
-    "lare.policy_of(run, 7)": "run has no seed 7; its seeds: 0",
-    "lare.stored_episodes('none')": "none is not a run: there is no config.json in it",
-    "lare.stored_episodes(run, 7)": "run has no seed 7; its seeds: 0",
+    "lare_rl.train(task, {'method': 'rrdu'})": "settings must be a lare_rl.Settings, such as "
+    "lare_rl.Settings(method='rrdu', steps=100_000), and are {'method': 'rrdu'}",
+    "lare_rl.train(7)": f"{TASK}7",
+    "lare_rl.train({'name': 'x'})": f"{TASK}{{'name': 'x'}}",
+    "lare_rl.train(task, function=7)": "a latent function must be the path of its file, or come from lare_rl.design or "
+    "lare_rl.load_function, and is 7: write its source to a file, which is verified",
+    "lare_rl.train(task, listeners=[7])": f"{LISTENER}7 does not",
+    "lare_rl.train(task, function='none.py')": "the function file none.py does not exist",
+    "lare_rl.resume(7)": "a run must be a directory, or come from lare_rl.train or lare_rl.open_run, and is 7",
+    "lare_rl.resume('none')": "none is not a run: there is no config.json in it",
+    "lare_rl.evaluate_run(7)": "a run must be a directory, or come from lare_rl.train or lare_rl.open_run, and is 7",
+    "lare_rl.evaluate_run('run', 1.5)": "episodes = 1.5: a whole number, 1 or more",
+    "lare_rl.policy_of('none')": "none is not a run: there is no config.json in it",
+    "lare_rl.policy_of(run, 7)": "run has no seed 7; its seeds: 0",
+    "lare_rl.stored_episodes('none')": "none is not a run: there is no config.json in it",
+    "lare_rl.stored_episodes(run, 7)": "run has no seed 7; its seeds: 0",
     "policy([1, 2, 3])": f"{POLICY}the shape is (3,)",
     "policy('left')": "an observation is 2 numbers: no array can be made of str",
     "policy(np.zeros((0, 2)))": f"{POLICY}the shape is (0, 2)",
-    "lare.export('none', 'out')": "none is not a run: there is no config.json in it",
-    "lare.write_report([])": "say which runs: no run is given",
-    "lare.load_function('none.py', task)": "the function file none.py does not exist",
-    "lare.load_function(listening.__code__.co_argcount, task)": "a latent function is read from the path of a file, not from 0",
-    "lare.load_function('none.py', 7)": "the function file none.py does not exist",
-    "lare.design(7)": f"{TASK}7",
-    "lare.design(task, model='gpt')": "a model must have a name and a method reply(messages, sample): 'gpt' does not",
-    "lare.reflect(phi, 7, None)": f"{TASK}7",
+    "lare_rl.export('none', 'out')": "none is not a run: there is no config.json in it",
+    "lare_rl.write_report([])": "say which runs: no run is given",
+    "lare_rl.load_function('none.py', task)": "the function file none.py does not exist",
+    "lare_rl.load_function(listening.__code__.co_argcount, task)": "a latent function is read from the path of a file, not from 0",
+    "lare_rl.load_function('none.py', 7)": "the function file none.py does not exist",
+    "lare_rl.design(7)": f"{TASK}7",
+    "lare_rl.design(task, model='gpt')": "a model must have a name and a method reply(messages, sample): 'gpt' does not",
+    "lare_rl.reflect(phi, 7, None)": f"{TASK}7",
     "phi([[0, 0]] * 5, [[0]] * 4)": "there are 5 observations and 4 actions: each step needs one observation and one action",
     "phi([0, 0, 0], [0])": "observations must have the shape (batch, 2), or (2,) for a single step: the shape is (3,)",
     "phi([[0, 0]], 'left')": "actions must be arrays of numbers: 'left' cannot be converted to one",
     "phi([[0, 0]], [[0, 0]])": "actions must have the shape (batch, 1), or (1,) for a single step: the shape is (1, 2)",
     "phi(0, 0)": "observations must have the shape (batch, 2), or (2,) for a single step: the shape is ()",
-    "lare.CreditAssigner('lare-bayes', 7, task=task)": "phi must be a function from lare.design or lare.load_function, and is 7",
-    "lare.CreditAssigner('lare-bayes', phi, task=7)": f"{TASK}7",
-    "lare.CreditAssigner('lare-bayes', phi, task=pick_spec())": "the latent function was written for the task 'Chase', and this is "
+    "lare_rl.CreditAssigner('lare-bayes', 7, task=task)": "phi must be a function from lare_rl.design or lare_rl.load_function, and is 7",
+    "lare_rl.CreditAssigner('lare-bayes', phi, task=7)": f"{TASK}7",
+    "lare_rl.CreditAssigner('lare-bayes', phi, task=pick_spec())": "the latent function was written for the task 'Chase', and this is "
     "'Pick': choose another one or, if this one is right for both, say so by dataclasses.replace(function, task='Pick')",
-    "lare.relabel('none', 'out', task=7)": f"{TASK}7",
-    "lare.logged_steps('none', 7)": f"{TASK}7",
+    "lare_rl.relabel('none', 'out', task=7)": f"{TASK}7",
+    "lare_rl.logged_steps('none', 7)": f"{TASK}7",
 }  # fmt: skip
 FINE = {
     "phi([0.5, 0], [0.5]).shape": "(2,)",
@@ -86,9 +84,9 @@ FINE = {
     "policy([0.5, 0]).shape": "(1,)",
     "policy([[0.5, 0]] * 3).shape": "(3, 1)",
     "bool(np.allclose(policy([[0.5, 0], [0, 1]])[1], policy([0, 1]), rtol=1e-5))": "True",
-    "lare.evaluate_run('run', 2)['Chase'].shape": "(1, 2)",
-    "lare.write_report('run').name": "'report.html'",
-    "lare.write_report(run).name": "'report.html'",
+    "lare_rl.evaluate_run('run', 2)['Chase'].shape": "(1, 2)",
+    "lare_rl.write_report('run').name": "'report.html'",
+    "lare_rl.write_report(run).name": "'report.html'",
 }
 
 

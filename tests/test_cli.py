@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from lare import cli
-from lare.algorithms.table import ALGORITHMS
-from lare.cli.runs import when_saved
-from lare.credit.methods import METHODS
-from lare.llm.prompts import candidate
-from lare.source import source
-from lare.tasks.load import read_task, shipped_tasks
-from toys import PHI
+from helpers.toys import PHI
+from lare_rl import cli
+from lare_rl.algorithms.table import ALGORITHMS
+from lare_rl.cli.runs import when_saved
+from lare_rl.credit.methods import METHODS
+from lare_rl.envs.load import read_task, shipped_tasks
+from lare_rl.llm.prompts import candidate
+from lare_rl.util.provenance import source
 
 DRAWING = "drawing, which takes up to a minute for each run\n"
 TINY = (
@@ -43,35 +43,35 @@ def test_tasks_are_listed(command):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("train Task --steps 1e5", "--steps 1e5: not a whole number, such as 10000; see lare train --help"),
-        ("train Task --step 9", "unrecognized options: --step, 9 (did you mean '--steps'?); see lare train --help"),
-        ("trian", "there is no command 'trian' (did you mean 'train'?); see lare --help"),
-        ("check task.toml", "there is no command 'check'; see lare --help"),
-        ("evaluate a b", "unrecognized options: b; see lare evaluate --help"),
-        ("evaluate a --seed 3", "unrecognized options: --seed, 3; see lare evaluate --help"),
-        ("evaluate", "lare evaluate needs RUN (a run directory); see lare evaluate --help"),
-        ("design Task --price 1", "--price 1: not of the kind {FLOAT FLOAT}; see lare design --help"),
-        ("train Task --seeds", "--seeds needs a value; see lare train --help"),
+        ("train Task --steps 1e5", "--steps 1e5: not a whole number, such as 10000; see lare-rl train --help"),
+        ("train Task --step 9", "unrecognized options: --step, 9 (did you mean '--steps'?); see lare-rl train --help"),
+        ("trian", "there is no command 'trian' (did you mean 'train'?); see lare-rl --help"),
+        ("check task.toml", "there is no command 'check'; see lare-rl --help"),
+        ("evaluate a b", "unrecognized options: b; see lare-rl evaluate --help"),
+        ("evaluate a --seed 3", "unrecognized options: --seed, 3; see lare-rl evaluate --help"),
+        ("evaluate", "lare-rl evaluate needs RUN (a run directory); see lare-rl evaluate --help"),
+        ("design Task --price 1", "--price 1: not of the kind {FLOAT FLOAT}; see lare-rl design --help"),
+        ("train Task --seeds", "--seeds needs a value; see lare-rl train --help"),
         (
             "export a",
-            "lare export needs --out DIR (the directory to write, which must not exist); see lare export --help",
+            "lare-rl export needs --out DIR (the directory to write, which must not exist); see lare-rl export --help",
         ),
         (
             "train Task --td3.gamma high",
-            "Error parsing --td3.gamma: could not convert string to float: 'high'; see lare train --help",
+            "Error parsing --td3.gamma: could not convert string to float: 'high'; see lare-rl train --help",
         ),
         ("compare", "say which runs: no run is given"),
         ("report", "say which runs: no run is given"),
     ],
 )
 def test_a_mistake_on_the_command_line_is_one_line(arguments, line, command):
-    assert command(*arguments.split()) == (2, "", f"lare: {line}\n")
+    assert command(*arguments.split()) == (2, "", f"lare-rl: {line}\n")
 
 
 def test_an_unknown_choice_lists_those_there_are(command):
     status, _, err = command("train", "Task", "--algorithm", "dqn")
     known = ", ".join(sorted(ALGORITHMS))
-    assert (status, err) == (2, f"lare: --algorithm dqn: not one of {known}; see lare train --help\n")
+    assert (status, err) == (2, f"lare-rl: --algorithm dqn: not one of {known}; see lare-rl train --help\n")
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_an_unknown_choice_lists_those_there_are(command):
     ],
 )
 def test_settings_that_make_no_difference_are_refused(arguments, message, command, tmp_path):
-    assert command("train", *arguments.split()) == (2, "", f"lare: {message}\n")
+    assert command("train", *arguments.split()) == (2, "", f"lare-rl: {message}\n")
     assert not list(tmp_path.iterdir())
 
 
@@ -148,7 +148,7 @@ def test_design_writes_the_function_once(command, tmp_path):
     assert command("design", "Reacher-v4", "--draw", 1, "--out", "phi") == (
         2,
         "",
-        "lare: phi.py exists, and is not overwritten; choose another --out\n",
+        "lare-rl: phi.py exists, and is not overwritten; choose another --out\n",
     )
     assert {name: (tmp_path / name).read_bytes() for name in written} == written
 
@@ -192,7 +192,7 @@ def test_verify_says_how_much_of_the_score_the_factors_explain(command, phi, spe
     ],
 )
 def test_a_fit_that_says_nothing_is_refused_at_once(command, phi, spec_file, more, message):
-    assert command("verify", phi, "--task", spec_file(), *more) == (2, "", f"lare: {message}\n")
+    assert command("verify", phi, "--task", spec_file(), *more) == (2, "", f"lare-rl: {message}\n")
 
 
 def test_verify_prints_every_error(command, spec_file, tmp_path):
@@ -236,7 +236,7 @@ def test_verify_gives_advice(command, spec_file, tmp_path):
 def test_what_cannot_be_tried_is_status_2(command, phi, arguments, message):
     status, out, err = command("verify", *arguments.split())
     assert (status, out) == (2, "")
-    assert err.startswith(f"lare: {message}")
+    assert err.startswith(f"lare-rl: {message}")
 
 
 def test_a_new_task_is_written_once(command, tmp_path):
@@ -244,7 +244,7 @@ def test_a_new_task_is_written_once(command, tmp_path):
     assert (status, err) == (0, "")
     assert out.splitlines()[0] == "wrote Pendulum-v1.toml"
     written = (tmp_path / "Pendulum-v1.toml").read_bytes()
-    again = "lare: Pendulum-v1.toml exists, and is not overwritten; choose another --out\n"
+    again = "lare-rl: Pendulum-v1.toml exists, and is not overwritten; choose another --out\n"
     assert command("new-task", "Pendulum-v1") == (2, "", again)
     assert (tmp_path / "Pendulum-v1.toml").read_bytes() == written
     status, out, _ = command("prompt", "Pendulum-v1.toml")
@@ -289,7 +289,7 @@ def test_the_ablation_without_pre_verification_keeps_what_can_be_read(command):
             f"{', '.join(shipped_tasks())}",
         ),
         ("design Reacher-v4 --draw 7", "no recording of factors has draw 7; the draws are 0, 1, 2, 3, 4"),
-        ("train", "say what to train on: lare train TASK (lare tasks lists them), or lare train --resume DIR"),
+        ("train", "say what to train on: lare-rl train TASK (lare-rl tasks lists them), or lare-rl train --resume DIR"),
         ("train --resume runs/none", "runs/none is not a run: there is no config.json in it"),
         (
             "train Reacher-v4 --resume runs/none",
@@ -339,7 +339,7 @@ def test_the_ablation_without_pre_verification_keeps_what_can_be_read(command):
     ],
 )
 def test_a_mistake_is_one_line_and_status_2(command, tmp_path, arguments, message):
-    assert command(*arguments.split()) == (2, "", f"lare: {message}\n")
+    assert command(*arguments.split()) == (2, "", f"lare-rl: {message}\n")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -348,14 +348,14 @@ def test_debug_shows_where_it_came_from(command, arguments):
     status, out, err = command(*arguments)
     assert (status, out) == (2, "")
     assert err.startswith("Traceback (most recent call last):\n")
-    assert err.endswith("\nlare: none is not a run: there is no config.json in it\n")
+    assert err.endswith("\nlare-rl: none is not a run: there is no config.json in it\n")
 
 
 def test_an_error_of_many_lines_is_printed_in_one(command, spec_file, tmp_path):
     (tmp_path / "bad.py").write_text("import os\ndef evaluation_func(o, a):\n    return [np.load(a)]\n")
     status, _, err = command("train", spec_file(), "--function", "bad.py")
     assert status == 2
-    start = "lare: bad.py: the function does not fit task 'Chase': E-IMPORT line 1: import os"
+    start = "lare-rl: bad.py: the function does not fit task 'Chase': E-IMPORT line 1: import os"
     assert err.startswith(start)
     assert " E-NUMPY line 3: np.load" in err
     assert err.count("\n") == 1
@@ -424,7 +424,7 @@ def test_from_training_to_report(command, spec_file, phi):
     run = Path("runs/Chase-lare-linear-td3-s0")
     status, out, _ = command("train", spec_file(), *TINY, "--function", phi)
     assert status == 0
-    assert out.endswith(f"finished {run}; to see it: lare report {run}\n")
+    assert out.endswith(f"finished {run}; to see it: lare-rl report {run}\n")
     metrics = (run / "metrics.jsonl").read_bytes()
     assert metrics.count(b"\n") == 2
 
@@ -443,7 +443,7 @@ def test_from_training_to_report(command, spec_file, phi):
     assert command("evaluate", run, "--video", "film.avi") == (
         2,
         "",
-        "lare: film.avi is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]\n",
+        "lare-rl: film.avi is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]\n",
     )
 
     # There is nothing left to do, and nothing is done again. A page that was watched is brought up to date.
@@ -451,14 +451,14 @@ def test_from_training_to_report(command, spec_file, phi):
     status, out, _ = command("train", "--resume", run)
     assert status == 0
     assert "Step 200 of 200; not running" in (run / "watch.html").read_text(encoding="utf-8")
-    assert out.endswith(f"finished {run}; to see it: lare report {run}\n")
+    assert out.endswith(f"finished {run}; to see it: lare-rl report {run}\n")
     assert (run / "metrics.jsonl").read_bytes() == metrics
 
     assert command("train", spec_file(), *TINY, "--function", phi, "--out", run) == (
         2,
         "",
-        f"lare: {run} exists, and a run never overwrites another: choose another directory, or continue "
-        "the run with --resume (lare.resume)\n",
+        f"lare-rl: {run} exists, and a run never overwrites another: choose another directory, or continue "
+        "the run with --resume (lare_rl.resume)\n",
     )
     assert (run / "metrics.jsonl").read_bytes() == metrics
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-import lare
+import lare_rl
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md")])
@@ -39,4 +39,4 @@ def test_python_is_python(page):
 
 def test_every_public_name_is_in_the_page_of_the_api():
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
-    assert [name for name in lare.__all__ if name != "__version__" and f"`{name}" not in text] == []
+    assert [name for name in lare_rl.__all__ if name != "__version__" and f"`{name}" not in text] == []

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import lare
-from logged import logged
+import lare_rl
+from helpers.logged import logged
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -21,7 +21,7 @@ def test_a_loop_of_ones_own_learns_credit():
 def test_td3_bc_trains_on_a_relabelled_log(tmp_path):
     """On all three kinds of rewards, for a few updates: that it learns is not for a test of seconds."""
     pytest.importorskip("torch")
-    lare.relabel(list(logged(12)), tmp_path / "new", method="rd-linear")
+    lare_rl.relabel(list(logged(12)), tmp_path / "new", method="rd-linear")
     main = runpy.run_path(str(EXAMPLES / "offline_td3_bc.py"))["main"]
     for rewards in ("rewards", "paid", "end"):
         assert main(str(tmp_path / "new"), rewards, steps=3) == []

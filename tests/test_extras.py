@@ -7,24 +7,30 @@ from pathlib import Path
 
 import pytest
 
-from lare.errors import pip_install
+from lare_rl.errors import pip_install
 
 MODULES = {
-    "lare.plugs.sb3": ("stable_baselines3", f"lare.plugs.sb3 needs an extra: {pip_install('sb3')}"),
-    "lare.plugs.torchrl": ("torchrl", f"lare.plugs.torchrl needs an extra: {pip_install('torchrl')}"),
-    "lare.plugs.pettingzoo": ("pettingzoo", f"lare.plugs.pettingzoo needs an extra: {pip_install('pettingzoo')}"),
-    "lare.tasks.particles.pettingzoo": (
-        "pettingzoo",
-        f"lare.tasks.particles.pettingzoo needs an extra: {pip_install('particles')}",
+    "lare_rl.integrations.sb3": ("stable_baselines3", f"lare_rl.integrations.sb3 needs an extra: {pip_install('sb3')}"),
+    "lare_rl.integrations.torchrl": (
+        "torchrl",
+        f"lare_rl.integrations.torchrl needs an extra: {pip_install('torchrl')}",
     ),
-    "lare.logs.parquet": ("pyarrow", f"a Parquet file needs an extra: {pip_install('parquet')}"),
-    "lare.logs.huggingface": ("datasets", f"a Hugging Face data set needs an extra: {pip_install('datasets')}"),
-    "lare.logs.minari": ("minari", f"a Minari data set needs an extra: {pip_install('minari')}"),
+    "lare_rl.integrations.pettingzoo": (
+        "pettingzoo",
+        f"lare_rl.integrations.pettingzoo needs an extra: {pip_install('pettingzoo')}",
+    ),
+    "lare_rl.envs.particles.parallel_env": (
+        "pettingzoo",
+        f"lare_rl.envs.particles.parallel_env needs an extra: {pip_install('particles')}",
+    ),
+    "lare_rl.logs.parquet": ("pyarrow", f"a Parquet file needs an extra: {pip_install('parquet')}"),
+    "lare_rl.logs.huggingface": ("datasets", f"a Hugging Face data set needs an extra: {pip_install('datasets')}"),
+    "lare_rl.logs.minari": ("minari", f"a Minari data set needs an extra: {pip_install('minari')}"),
 }
 
 PROGRAM = """
 import importlib, sys
-from lare.errors import LareError
+from lare_rl.errors import LareError
 for module, library in zip(sys.argv[1::2], sys.argv[2::2]):
     sys.modules[library] = None
     try:

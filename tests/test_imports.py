@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-import lare
+import lare_rl
 
-PACKAGE = Path(lare.__file__).parent
+PACKAGE = Path(lare_rl.__file__).parent
 MODULES = {
-    ".".join(["lare", *path.relative_to(PACKAGE).with_suffix("").parts]).removesuffix(".__init__"): path
+    ".".join(["lare-rl", *path.relative_to(PACKAGE).with_suffix("").parts]).removesuffix(".__init__"): path
     for path in sorted(PACKAGE.rglob("*.py"))
 }
 
@@ -44,7 +44,7 @@ MUST_NOT_KNOW = {
 
 
 def imported_by(module: str) -> set[str]:
-    """What of the package a module imports, at its top or inside a function; `lare.train` counts as where it lives."""
+    """What of the package a module imports, at its top or inside a function; `lare_rl.train` counts as where it lives."""
     names = set()
     for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
         match node:
@@ -53,8 +53,8 @@ def imported_by(module: str) -> set[str]:
             case ast.ImportFrom():
                 assert node.level == 0, f"{module} has a relative import, which this test does not follow"
                 names |= {f"{node.module}.{alias.name}" for alias in node.names}
-            case ast.Attribute(value=ast.Name(id="lare"), attr=name) if name in lare.HOMES:
-                names.add(lare.HOMES[name])
+            case ast.Attribute(value=ast.Name(id="lare"), attr=name) if name in lare_rl.HOMES:
+                names.add(lare_rl.HOMES[name])
     return {name for name in names if name.startswith("lare.")}
 
 
@@ -74,9 +74,9 @@ def test_imports_run_downwards(module):
 
 def test_imports_are_found_wherever_they_stand():
     # The lines that the test above rests on: at the top, inside a function, and by the package's name.
-    assert "lare.errors.LareError" in imported_by("lare.cli")
-    assert "lare.llm.prompts.candidate" in imported_by("lare.cli.functions")
-    assert "lare.training.train" in imported_by("lare.cli.runs")
+    assert "lare_rl.errors.LareError" in imported_by("lare_rl.cli")
+    assert "lare_rl.llm.prompts.candidate" in imported_by("lare_rl.cli.functions")
+    assert "lare_rl.training.train" in imported_by("lare_rl.cli.runs")
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -85,7 +85,7 @@ def test_no_module_names_a_device(module):
     assert re.search(r"\b(cuda|gpu|tpu)\b|jax\.(local_)?devices\(", source, re.IGNORECASE) is None
 
 
-@pytest.mark.parametrize("name", lare.__all__)
+@pytest.mark.parametrize("name", lare_rl.__all__)
 def test_every_public_name_is_there(name):
     assert getattr(lare, name) is not None
     assert name in dir(lare)
@@ -93,20 +93,20 @@ def test_every_public_name_is_there(name):
 
 def test_another_name_is_not():
     with pytest.raises(AttributeError, match="module 'lare' has no attribute 'trian'"):
-        lare.trian  # noqa: B018
+        lare_rl.trian  # noqa: B018
 
 
 @pytest.mark.parametrize(
     "module",
     [
         "lare",
-        "lare.latent.verify",
-        "lare.phi.read",
-        "lare.latent.design",
-        "lare.tasks.load",
-        "lare.tasks.spec",
-        "lare.tasks.pettingzoo",
-        "lare.tasks.workers",
+        "lare_rl.latent.verify",
+        "lare_rl.phi.read",
+        "lare_rl.latent.design",
+        "lare_rl.envs.load",
+        "lare_rl.tasks.spec",
+        "lare_rl.envs.pettingzoo_env",
+        "lare_rl.envs.workers",
     ],
 )
 def test_what_need_not_wait_for_jax_does_not(module):
@@ -121,8 +121,8 @@ def test_what_need_not_wait_for_jax_does_not(module):
 def test_the_command_line_answers_before_anything_slow_is_imported(command, most):
     program = f"""
 import sys
-from lare.cli import main
-sys.argv = ["lare", *{command.split()!r}]
+from lare_rl.cli import main
+sys.argv = ["lare-rl", *{command.split()!r}]
 try:
     main()
 except SystemExit:

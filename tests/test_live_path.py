@@ -11,16 +11,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lare.errors import LareError
-from lare.latent.design import design
-from lare.latent.saved import load
-from lare.llm import prompts
-from lare.llm.budget import Budget
-from lare.llm.live import LiveModel
-from lare.llm.recording import read_recording, shipped_recordings
-from lare.tasks.load import read_task
-from servers import Server, refuses, says
-from toys import PHI, toy_spec
+from helpers.servers import Server, refuses, says
+from helpers.toys import PHI, toy_spec
+from lare_rl.envs.load import read_task
+from lare_rl.errors import LareError
+from lare_rl.latent.design import design
+from lare_rl.latent.saved import load
+from lare_rl.llm import prompts
+from lare_rl.llm.budget import Budget
+from lare_rl.llm.live import LiveModel
+from lare_rl.llm.recording import read_recording, shipped_recordings
 
 KEY = "sk-a-key-that-nobody-may-see"
 
@@ -86,7 +86,7 @@ def test_a_recording_is_not_overwritten(serve, command, tmp_path):
     server = serve(recorded_answers)
     status, _, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--record", "talk.json")
     assert status == 2
-    assert "lare: talk.json exists, and is not overwritten; choose another --record" in err
+    assert "lare-rl: talk.json exists, and is not overwritten; choose another --record" in err
     assert (tmp_path / "talk.json").read_text() == "mine"
 
 
@@ -97,7 +97,7 @@ def test_when_nothing_passes_every_attempt_is_kept(serve, command, tmp_path):
         assert (status, out) == (1, "")
         assert "none of 5 attempts passed; the last one failed: the reply is not one JSON object" in err
         assert err.count("none of 5 attempts passed") == len(
-            [line for line in err.splitlines() if "lare: task" in line]
+            [line for line in err.splitlines() if "lare-rl: task" in line]
         )
         assert f"every attempt is kept in {name}" in err
         kept = read_recording((tmp_path / name).read_text(), name)
@@ -107,8 +107,8 @@ def test_when_nothing_passes_every_attempt_is_kept(serve, command, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--requests", 2], "lare: the budget of 2 requests is spent"),
-        (["--budget", 100], "lare: the next request might exceed the budget of 100 tokens (0 are used)"),
+        (["--requests", 2], "lare-rl: the budget of 2 requests is spent"),
+        (["--budget", 100], "lare-rl: the next request might exceed the budget of 100 tokens (0 are used)"),
     ],
 )
 def test_a_budget_ends_a_design(serve, command, arguments, said):
@@ -124,7 +124,7 @@ def test_what_was_said_is_kept_when_the_budget_ends(serve, command, tmp_path):
     asked = ("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1, "--requests", 2)
     status, out, err = command(*asked)
     assert (status, out) == (2, "")
-    assert "lare: the budget of 2 requests is spent\nevery attempt is kept in Reacher-v4.attempts.json" in err
+    assert "lare-rl: the budget of 2 requests is spent\nevery attempt is kept in Reacher-v4.attempts.json" in err
     kept = read_recording((tmp_path / "Reacher-v4.attempts.json").read_text(), "kept")
     assert [exchange.stage for exchange in kept.exchanges] == ["candidate", "correct"]
 
@@ -133,9 +133,9 @@ def test_a_design_that_fails_says_so_in_one_line(serve, command):
     wrong = json.dumps({"Understand": "", "Analyze": "", "Functions": "x = np.load('a')\ny = np.fromfile('b')"})
     server = serve(says(wrong))
     status, _, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1)
-    said = [line for line in err.splitlines() if line.startswith("lare: ")]
+    said = [line for line in err.splitlines() if line.startswith("lare-rl: ")]
     assert status == 1
-    start = "lare: task 'Reacher-v4': none of 5 attempts passed; the last one failed: E-NUMPY line 1: np.load"
+    start = "lare-rl: task 'Reacher-v4': none of 5 attempts passed; the last one failed: E-NUMPY line 1: np.load"
     assert len(said) == 1
     assert said[0].startswith(start)
     assert said[0].endswith(" (and 1 more)")
@@ -145,7 +145,7 @@ def test_a_server_that_fails_does_not_steer_the_terminal(serve, command):
     server = serve(refuses(401, "\x1b[2J\u202eno\U000e0041"))
     status, _, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url)
     assert status == 2
-    assert err.splitlines()[-1] == "lare: m did not answer: HTTP 401: Error code: 401 - ?[2J?no?"
+    assert err.splitlines()[-1] == "lare-rl: m did not answer: HTTP 401: Error code: 401 - ?[2J?no?"
     assert err.isascii()
 
 
@@ -155,7 +155,7 @@ def test_the_minutes_of_a_design_are_a_setting(serve, command):
     status, _, err = command(*asked)
     assert status == 2
     assert err.startswith("m: waiting for a reply, 1 s at most (1 s are left for all)\n")
-    assert "lare: the 1 s of waiting for the model are over (" in err
+    assert "lare-rl: the 1 s of waiting for the model are over (" in err
 
 
 def test_what_a_model_says_does_not_steer_the_terminal(serve, command):
@@ -198,12 +198,12 @@ def test_what_a_model_says_does_not_steer_the_terminal(serve, command):
 def test_options_of_a_design_that_make_no_sense(command, tmp_path, arguments, message):
     """Before anybody is asked, or paid."""
     given = [str(argument).format(here=tmp_path.name) for argument in arguments]
-    assert command("design", "Reacher-v4", *given) == (2, "", f"lare: {message}\n")
+    assert command("design", "Reacher-v4", *given) == (2, "", f"lare-rl: {message}\n")
 
 
 def run_lare(*arguments, **streams):
-    """`lare` in a process of its own."""
-    command = [sys.executable, "-c", "from lare.cli import main; main()", *map(str, arguments)]
+    """`lare-rl` in a process of its own."""
+    command = [sys.executable, "-c", "from lare_rl.cli import main; main()", *map(str, arguments)]
     return subprocess.run(command, stderr=subprocess.PIPE, **streams)
 
 
@@ -229,7 +229,7 @@ def test_a_terminal_that_cannot_show_a_letter(tmp_path):
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
 def test_what_was_paid_for_is_shown_where_nothing_can_be_written(command, tmp_path):
     status, out, err = command("design", "Reacher-v4", "--out", "/proc/phi.py")
-    assert (status, err.splitlines()[-1]) == (2, "lare: /proc/phi.py cannot be written: No such file or directory")
+    assert (status, err.splitlines()[-1]) == (2, "lare-rl: /proc/phi.py cannot be written: No such file or directory")
     assert "def evaluation_func" in out
     status, _, err = command("design", "Reacher-v4", "--record", "/proc/talk.json")
     assert status == 2
@@ -243,10 +243,12 @@ def test_what_was_paid_for_is_kept_where_nothing_can_be_printed(tmp_path):
         done = run_lare("design", "Reacher-v4", cwd=tmp_path, stdout=full)
         assert done.returncode == 2
         said = done.stderr.decode().splitlines()[-1]
-        assert said == "lare: nothing can be printed (No space left on device); the function is kept in Reacher-v4.py"
+        assert (
+            said == "lare-rl: nothing can be printed (No space left on device); the function is kept in Reacher-v4.py"
+        )
         assert load(tmp_path / "Reacher-v4.py", read_task("Reacher-v4")).size > 0
         done = run_lare("prompt", "Reacher-v4", cwd=tmp_path, stdout=full)
-        assert (done.returncode, done.stderr.decode()) == (2, "lare: [Errno 28] No space left on device\n")
+        assert (done.returncode, done.stderr.decode()) == (2, "lare-rl: [Errno 28] No space left on device\n")
 
 
 def test_a_reply_for_another_task_is_corrected(serve):

@@ -10,19 +10,19 @@ from pathlib import Path
 
 import pytest
 
-import lare
+import lare_rl
 
 ROOT = Path(__file__).parents[1]
 MAIN_JOB = """
 import sys
-import lare
-from lare.cli import main
-assert "site-packages" not in lare.__file__ and "src" not in lare.__file__.split("/"), lare.__file__
-phi = lare.design(lare.load_task("Reacher-v4"))
+import lare_rl
+from lare_rl.cli import main
+assert "site-packages" not in lare_rl.__file__ and "src" not in lare_rl.__file__.split("/"), lare_rl.__file__
+phi = lare_rl.design(lare_rl.load_task("Reacher-v4"))
 td3 = {"hidden": (8,), "batch_size": 8, "warmup": 100}
-settings = lare.Settings(steps=200, evaluate_every=100, evaluation_episodes=1, td3=td3)
-run = lare.train("Reacher-v4", settings, function=phi, out="run", listeners=[])
-sys.argv = ["lare", "report", "run"]
+settings = lare_rl.Settings(steps=200, evaluate_every=100, evaluation_episodes=1, td3=td3)
+run = lare_rl.train("Reacher-v4", settings, function=phi, out="run", listeners=[])
+sys.argv = ["lare-rl", "report", "run"]
 main()
 """
 
@@ -51,8 +51,8 @@ def test_the_wheel_does_the_main_job_without_the_checkout(built, tmp_path):
 def test_the_wheel_holds_the_package_and_its_data_alone(built):
     with zipfile.ZipFile(built["wheel"]) as archive:
         names = archive.namelist()
-        metadata = archive.read(f"lare_rl-{lare.__version__}.dist-info/METADATA").decode()
-    assert {name.split("/")[0] for name in names} == {"lare", f"lare_rl-{lare.__version__}.dist-info"}
+        metadata = archive.read(f"lare_rl-{lare_rl.__version__}.dist-info/METADATA").decode()
+    assert {name.split("/")[0] for name in names} == {"lare", f"lare_rl-{lare_rl.__version__}.dist-info"}
     every = {str(path.relative_to(ROOT / "src")) for path in (ROOT / "src" / "lare").rglob("*") if path.is_file()}
     assert {name for name in every if "__pycache__" not in name} <= set(names)
     for line in ("License-Expression: MIT", "Requires-Python: >=3.11", "Project-URL: Paper, "):
@@ -75,7 +75,7 @@ def test_the_sdist_holds_what_the_tests_need_and_no_results(built):
 
 
 def test_one_version_is_everywhere():
-    assert f"version: {lare.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"version: {lare_rl.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert re.search(
-        rf"^## {re.escape(lare.__version__)} ", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
+        rf"^## {re.escape(lare_rl.__version__)} ", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
     )

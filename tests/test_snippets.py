@@ -17,16 +17,18 @@ import gymnasium
 import numpy as np
 import pytest
 
-import lare
-from lare.experiments import processes, statistics
-from lare.experiments.sweep import read_sweep
-from lare.foreign import read_toml
-from lare.run.directory import describe
-from lare.tasks import env, spec
-from lare.training import train as training
+import lare_rl
+from helpers.servers import Server, completion
+from lare_rl.compare import statistics
+from lare_rl.envs import interface as env
+from lare_rl.runs.directory import describe
+from lare_rl.sweep import processes
+from lare_rl.sweep.sweep import read_sweep
+from lare_rl.tasks import spec
+from lare_rl.training import train as training
+from lare_rl.util.safe_io import read_toml
 from paper.exhibits import Exhibit
 from paper.trained import MEANING
-from servers import Server, completion
 
 pytestmark = pytest.mark.docs
 
@@ -53,14 +55,14 @@ CUTS = {
     r"--steps 40000": "--steps 600",
     r"steps=(100|20)_000": "steps=400, evaluation_episodes=1",
     r"--seeds 3|seeds=3": lambda found: found[0].replace("3", "2"),
-    r"(lare train (CN|PP|CompetitivePP|TriangleArea)-?6?.*)": r"\1 --steps 200 --environments 4 --evaluation-episodes 1",
-    r"(lare train spread.toml.*)": r"\1 --steps 2000 --evaluation-episodes 1",
-    r"lare train SMAX-\w+": "lare train SMAX-2s3z",
+    r"(lare-rl train (CN|PP|CompetitivePP|TriangleArea)-?6?.*)": r"\1 --steps 200 --environments 4 --evaluation-episodes 1",
+    r"(lare-rl train spread.toml.*)": r"\1 --steps 2000 --evaluation-episodes 1",
+    r"lare-rl train SMAX-\w+": "lare-rl train SMAX-2s3z",
     r"--qmix.* --steps": "--steps",
     r" --processes 2": "",
-    r"(lare train SMAX-.* --algorithm ippo.*)": r"\1 --steps 2050 --environments 2 --evaluation-episodes 1",
-    r"(lare train SMAX-\S+(?: --method \S+)?)(?: --steps \d+)? *$": r"\1 --steps 1200 --environments 2 --evaluation-episodes 1",
-    r"(lare train \S+ --method \w+-?\w*)$": r"\1 --steps 200 --td3.warmup 100 --evaluation-episodes 1",
+    r"(lare-rl train SMAX-.* --algorithm ippo.*)": r"\1 --steps 2050 --environments 2 --evaluation-episodes 1",
+    r"(lare-rl train SMAX-\S+(?: --method \S+)?)(?: --steps \d+)? *$": r"\1 --steps 1200 --environments 2 --evaluation-episodes 1",
+    r"(lare-rl train \S+ --method \w+-?\w*)$": r"\1 --steps 200 --td3.warmup 100 --evaluation-episodes 1",
     r"--budget laptop|reproduce errors": lambda found: f"{found[0].split(' --')[0]} --budget smoke",
     r"--episodes 20|episodes=20": lambda found: found[0].replace("20", "1"),
     r"learn\(1_000_000": "learn(1100",
@@ -110,7 +112,7 @@ class Page:
                     name, value = one.split("=", 1)
                     if value != "...":
                         self.patch.setenv(name, value.replace("$PWD", os.getcwd()))
-            case ["lare", *arguments]:
+            case ["lare-rl", *arguments]:
                 status, out, err = self.command(*arguments)
                 undrawn = "--video" in arguments and "cannot be drawn here" in err  # a machine without graphics
                 assert status == 0 or undrawn, f"{line}\n{out}\n{err}"
@@ -210,12 +212,12 @@ def logs(page):
         observation_space=box(-np.inf, np.inf, (17,), np.float64),
         action_space=box(-np.inf, np.inf, (6,), np.float64),
     )
-    page.serve(lare.design("HalfCheetah-v4").source)
+    page.serve(lare_rl.design("HalfCheetah-v4").source)
 
 
 def a_run(page):
-    settings = lare.Settings(method="lare-bayes", steps=400, evaluation_episodes=1, seeds=2)
-    return lare.train("Reacher-v4", settings, out="runs/lare", listeners=[])
+    settings = lare_rl.Settings(method="lare-bayes", steps=400, evaluation_episodes=1, seeds=2)
+    return lare_rl.train("Reacher-v4", settings, out="runs/lare", listeners=[])
 
 
 def for_the_api(page):
@@ -240,7 +242,7 @@ def reply_of(source):
 
 def an_export(page):
     run = a_run(page)
-    lare.export(run, page.directory / "exported")
+    lare_rl.export(run, page.directory / "exported")
     page.patch.chdir(page.directory / "exported")
     page.patch.syspath_prepend(page.directory / "exported")
     page.given(
@@ -255,7 +257,7 @@ def for_the_architecture(page):
 
 
 def a_function(page):
-    lare.design("Reacher-v4").save(page.directory / "phi.py")
+    lare_rl.design("Reacher-v4").save(page.directory / "phi.py")
 
 
 def a_user(page):
@@ -337,7 +339,7 @@ def test_task_files_are_task_files(tmp_path):
     (tmp_path / "simple_adversary_v3-agent.toml").write_text(
         re.sub('(name|team) = "adversary"', r'\1 = "agent"', other)
     )
-    loaded = [lare.load_task(tmp_path / f"{name}.toml") for name in ("Pendulum", "spread", "simple_adversary_v3")]
+    loaded = [lare_rl.load_task(tmp_path / f"{name}.toml") for name in ("Pendulum", "spread", "simple_adversary_v3")]
     assert [len(task.roles) for task in loaded] == [1, 1, 2]
 
 

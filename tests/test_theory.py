@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare import theory
-from lare.theory import MDP, Table
+from lare_rl import theory
+from lare_rl.theory import MDP, Table
 
 CORES, ACTIONS, HORIZON = 3, 2, 5
 

@@ -7,11 +7,11 @@ import threading
 from rich.console import Console
 from rich.progress import Progress
 
-from lare.cli import watch
-from lare.experiments.jobs import Job
-from lare.run.decide import decide
-from lare.run.settings import Settings
-from toys import toy_spec
+from helpers.toys import toy_spec
+from lare_rl.cli import sweep_progress as watch
+from lare_rl.config.resolve import decide
+from lare_rl.config.settings import Settings
+from lare_rl.sweep.jobs import Job
 
 
 def job_at(directory, step):

@@ -1,1 +1,1 @@
-"""`lare reproduce`: the figures and tables of the LaRe paper, from new runs."""
+"""`lare-rl reproduce`: the figures and tables of the LaRe paper, from new runs."""

@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lare.experiments.credit import correlations
-from lare.latent.design import DesignFailed, design, examine
-from lare.latent.function import LatentFunction
-from lare.llm.recording import shipped_recordings
-from lare.tasks.load import load_task
-from lare.tasks.play import Episode, episodes_of
-from lare.tasks.spec import Judges, TaskSpec
+from lare_rl.envs.load import load_task
+from lare_rl.envs.play import Episode, episodes_of
+from lare_rl.evaluation.episode_credit import correlations
+from lare_rl.latent.design import DesignFailed, design, examine
+from lare_rl.latent.function import LatentFunction
+from lare_rl.llm.recording import shipped_recordings
+from lare_rl.tasks.spec import Judges, TaskSpec
 from paper.exhibits import Budget
 from paper.pages import Page, items, table
 

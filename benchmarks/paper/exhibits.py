@@ -12,16 +12,16 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from lare.algorithms.table import Name
-from lare.credit.methods import find_method
-from lare.errors import Checked, LareError
-from lare.experiments.jobs import Job, job_of
-from lare.experiments.scores import RETURN
-from lare.foreign import LARGEST_SETTINGS, read_text, read_toml
-from lare.run.settings import Settings
-from lare.run.usual import algorithm_of
-from lare.tasks.load import load_task
-from lare.tasks.table import env_spec
+from lare_rl.algorithms.table import Name
+from lare_rl.compare.scores import RETURN
+from lare_rl.config.defaults import algorithm_of
+from lare_rl.config.settings import Settings
+from lare_rl.credit.methods import find_method
+from lare_rl.envs.families import env_spec
+from lare_rl.envs.load import load_task
+from lare_rl.errors import Checked, LareError
+from lare_rl.sweep.jobs import Job, job_of
+from lare_rl.util.safe_io import LARGEST_SETTINGS, read_text, read_toml
 
 PLACE = Path(__file__).parent
 OURS = "ours"

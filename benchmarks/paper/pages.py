@@ -4,9 +4,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lare.errors import LareError
-from lare.experiments.figures import on_white
-from lare.files import write_atomically
+from lare_rl.errors import LareError
+from lare_rl.report.figures import on_white
+from lare_rl.util.files import write_atomically
 
 REMARKS = "\n## Remarks\n"
 """The heading of the remarks that a person adds."""

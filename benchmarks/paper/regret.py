@@ -7,10 +7,10 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lare import theory
-from lare.experiments import figures
-from lare.experiments.statistics import Band, plus_minus
-from lare.theory import History, Table
+from lare_rl import theory
+from lare_rl.compare.statistics import Band, plus_minus
+from lare_rl.report import figures
+from lare_rl.theory import History, Table
 from paper.exhibits import Budget
 from paper.pages import Page, items, table
 

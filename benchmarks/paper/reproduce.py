@@ -1,15 +1,15 @@
-"""`lare reproduce`: an exhibit of the paper, from its runs to its page."""
+"""`lare-rl reproduce`: an exhibit of the paper, from its runs to its page."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from lare.errors import LareError
-from lare.experiments.jobs import Job, check
-from lare.experiments.statistics import rliable
-from lare.experiments.sweep import Share, run_sweep
-from lare.experiments.tables import rows_of, write_table
+from lare_rl.compare.metric_tables import rows_of, write_table
+from lare_rl.compare.statistics import rliable
+from lare_rl.errors import LareError
+from lare_rl.sweep.jobs import Job, check
+from lare_rl.sweep.sweep import Share, run_sweep
 from paper import correlations, regret, trained
 from paper.exhibits import Budget, budgets, exhibits, jobs_of
 from paper.pages import Page, write_page
@@ -55,7 +55,7 @@ def reproduce(
     Raises:
         LareError: there is no such exhibit, rliable is not installed, or one of the runs failed.
     """
-    common, command = budgets()[budget], f"lare reproduce {name} --budget {budget}"
+    common, command = budgets()[budget], f"lare-rl reproduce {name} --budget {budget}"
     names = [one for one, _, _ in listed()]
     if name not in names:
         raise LareError(f"no exhibit {name!r}; the exhibits are {', '.join(names)}")

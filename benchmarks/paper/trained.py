@@ -4,10 +4,9 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from lare.algorithms.table import ALGORITHMS, Consumes
-from lare.experiments import figures
-from lare.experiments.scores import CORRELATION, ERROR, RETURN, SUMMED_RETURN, Group
-from lare.experiments.statistics import (
+from lare_rl.algorithms.table import ALGORITHMS, Consumes
+from lare_rl.compare.scores import CORRELATION, ERROR, RETURN, SUMMED_RETURN, Group
+from lare_rl.compare.statistics import (
     REPETITIONS,
     Band,
     Comparison,
@@ -18,8 +17,9 @@ from lare.experiments.statistics import (
     plus_minus,
     too_few,
 )
-from lare.run.directory import Run, read_measured
-from lare.tasks.table import env_spec
+from lare_rl.envs.families import env_spec
+from lare_rl.report import figures
+from lare_rl.runs.directory import Run, read_measured
 from paper.exhibits import OURS, Budget, Claim, Exhibit, Jobs
 from paper.pages import Page, items, table
 

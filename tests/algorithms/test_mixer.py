@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lare.algorithms.mixer import Mixer, mixed
-from worked_qmix import PINNED, networks
+from helpers.worked_qmix import PINNED, networks
+from lare_rl.algorithms.mixer import Mixer, mixed
 
 
 def chosen(value, action):

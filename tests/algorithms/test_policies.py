@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.algorithms.policies import StochasticPolicy
-from lare.networks import MLP
+from lare_rl.algorithms.policies import StochasticPolicy
+from lare_rl.nn.networks import MLP
 
 
 def choosing(actions):

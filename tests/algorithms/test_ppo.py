@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.algorithms import ppo
-from lare.algorithms.ppo import Rollout
-from lare.algorithms.settings import PPOSettings
-from lare.normalise import deviation, observe
+from lare_rl.algorithms import ppo
+from lare_rl.algorithms.ppo import Rollout
+from lare_rl.algorithms.settings import PPOSettings
+from lare_rl.nn.normalise import deviation, observe
 
 SETTINGS = PPOSettings(hidden=(16,), minibatch_size=8, epochs=3)
 init, update = jax.jit(ppo.init, static_argnums=(1, 2, 3, 4)), jax.jit(ppo.update, static_argnums=4)

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.algorithms import qmix
-from lare.algorithms.qmix import QMIX, Sequences
-from lare.algorithms.settings import QMIXSettings
-from lare.algorithms.table import VDN
-from lare.networks import start_adam
-from worked_qmix import PINNED, SETTINGS, networks, sequences
+from helpers.worked_qmix import PINNED, SETTINGS, networks, sequences
+from lare_rl.algorithms import qmix
+from lare_rl.algorithms.qmix import QMIX, Sequences
+from lare_rl.algorithms.settings import QMIXSettings
+from lare_rl.algorithms.table import VDN
+from lare_rl.nn.networks import start_adam
 
 STAY, MOVE = jnp.array(False), jnp.array(True)
 

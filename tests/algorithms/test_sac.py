@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.algorithms import sac
-from lare.algorithms.settings import SACSettings
-from lare.networks import MLP
-from twins import forward, transitions
+from helpers.twins import forward, transitions
+from lare_rl.algorithms import sac
+from lare_rl.algorithms.settings import SACSettings
+from lare_rl.nn.networks import MLP
 
 SETTINGS = SACSettings(hidden=(8, 8), temperature=0.5)
 init, update = jax.jit(sac.init, static_argnums=(1, 2, 3)), jax.jit(sac.update, static_argnums=4)

@@ -4,8 +4,8 @@ from typing import get_args
 
 import pytest
 
-from lare.algorithms.table import ALGORITHMS, TABLE, Name
-from lare.run.settings import Settings
+from lare_rl.algorithms.table import ALGORITHMS, TABLE, Name
+from lare_rl.config.settings import Settings
 
 
 def test_names_are_those_of_the_types():

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.algorithms import td3
-from lare.algorithms.settings import TD3Settings
-from lare.algorithms.table import DDPG
-from twins import forward, transitions
+from helpers.twins import forward, transitions
+from lare_rl.algorithms import td3
+from lare_rl.algorithms.settings import TD3Settings
+from lare_rl.algorithms.table import DDPG
 
 SETTINGS = TD3Settings(hidden=(8, 8), batch_size=16)
 init, update = jax.jit(td3.init, static_argnums=(1, 2, 3)), jax.jit(td3.update, static_argnums=4)

@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit import accuracy
+from lare_rl.credit import accuracy
 
 
 def test_against_numpy():

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit.basis import LARGEST, MOST_PAIRED, Basis, cosine_and_sine, expand, shapes
+from lare_rl.credit.basis import LARGEST, MOST_PAIRED, Basis, cosine_and_sine, expand, shapes
 
 U = np.array([0.5, -1.0, 2.0, 9.0, -0.3], np.float32)
 """Three factors and two entries, one of which is far out."""

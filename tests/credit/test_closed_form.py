@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from jax.extend.core import Var
 
-from lare.credit import closed_form, evidence
-from lare.credit.basis import Basis, expand
-from lare.credit.closed_form import LinearDecoder
-from lare.normalise import new_mean_std, observe
+from lare_rl.credit import closed_form, evidence
+from lare_rl.credit.basis import Basis, expand
+from lare_rl.credit.closed_form import LinearDecoder
+from lare_rl.nn.normalise import new_mean_std, observe
 
 PLAIN = Basis(3, 0, extended=False)
 

@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit import decomposition, descent
-from lare.credit.arel import AREL, Block
-from lare.credit.attention import LayerNorm, attend, causal
-from lare.credit.decoders import Bottleneck, StepDecoder
-from lare.credit.decomposition import Episodes
-from lare.credit.methods import TABLE, Decoder, Fit
-from lare.credit.settings import CreditSettings
-from lare.credit.stas import STAS, USED, Coalitions, TimeLayer, dropout
-from tiers import long
+from helpers.tiers import long
+from lare_rl.credit import decomposition, descent
+from lare_rl.credit.arel import AREL, Block
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoders import Bottleneck, StepDecoder
+from lare_rl.credit.decomposition import Episodes
+from lare_rl.credit.methods import TABLE, Decoder, Fit
+from lare_rl.credit.stas import STAS, USED, Coalitions, TimeLayer, dropout
+from lare_rl.nn.attention import LayerNorm, attend, causal
 
 EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
 KEY = jax.random.key(1)

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit import decomposition, descent
-from lare.credit.decomposition import Episodes
-from lare.credit.methods import METHODS, Fit
-from lare.credit.settings import CreditSettings
-from lare.errors import LareError
+from lare_rl.credit import decomposition, descent
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decomposition import Episodes
+from lare_rl.credit.methods import METHODS, Fit
+from lare_rl.errors import LareError
 
 EPISODES, LENGTH, FEATURES = 64, 10, 3
 KEY = jax.random.key(3)

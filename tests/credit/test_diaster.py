@@ -7,8 +7,8 @@ import numpy as np
 import optax
 import pytest
 
-from lare.credit.diaster import Diaster
-from lare.networks import descend, start_adam
+from lare_rl.credit.diaster import Diaster
+from lare_rl.nn.networks import descend, start_adam
 
 BATCH, STEPS, FEATURES = 4, 7, 3
 LENGTH = np.array([7, 4, 2, 1])

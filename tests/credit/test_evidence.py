@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lare.credit import evidence
-from lare.credit.basis import Basis, expand
+from lare_rl.credit import evidence
+from lare_rl.credit.basis import Basis, expand
 
 GROUP = np.repeat([0, 1, 2], [3, 4, 5])
 

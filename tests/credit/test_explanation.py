@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit import evidence
-from lare.credit.basis import Basis, expand
-from lare.credit.explanation import add_steps, no_steps
-from lare.credit.explanation import explain as explain_sums
+from lare_rl.credit import evidence
+from lare_rl.credit.basis import Basis, expand
+from lare_rl.credit.explanation import add_steps, no_steps
+from lare_rl.credit.explanation import explain as explain_sums
 
 explain = jax.jit(explain_sums, static_argnames="basis")
 

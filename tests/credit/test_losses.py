@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit import losses
+from lare_rl.credit import losses
 
 
 @pytest.fixture(params=[lambda f: f, jax.jit], ids=["plain", "jit"])

@@ -1,7 +1,7 @@
 import pytest
 
-from lare.credit.methods import METHODS, TABLE, Encoder, Fit, Reward, find_method
-from lare.errors import LareError
+from lare_rl.credit.methods import METHODS, TABLE, Encoder, Fit, Reward, find_method
+from lare_rl.errors import LareError
 
 
 def test_names_are_unique():

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lare.data import replay
-from lare.data.replay import Index
+from lare_rl.data import replay
+from lare_rl.data.replay import Index
 
 ENVS, LONGEST, CHUNKS = 3, 6, (1, 3, 7)
 CAPACITY = replay.room(max(CHUNKS), LONGEST)

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lare.data import replay, sampling
-from lare.tasks.env import EnvSpec, Team
-from recipes import LENGTHS, config_of, steps_of, stored, untrained, with_steps
+from helpers.recipes import LENGTHS, config_of, steps_of, stored, untrained, with_steps
+from lare_rl.data import replay, sampling
+from lare_rl.envs.interface import EnvSpec, Team
 
 ENVS = 3
 ENV = EnvSpec(

@@ -1,6 +1,6 @@
 import numpy as np
 
-from recipes import RIVALS, steps_of
+from helpers.recipes import RIVALS, steps_of
 
 
 def test_an_episode_ends_by_itself_or_with_its_time():

@@ -2,10 +2,10 @@ from dataclasses import replace
 
 import pytest
 
-from lare.latent import function as module
-from lare.latent.function import LatentFunction, verified
-from lare.latent.verify import Verdict
-from toys import PHI, toy_spec
+from helpers.toys import PHI, toy_spec
+from lare_rl.latent import function as module
+from lare_rl.latent.function import LatentFunction, verified
+from lare_rl.latent.verify import Verdict
 
 
 @pytest.fixture(scope="session")

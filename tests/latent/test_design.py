@@ -6,16 +6,16 @@ import re
 import gymnasium
 import pytest
 
-from lare.errors import LareError
-from lare.latent import design as module
-from lare.latent.design import ATTEMPTS, LONGEST_QUOTE, DesignBroken, DesignFailed, DesignStopped, design
-from lare.latent.verify import Check, Verdict, verify
-from lare.llm.prompts import candidate, combine, correct
-from lare.llm.recording import read_recording
-from lare.phi.read import read
-from lare.tasks.load import read_task, shipped_tasks
-from tiers import long
-from toys import PHI, Chase, phi, toy_spec
+from helpers.tiers import long
+from helpers.toys import PHI, Chase, phi, toy_spec
+from lare_rl.envs.load import read_task, shipped_tasks
+from lare_rl.errors import LareError
+from lare_rl.latent import design as module
+from lare_rl.latent.design import ATTEMPTS, LONGEST_QUOTE, DesignBroken, DesignFailed, DesignStopped, design
+from lare_rl.latent.verify import Check, Verdict, verify
+from lare_rl.llm.prompts import candidate, combine, correct
+from lare_rl.llm.recording import read_recording
+from lare_rl.phi.read import read
 
 
 def reply(source: str) -> str:

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from lare.latent import factors as module
-from lare.latent.factors import LatentRewardError, check_finite, compute_factors, origin_of_infinity
-from lare.phi.read import read
-from programs import batch, by_graph, by_python
-from toys import PHI, phi
+from helpers.programs import batch, by_graph, by_python
+from helpers.toys import PHI, phi
+from lare_rl.latent import factors as module
+from lare_rl.latent.factors import LatentRewardError, check_finite, compute_factors, origin_of_infinity
+from lare_rl.phi.read import read
 
 
 def steps(rows: int) -> tuple[np.ndarray, np.ndarray]:

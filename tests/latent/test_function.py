@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lare.errors import LareError
-from lare.latent.factors import LatentRewardError
-from lare.latent.function import entries_text, normal, verified
-from lare.latent.verify import Check
-from lare.phi.graph import Refused
-from toys import PHI, phi
+from helpers.toys import PHI, phi
+from lare_rl.errors import LareError
+from lare_rl.latent.factors import LatentRewardError
+from lare_rl.latent.function import entries_text, normal, verified
+from lare_rl.latent.verify import Check
+from lare_rl.phi.graph import Refused
 
 SOURCE = PHI.strip("\n")
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lare.errors import LareError
-from lare.latent.function import HEADER, check_task, normal, verified
-from lare.latent.saved import load, read_source
-from toys import PHI, phi
+from helpers.toys import PHI, phi
+from lare_rl.errors import LareError
+from lare_rl.latent.function import HEADER, check_task, normal, verified
+from lare_rl.latent.saved import load, read_source
 
 SOURCE = PHI.strip("\n")
 

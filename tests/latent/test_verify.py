@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from lare.errors import LareError
-from lare.latent import verify as module
-from lare.latent.verify import Check, random_steps, sample_steps, verify
-from lare.llm.recording import SHIPPED, read_recording
-from lare.llm.reply import parse
-from lare.tasks.load import read_task
-from tiers import long
-from toys import PHI, phi, toy_spec
+from helpers.tiers import long
+from helpers.toys import PHI, phi, toy_spec
+from lare_rl.envs.load import read_task
+from lare_rl.errors import LareError
+from lare_rl.latent import verify as module
+from lare_rl.latent.verify import Check, random_steps, sample_steps, verify
+from lare_rl.llm.recording import SHIPPED, read_recording
+from lare_rl.llm.reply import parse
 
 RECORDINGS = {
     f"{kind.name}/{entry.name}": read_recording(entry.read_text(encoding="utf-8"), entry.name)
@@ -155,7 +155,12 @@ def test_random_steps_of_another_task(chase):
     assert not np.array_equal(random_steps(chase, 50)[0], random_steps(longer, 50)[0])
 
 
-PARALLEL = {"name": "toy", "environment": "pettingzoo/parallel_toys:Toy", "observation_size": 2, "action_size": 3}
+PARALLEL = {
+    "name": "toy",
+    "environment": "pettingzoo/helpers.parallel_toys:Toy",
+    "observation_size": 2,
+    "action_size": 3,
+}
 """An observation says how much of an episode of five steps is over."""
 
 

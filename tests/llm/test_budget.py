@@ -2,7 +2,7 @@
 
 import pytest
 
-from lare.llm.budget import Budget, BudgetSpent, most_tokens
+from lare_rl.llm.budget import Budget, BudgetSpent, most_tokens
 
 ASKED = [{"role": "user", "content": "Grüße"}]
 

@@ -4,11 +4,11 @@ import json
 
 import pytest
 
-from lare.latent.function import LatentFunction
-from lare.llm.key import without_key
-from lare.llm.recording import Recorder
-from lare.llm.reply import parse
-from toys import PHI
+from helpers.toys import PHI
+from lare_rl.latent.function import LatentFunction
+from lare_rl.llm.key import without_key
+from lare_rl.llm.recording import Recorder
+from lare_rl.llm.reply import parse
 
 KEY = "sk-a+key/that.nobody"
 

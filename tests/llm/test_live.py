@@ -7,10 +7,7 @@ import time
 
 import pytest
 
-from lare.llm import budget, live
-from lare.llm.budget import Budget, BudgetSpent, most_tokens
-from lare.llm.live import LADDER, LiveModel, ModelFailed
-from servers import (
+from helpers.servers import (
     Server,
     completion,
     dribbles,
@@ -26,6 +23,9 @@ from servers import (
     says,
     spells_headers,
 )
+from lare_rl.llm import budget, live
+from lare_rl.llm.budget import Budget, BudgetSpent, most_tokens
+from lare_rl.llm.live import LADDER, LiveModel, ModelFailed
 
 KEY = "sk-secret-key-0123456789"
 ASKED = [{"role": "user", "content": "Write some."}]

@@ -2,9 +2,9 @@
 
 import pytest
 
-from lare.llm.prompts import candidate, combine, correct
-from lare.llm.recording import SHIPPED, read_recording
-from lare.tasks.load import read_task
+from lare_rl.envs.load import read_task
+from lare_rl.llm.prompts import candidate, combine, correct
+from lare_rl.llm.recording import SHIPPED, read_recording
 
 RECORDINGS = sorted(f"{kind.name}/{entry.name}" for kind in SHIPPED.iterdir() for entry in kind.iterdir())
 DIALOGUE = [{"role": "system", "content": "You write code."}, {"role": "user", "content": "Write some."}]

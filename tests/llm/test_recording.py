@@ -5,11 +5,11 @@ import os
 
 import pytest
 
-from lare.errors import LareError
-from lare.llm.prompts import candidate, combine
-from lare.llm.recording import RecordedModel, Recorder, read_recording, shipped_recordings
-from lare.tasks.load import read_task
-from toys import toy_spec
+from helpers.toys import toy_spec
+from lare_rl.envs.load import read_task
+from lare_rl.errors import LareError
+from lare_rl.llm.prompts import candidate, combine
+from lare_rl.llm.recording import RecordedModel, Recorder, read_recording, shipped_recordings
 
 KNOWN = [{"role": "user", "content": "Write some."}]
 RECORDING = {
@@ -98,7 +98,7 @@ def test_an_unknown_draw_is_refused(kind, draw, message):
         ),
         (
             {"Understand": "", "Analyze": "", "Functions": ""},
-            "X.json is a single reply, not a recording of requests and their replies: lare verify X.json --task TASK reads the "
+            "X.json is a single reply, not a recording of requests and their replies: lare-rl verify X.json --task TASK reads the "
             "function in it",
         ),
         (RECORDING | {"note": "mine"}, "recording X.json: there is no key 'note'"),

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lare.llm.reply import MalformedReply, Reply, parse
+from lare_rl.llm.reply import MalformedReply, Reply, parse
 
 GOOD = {"Understand": "u", "Analyze": "a", "Functions": "def f(): ..."}
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lare.tasks.spec import TaskSpec
+from lare_rl.tasks.spec import TaskSpec
 
 
 @pytest.fixture

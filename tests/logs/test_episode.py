@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from lare import LareError
-from lare.logs.episode import KEYS, Form, Logged, checked, form_of
-from lare.plugs.layout import Layout, numbers
+from lare_rl import LareError
+from lare_rl.assigner.layout import Layout, numbers
+from lare_rl.logs.episode import KEYS, Form, Logged, checked, form_of
 
 FORM = Form(numbers(2), numbers(1))
 GOOD = {"observations": np.zeros((4, 2)), "actions": np.zeros((3, 1)), "rewards": np.ones(3)}

@@ -4,11 +4,11 @@ import datasets
 import numpy as np
 import pytest
 
-import lare
-from lare import LareError
-from lare.logs import tables
-from lare.logs.source import open_logs
-from logged import logged
+import lare_rl
+from helpers.logged import logged
+from lare_rl import LareError
+from lare_rl.logs import tables
+from lare_rl.logs.source import open_logs
 
 
 @pytest.fixture(autouse=True)
@@ -44,7 +44,7 @@ def test_round_trip(table, tmp_path, monkeypatch):
         np.testing.assert_allclose(one.before, wanted["observations"][:-1])
         np.testing.assert_allclose(one.after, wanted["observations"][1:])
         np.testing.assert_allclose(one.paid, wanted["rewards"])
-    found = lare.relabel(path, out, hold_out=0.2)
+    found = lare_rl.relabel(path, out, hold_out=0.2)
     assert found.return_r2 > 0.9
     old, new = datasets.load_from_disk(path), datasets.load_from_disk(out)
     assert new.column_names == [*old.column_names, "paid"]

@@ -7,10 +7,10 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete
 from minari.data_collector import EpisodeBuffer
 
-import lare
-from lare import LareError
-from lare.logs.source import open_logs
-from logged import logged
+import lare_rl
+from helpers.logged import logged
+from lare_rl import LareError
+from lare_rl.logs.source import open_logs
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::UserWarning"
@@ -42,12 +42,12 @@ def with_infos(episodes):
 @pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
 def test_round_trip(data_format):
     made("toy/log-v0", with_infos(logged(60)), data_format=data_format, description="A walk.", author="Ada")
-    found = lare.relabel("toy/log-v0", "mine/new-v0", hold_out=0.2)
+    found = lare_rl.relabel("toy/log-v0", "mine/new-v0", hold_out=0.2)
     assert (found.out, found.episodes, found.held_out) == ("mine/new-v0", 60, 12)
     assert found.return_r2 > 0.95
     new = minari.load_dataset("mine/new-v0")
     assert new.storage.metadata["author"] == {"Ada"}
-    assert new.storage.metadata["description"].startswith("A walk.\n\nRewards by lare relabel, bayes;")
+    assert new.storage.metadata["description"].startswith("A walk.\n\nRewards by lare-rl relabel, bayes;")
     assert (new.storage.FORMAT, new.total_episodes) == (data_format, 60)
     for number, (old, one) in enumerate(zip(with_infos(logged(60)), new, strict=True)):
         np.testing.assert_array_equal(one.observations, old["observations"])
@@ -57,7 +57,7 @@ def test_round_trip(data_format):
         np.testing.assert_allclose(one.rewards, old["rewards"], atol=0.5)
         assert new.storage.get_episode_metadata([number]).__iter__().__next__()["seed"] == number
     assert set(minari.list_local_datasets()) == {"toy/log-v0", "mine/new-v0"}
-    again = lare.relabel(new, "mine/again-v0", hold_out=0.2)
+    again = lare_rl.relabel(new, "mine/again-v0", hold_out=0.2)
     assert again.return_r2 == pytest.approx(found.return_r2, abs=1e-5)
 
 
@@ -70,7 +70,7 @@ def test_collected_episodes_that_were_cut(datasets):
             environment.step(environment.action_space.sample())
     environment.create_dataset("pendulum-v0")
     environment.close()
-    found = lare.relabel("pendulum-v0", "pendulum-new-v0", method="rd-linear")
+    found = lare_rl.relabel("pendulum-v0", "pendulum-new-v0", method="rd-linear")
     assert (found.episodes, found.cut, found.held_out) == (25, 1, 2)
     assert minari.load_dataset("pendulum-new-v0").recover_environment().spec.id == "Pendulum-v1"
 
@@ -86,7 +86,7 @@ def test_spaces_of_any_kind():
     made("dict-v0", episodes(), space, Discrete(2))
     logs = open_logs("dict-v0")
     assert (logs.form.observation.size, logs.form.action.size) == (5, 2)
-    found = lare.relabel("dict-v0", "dict-v1", hold_out=0.2)
+    found = lare_rl.relabel("dict-v0", "dict-v1", hold_out=0.2)
     assert found.return_r2 > 0.9
     assert set(minari.load_dataset("dict-v1")[0].observations) == {"ear", "eye"}
 
@@ -101,14 +101,14 @@ def test_what_cannot_be_is_refused(datasets, tmp_path):
         ),
     ):
         with pytest.raises(LareError) as error:
-            lare.relabel("log-v0", out)
+            lare_rl.relabel("log-v0", out)
         assert str(error.value) == message
     with pytest.raises(LareError, match=r"\Athere is no gone-v0: neither a path nor a local data set of Minari"):
-        lare.relabel("gone-v0", "new-v0")
+        lare_rl.relabel("gone-v0", "new-v0")
     file = datasets / "log-v0" / "data" / "main_data.hdf5"
     file.write_bytes(file.read_bytes()[:5000])
     with pytest.raises(LareError, match=r"\Alog-v0, episode \d+ cannot be read: [^\n]+\Z"):
-        lare.relabel("log-v0", "new-v0")
+        lare_rl.relabel("log-v0", "new-v0")
     assert [one.name for one in datasets.iterdir()] == ["log-v0"]
 
 
@@ -116,10 +116,10 @@ def test_a_first_task_file(command, tmp_path):
     made("walks/log-v0", logged(3), description="A walker of two legs. Its reward is its speed. It must not fall.")
     status, said, wrong = command("new-task", "walks/log-v0", "--out", "task.toml")
     assert (status, wrong) == (0, "")
-    assert "lare design task.toml --data walks/log-v0 --model NAME" in said
+    assert "lare-rl design task.toml --data walks/log-v0 --model NAME" in said
     text = (tmp_path / "task.toml").read_text()
     assert "A walker of two legs.\nIt must not fall." in text
     assert "speed" not in text
     (tmp_path / "task.toml").write_text(text.replace("FILL IN", "Filled in"))
-    spec = lare.load_task("task.toml")
+    spec = lare_rl.load_task("task.toml")
     assert (spec.name, spec.environment, spec.observation_size, spec.action_size) == ("log-v0", "none", 2, 1)

@@ -7,19 +7,19 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import lare
-from lare import LareError
-from lare.errors import pip_install
-from lare.logs.npz import NpzLogs, read
-from lare.logs.source import hints_of, open_logs
-from logged import logged
+import lare_rl
+from helpers.logged import logged
+from lare_rl import LareError
+from lare_rl.errors import pip_install
+from lare_rl.logs.npz import NpzLogs, read
+from lare_rl.logs.source import hints_of, open_logs
 
 
 def test_what_is_there_is_written_again(folder, tmp_path):
     """With arrays of anybody's, whatever they are called."""
     others = {"file": np.arange(3), "infos/qpos": np.ones((2, 2)), "name": np.array("a walk")}
     path = folder(one | {key: value for key, value in others.items() if key != "file"} for one in logged(20))
-    lare.relabel(path, tmp_path / "new", method="rd-linear")
+    lare_rl.relabel(path, tmp_path / "new", method="rd-linear")
     for old, new in zip(sorted(path.iterdir()), sorted((tmp_path / "new").iterdir()), strict=True):
         assert old.name == new.name
         was, found = read(old), read(new)
@@ -39,7 +39,7 @@ def test_a_path_that_is_no_log_is_named(tmp_path, monkeypatch):
     with pytest.raises(LareError, match=r"log.csv is text, which is not read: write the log as .npz or Parquet "):
         open_logs(tmp_path / "log.csv")
     monkeypatch.setitem(sys.modules, "minari", None)
-    monkeypatch.delitem(sys.modules, "lare.logs.minari", raising=False)
+    monkeypatch.delitem(sys.modules, "lare_rl.logs.minari", raising=False)
     with pytest.raises(LareError) as refusal:
         open_logs("nologs")
     assert str(refusal.value) == (

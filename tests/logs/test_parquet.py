@@ -5,11 +5,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import lare
-from lare import LareError
-from lare.logs import tables
-from lare.logs.source import open_logs
-from logged import logged
+import lare_rl
+from helpers.logged import logged
+from lare_rl import LareError
+from lare_rl.logs import tables
+from lare_rl.logs.source import open_logs
 
 
 def table(episodes, **others):
@@ -32,7 +32,7 @@ def table(episodes, **others):
 def test_round_trip(tmp_path):
     path, rows = tmp_path / "log.parquet", table(logged(60), comment="mine")
     pq.write_table(rows, path, row_group_size=100)
-    found = lare.relabel(path, tmp_path / "new.parquet", hold_out=0.2)
+    found = lare_rl.relabel(path, tmp_path / "new.parquet", hold_out=0.2)
     assert (found.episodes, found.held_out) == (60, 12)
     assert found.return_r2 > 0.95
     new = pq.read_table(tmp_path / "new.parquet")
@@ -55,7 +55,7 @@ def test_a_directory_of_files_is_one_log(tmp_path, monkeypatch):
         np.testing.assert_array_equal(one.before, wanted["observations"][:-1])
         np.testing.assert_array_equal(one.after, wanted["observations"][1:])
         np.testing.assert_array_equal(one.paid, wanted["rewards"])
-    lare.relabel(tmp_path / "log", tmp_path / "new.parquet", method="rd-linear")
+    lare_rl.relabel(tmp_path / "log", tmp_path / "new.parquet", method="rd-linear")
     assert pq.read_table(tmp_path / "new.parquet")["episode"].to_pylist() == rows["episode"].to_pylist()
 
 
@@ -67,7 +67,7 @@ def test_a_row_for_each_episode(tmp_path):
     for one, wanted in zip(found, logged(12), strict=True):
         np.testing.assert_array_equal(one.after, wanted["observations"][1:])
         np.testing.assert_array_equal(one.paid, wanted["rewards"])
-    lare.relabel(tmp_path / "log.parquet", tmp_path / "new.parquet", method="rd-linear")
+    lare_rl.relabel(tmp_path / "log.parquet", tmp_path / "new.parquet", method="rd-linear")
     new = pq.read_table(tmp_path / "new.parquet")
     assert new.column_names == ["observations", "actions", "rewards", "paid"]
     assert new["paid"].to_pylist() == rows["rewards"].to_pylist()
@@ -126,7 +126,7 @@ def test_what_is_no_log_is_refused(tmp_path, rows, message):
     path = tmp_path / "log.parquet"
     pq.write_table(rows, path)
     with pytest.raises(LareError) as error:
-        lare.relabel(path, tmp_path / "new.parquet", method="rd-linear")
+        lare_rl.relabel(path, tmp_path / "new.parquet", method="rd-linear")
     assert str(error.value).startswith(message.format(path=path))
     assert [one.name for one in tmp_path.iterdir()] == ["log.parquet"]
 

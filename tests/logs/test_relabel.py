@@ -9,13 +9,13 @@ import sys
 import numpy as np
 import pytest
 
-import lare
-from lare import LareError
-from lare.latent.function import verified
-from lare.logs import relabel as module
-from lare.logs.relabel import held
-from logged import PHI, logged
-from tiers import long
+import lare_rl
+from helpers.logged import PHI, logged
+from helpers.tiers import long
+from lare_rl import LareError
+from lare_rl.latent.function import verified
+from lare_rl.logs import relabel as module
+from lare_rl.logs.relabel import held
 
 
 def read(path):
@@ -23,7 +23,7 @@ def read(path):
 
 
 def test_a_linear_score_is_found_and_told_from_unseen_returns(folder, tmp_path):
-    found = lare.relabel(folder(logged(120)), tmp_path / "new")
+    found = lare_rl.relabel(folder(logged(120)), tmp_path / "new")
     assert (found.method, found.episodes, found.cut, found.held_out) == ("bayes", 120, 0, 12)
     assert found.return_r2 > 0.98
     assert any("Raw entries explain" in line for line in found.explanation)
@@ -38,7 +38,7 @@ def test_a_linear_score_is_found_and_told_from_unseen_returns(folder, tmp_path):
 
 
 def test_a_score_of_noise_is_said_to_be_noise(tmp_path):
-    found = lare.relabel(list(logged(200, noise=True)), tmp_path / "new")
+    found = lare_rl.relabel(list(logged(200, noise=True)), tmp_path / "new")
     assert found.return_r2 < 0.2
     assert f"with a standard error of {found.return_r2_error:.1g}." in found.words[1]
     assert 0.05 < found.return_r2_error < 1
@@ -47,8 +47,8 @@ def test_a_score_of_noise_is_said_to_be_noise(tmp_path):
 
 def test_a_function_is_verified_on_logs_and_used(folder, tmp_path, task):
     path = folder(logged(60))
-    phi = verified(PHI, task, steps=lare.logged_steps(path, task))
-    found = lare.relabel(path, tmp_path / "new", phi=phi, task=task, hold_out=0.2)
+    phi = verified(PHI, task, steps=lare_rl.logged_steps(path, task))
+    found = lare_rl.relabel(path, tmp_path / "new", phi=phi, task=task, hold_out=0.2)
     assert (found.method, found.held_out) == ("lare-bayes", 12)
     assert found.return_r2 > 0.95
     assert any("first" in line for line in found.explanation)
@@ -60,7 +60,7 @@ def test_cut_episodes_are_paid_and_not_learned_from(folder, tmp_path):
         episodes[number] |= {"cut": np.array(True), "rewards": np.full_like(episodes[number]["rewards"], 1e6)}
     for number in (20, 21):
         episodes[number] |= {key: np.zeros_like(episodes[number][key]) for key in ("terminations", "truncations")}
-    found = lare.relabel(folder(episodes), tmp_path / "new", hold_out=0.2)
+    found = lare_rl.relabel(folder(episodes), tmp_path / "new", hold_out=0.2)
     assert found.cut == 5
     assert found.return_r2 > 0.95
     assert "Cut before their end, and not learned from: 5 episodes." in found.words
@@ -69,7 +69,7 @@ def test_cut_episodes_are_paid_and_not_learned_from(folder, tmp_path):
 
 def test_the_time_limit_says_what_was_cut(tmp_path, task):
     limited = task.model_copy(update={"max_episode_steps": 29})
-    found = lare.relabel(list(logged(80)), tmp_path / "new", task=limited)
+    found = lare_rl.relabel(list(logged(80)), tmp_path / "new", task=limited)
     truncated = [len(one["actions"]) for one in logged(80) if one["truncations"].any()]
     assert found.cut == sum(steps < 29 for steps in truncated) > 0
 
@@ -81,20 +81,20 @@ def test_one_score_stands_for_rewards(folder, tmp_path):
             del values["terminations"], values["truncations"]
             yield values | {"score": score}
 
-    found = lare.relabel(folder(scored()), tmp_path / "new")
+    found = lare_rl.relabel(folder(scored()), tmp_path / "new")
     assert (found.cut, found.return_r2 > 0.95) == (0, True)
     first = read(tmp_path / "new")[0]
     assert first["paid"][-1] == first["score"] == pytest.approx(first["paid"].sum())
-    again = lare.relabel(tmp_path / "new", tmp_path / "again")
+    again = lare_rl.relabel(tmp_path / "new", tmp_path / "again")
     assert again.return_r2 == pytest.approx(found.return_r2, abs=1e-6)
 
 
 def test_what_was_relabelled_can_be_relabelled(folder, tmp_path):
     """By what was paid at first, not by what the rewards are now; in its own place, too, where that is asked for."""
     path = folder(logged(40))
-    lare.relabel(path, path, method="rd-linear", overwrite=True)
+    lare_rl.relabel(path, path, method="rd-linear", overwrite=True)
     once = read(path)
-    lare.relabel(path, path, method="rd-linear", overwrite=True)
+    lare_rl.relabel(path, path, method="rd-linear", overwrite=True)
     for before, after in zip(once, read(path), strict=True):
         assert all(np.array_equal(before[key], after[key]) for key in before)
     assert [one.name for one in tmp_path.iterdir()] == ["log"]
@@ -102,7 +102,7 @@ def test_what_was_relabelled_can_be_relabelled(folder, tmp_path):
 
 @pytest.mark.parametrize("method", ["rrdu", long("rd"), long("diaster"), long("rd-linear")])
 def test_other_methods_too(tmp_path, method):
-    found = lare.relabel(list(logged(40)), tmp_path / "new", method=method, updates=16, hold_out=0.25)
+    found = lare_rl.relabel(list(logged(40)), tmp_path / "new", method=method, updates=16, hold_out=0.25)
     assert math.isfinite(found.return_r2)
 
 
@@ -114,7 +114,7 @@ def test_flat_arrays_as_d4rl_has_them(tmp_path):
     flat["terminals"], flat["timeouts"] = flat.pop("terminations"), flat.pop("truncations")
     flat["metadata/algorithm"] = np.array("sac")
     flat["timeouts"][-1] = flat["terminals"][-1] = False  # the last one goes on
-    found = lare.relabel(flat, tmp_path / "new", hold_out=0.2)
+    found = lare_rl.relabel(flat, tmp_path / "new", hold_out=0.2)
     assert (found.episodes, found.cut, found.held_out) == (50, 1, 9)
     again = read(tmp_path / "new")
     np.testing.assert_array_equal(np.concatenate([one["paid"] for one in again]), flat["rewards"])
@@ -138,7 +138,7 @@ def test_a_log_is_read_as_a_stream(tmp_path, monkeypatch):
         def __iter__(self):
             return map(Told, logged(300))
 
-    found = lare.relabel(Log(), tmp_path / "new", method="rd-linear")
+    found = lare_rl.relabel(Log(), tmp_path / "new", method="rd-linear")
     assert found.episodes == 300
     assert most[0] < 20
 
@@ -154,7 +154,7 @@ def test_an_output_is_whole_or_not_there(folder, tmp_path):
     path = folder(logged(20))
     (path / "0019.npz").write_bytes(b"not an archive")
     with pytest.raises(LareError, match=r"0019\.npz is no \.npz file, or a damaged one: [^\n]+\Z"):
-        lare.relabel(path, tmp_path / "new")
+        lare_rl.relabel(path, tmp_path / "new")
     assert [one.name for one in tmp_path.iterdir()] == ["log"]
 
 
@@ -171,7 +171,7 @@ def test_a_failure_in_the_second_pass_leaves_what_was_there(tmp_path):
     (tmp_path / "new").mkdir()
     (tmp_path / "new" / "mine.npz").write_text("kept")
     with pytest.raises(LareError) as error:
-        lare.relabel(Log(), tmp_path / "new", overwrite=True)
+        lare_rl.relabel(Log(), tmp_path / "new", overwrite=True)
     assert str(error.value) == "episodes has changed while it was read: 20 episodes first, then 19"
     assert [one.name for one in tmp_path.iterdir()] == ["new"]
     assert (tmp_path / "new" / "mine.npz").read_text() == "kept"
@@ -190,14 +190,14 @@ def test_a_failure_in_the_second_pass_leaves_what_was_there(tmp_path):
 )
 def test_what_makes_no_sense_is_refused(tmp_path, options, message):
     with pytest.raises(LareError) as error:
-        lare.relabel(list(logged(10)), tmp_path / "new", **options)
+        lare_rl.relabel(list(logged(10)), tmp_path / "new", **options)
     assert (str(error.value), list(tmp_path.iterdir())) == (message, [])
 
 
 def test_nothing_whole_is_nothing_to_learn_from(tmp_path):
     cut = [one | {"cut": True} for one in logged(3)]
     with pytest.raises(LareError) as error:
-        lare.relabel(cut, tmp_path / "new")
+        lare_rl.relabel(cut, tmp_path / "new")
     assert str(error.value).startswith("episodes: none of 3 episodes is whole and not held out")
 
 
@@ -214,22 +214,22 @@ def test_the_command(command, folder, tmp_path, task):
     assert command("relabel", path, "--out", "new") == (
         2,
         "",
-        "lare: new exists: choose another directory, or replace it with --overwrite (overwrite=True)\n",
+        "lare-rl: new exists: choose another directory, or replace it with --overwrite (overwrite=True)\n",
     )
     status, said, _ = command("verify", "phi.py", "--task", "task.toml", "--data", path)
     assert (status, "FAILED" in said) == (0, False)
-    assert command("verify", "phi.py", "--task", "task.toml")[2].startswith("lare: task 'Logs' has no environment")
+    assert command("verify", "phi.py", "--task", "task.toml")[2].startswith("lare-rl: task 'Logs' has no environment")
     status, _, wrong = command("train", "task.toml")
     assert (status, wrong.count("\n")) == (2, 1)
-    assert wrong.startswith("lare: task 'Logs' has no environment (environment = 'none')")
-    assert command("relabel", "gone/", "--out", "new2")[2] == "lare: there is no gone/\n"
+    assert wrong.startswith("lare-rl: task 'Logs' has no environment (environment = 'none')")
+    assert command("relabel", "gone/", "--out", "new2")[2] == "lare-rl: there is no gone/\n"
 
 
 def test_a_directory_of_other_files_is_never_replaced(folder, tmp_path):
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "thesis.txt").write_text("years")
     with pytest.raises(LareError) as refused:
-        lare.relabel(folder(logged(9)), tmp_path / "precious", method="rd-linear", overwrite=True)
+        lare_rl.relabel(folder(logged(9)), tmp_path / "precious", method="rd-linear", overwrite=True)
     assert str(refused.value) == (
         f"{tmp_path / 'precious'} holds thesis.txt, which is not a log, and is not replaced: choose another directory"
     )
@@ -238,7 +238,7 @@ def test_a_directory_of_other_files_is_never_replaced(folder, tmp_path):
 
 def test_one_that_is_asked_to_end_leaves_nothing_behind(folder, tmp_path):
     path = folder(logged(3000))
-    command = [sys.executable, "-c", "from lare.cli import main; main()", "relabel", str(path), "--out", "new"]
+    command = [sys.executable, "-c", "from lare_rl.cli import main; main()", "relabel", str(path), "--out", "new"]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as running:
         while not running.stderr.readline().startswith("writing"):
             assert running.poll() is None

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-import lare
-from lare import LareError
-from lare.latent.verify import verify
-from logged import PHI, logged
+import lare_rl
+from helpers.logged import PHI, logged
+from lare_rl import LareError
+from lare_rl.latent.verify import verify
 
 
 @pytest.mark.parametrize("judges", ["before", "after"])
 def test_steps_are_from_all_over_the_log(task, judges):
     episodes = list(logged(40))
-    observation, action = lare.logged_steps(episodes, task.model_copy(update={"judges": judges}))
+    observation, action = lare_rl.logged_steps(episodes, task.model_copy(update={"judges": judges}))
     assert (observation.shape, action.shape) == ((256, 2), (256, 1))
     known = slice(None, -1) if judges == "before" else slice(1, None)
     every = np.concatenate([one["observations"][known] for one in episodes])
@@ -21,7 +21,7 @@ def test_steps_are_from_all_over_the_log(task, judges):
 
 def test_both_observations_of_a_step_are_shown_if_both_are_judged(task):
     episodes = list(logged(40))
-    observation, action = lare.logged_steps(episodes, task.model_copy(update={"judges": "both"}))
+    observation, action = lare_rl.logged_steps(episodes, task.model_copy(update={"judges": "both"}))
     assert (observation.shape, action.shape) == ((256, 2), (256, 1))
     first, second = np.split(observation, 2)
     every = np.concatenate([one["observations"] for one in episodes])
@@ -56,5 +56,5 @@ def test_a_task_without_an_environment_takes_nothing_that_only_an_environment_he
         'action = "a"\nmeasures = ["x"]\n'
     )
     with pytest.raises(LareError) as error:
-        lare.load_task(path)
+        lare_rl.load_task(path)
     assert str(error.value) == "task 'Logs': measures makes no difference to logs: leave it out"

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.phi.evaluate import evaluate
-from lare.phi.read import read
-from phi.corpus import recorded, steps
-from toys import phi
+from helpers.corpus import recorded, steps
+from helpers.toys import phi
+from lare_rl.phi.evaluate import evaluate
+from lare_rl.phi.read import read
 
 PROGRAMS = {p.name: p for p in recorded()[::60]}
 

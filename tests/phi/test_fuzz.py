@@ -12,10 +12,10 @@ import numpy as np
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from lare.phi.evaluate import evaluate
-from lare.phi.graph import Refused
-from lare.phi.read import read
-from phi.corpus import benign, execute, hostile, recorded, varied
+from helpers.corpus import benign, execute, hostile, recorded, varied
+from lare_rl.phi.evaluate import evaluate
+from lare_rl.phi.graph import Refused
+from lare_rl.phi.read import read
 from phi.test_numpy_functions import CASES
 
 EXAMPLES = int(os.environ.get("LARE_FUZZ", "150"))

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from lare.latent.function import entries_text
-from lare.phi.evaluate import evaluate
-from lare.phi.graph import UNLIMITED, Builder, Limits, Refused
-from lare.phi.read import read
-from phi.corpus import benign, steps, varied
-from toys import phi
+from helpers.corpus import benign, steps, varied
+from helpers.toys import phi
+from lare_rl.latent.function import entries_text
+from lare_rl.phi.evaluate import evaluate
+from lare_rl.phi.graph import UNLIMITED, Builder, Limits, Refused
+from lare_rl.phi.read import read
 
 PROGRAMS = {p.name: p for p in (*benign()[:6], *varied()[::9])}
 

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from lare.phi.names import factor_meanings, factor_names
-from toys import PHI, phi
+from helpers.toys import PHI, phi
+from lare_rl.phi.names import factor_meanings, factor_names
 
 
 @pytest.mark.parametrize(

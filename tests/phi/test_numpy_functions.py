@@ -6,10 +6,10 @@ Expressions are separated by | and by the ends of lines; ¦ stands for the opera
 import numpy as np
 import pytest
 
-from lare.phi.evaluate import evaluate
-from lare.phi.numpy_functions import FUNCTIONS
-from lare.phi.read import read
-from phi.corpus import execute, steps
+from helpers.corpus import execute, steps
+from lare_rl.phi.evaluate import evaluate
+from lare_rl.phi.numpy_functions import FUNCTIONS
+from lare_rl.phi.read import read
 
 SETUP = """import numpy as np
 import math
@@ -194,7 +194,7 @@ def test_function_agrees_with_numpy(expression):
 
 def test_every_function_is_tried():
     """Each registered name, or another name of the same function, is in an expression above or in a program of the corpus."""
-    from phi.corpus import benign, recorded, varied
+    from helpers.corpus import benign, recorded, varied
 
     text = "\n".join([*EXPRESSIONS.values(), *(p.source for p in (*recorded(), *benign(), *varied()))])
     names_by_function = {}

@@ -4,13 +4,13 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from lare.phi.evaluate import evaluate
-from lare.phi.graph import Refused
-from lare.phi.onnx import onnx_model
-from lare.phi.read import read
-from phi.corpus import benign, recorded, steps, varied
+from helpers.corpus import benign, recorded, steps, varied
+from helpers.tiers import long
+from lare_rl.phi.evaluate import evaluate
+from lare_rl.phi.graph import Refused
+from lare_rl.phi.onnx import onnx_model
+from lare_rl.phi.read import read
 from phi.test_numpy_functions import CASES, SETUP
-from tiers import long
 
 PROGRAMS = {p.name: p for p in (*benign(), *varied(), *recorded())}
 IN_SHORT = {*[p.name for p in varied()[::12]], *[p.name for p in recorded()[::80]]}

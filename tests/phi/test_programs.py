@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.phi.evaluate import evaluate
-from lare.phi.graph import Refused
-from lare.phi.read import read
-from phi.corpus import benign, execute, mended, recorded, steps, varied
-from tiers import long
+from helpers.corpus import benign, execute, mended, recorded, steps, varied
+from helpers.tiers import long
+from lare_rl.phi.evaluate import evaluate
+from lare_rl.phi.graph import Refused
+from lare_rl.phi.read import read
 
 REFUSED = {
     "a_covariance_logdet": "eigenvalues of 4 x 4 matrices",

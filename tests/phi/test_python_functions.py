@@ -9,9 +9,9 @@ import operator
 import numpy as np
 import pytest
 
-from lare.phi.evaluate import evaluate
-from lare.phi.read import read
-from toys import phi
+from helpers.toys import phi
+from lare_rl.phi.evaluate import evaluate
+from lare_rl.phi.read import read
 
 MODULES = {module.__name__: module for module in (math, itertools, functools, operator, collections)}
 EXPRESSIONS = """

@@ -2,11 +2,11 @@
 
 import pytest
 
-from lare.latent.verify import verify
-from lare.phi.graph import Refused
-from lare.phi.read import read
-from phi.corpus import hostile
-from toys import phi, toy_spec
+from helpers.corpus import hostile
+from helpers.toys import phi, toy_spec
+from lare_rl.latent.verify import verify
+from lare_rl.phi.graph import Refused
+from lare_rl.phi.read import read
 
 CASES = {
     "syntax": ("def f(:\n", "E-SYNTAX", "line 1"),

@@ -1,6 +1,6 @@
 import pytest
 
-from toys import toy_spec
+from helpers.toys import toy_spec
 
 
 @pytest.mark.parametrize("key", ["name", "description", "observation", "action", "environment"])

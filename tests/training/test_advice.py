@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 
-import lare
-from lare.training import session as sessions
-from lare.training.advice import SATURATION, of_returns, of_saturation, saturation
-from toys import Chase, Ear, toy_spec
+import lare_rl
+from helpers.toys import Chase, Ear, toy_spec
+from lare_rl.training import session as sessions
+from lare_rl.training.advice import SATURATION, of_returns, of_saturation, saturation
 
 
 class Bright(Chase):
@@ -27,7 +27,7 @@ BRIGHT = {"name": "Bright", "environment": "toys/Bright-v0", "observation": "0: 
 
 def heard(task, settings, out):
     ear = Ear()
-    lare.train(task, settings, out=out, listeners=[ear])
+    lare_rl.train(task, settings, out=out, listeners=[ear])
     return [line for line in ear.heard if line.startswith("Observations are large")]
 
 
@@ -87,14 +87,14 @@ def test_a_policy_at_its_bounds(actions, shares, whose):
 
 
 def test_the_newest_states_are_asked(small, tmp_path):
-    run = lare.train(toy_spec(), small(method="dense", algorithm="td3", seeds=2), out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(toy_spec(), small(method="dense", algorithm="td3", seeds=2), out=tmp_path / "run", listeners=[])
     session, _ = sessions.restore(run)
     actions = session.actions_now(5)
     assert actions.shape == (2, 5, 1)
     held = session.learner.replay
     newest = int(held.next_row[1, 0]) - np.arange(1, 6)
     seen = np.asarray(held.columns["observation"][1, 0, newest, 0])
-    np.testing.assert_allclose(2 * actions[1], lare.policy_of(run, seed=run.seeds[1])(seen), rtol=1e-5)
+    np.testing.assert_allclose(2 * actions[1], lare_rl.policy_of(run, seed=run.seeds[1])(seen), rtol=1e-5)
     assert session.actions_now(5000).shape == (2, 5000, 1)  # more than are stored: they are repeated
     session.close()
 
@@ -103,6 +103,6 @@ def test_a_policy_that_has_not_been_trained_says_nothing(small, tmp_path, monkey
     monkeypatch.setattr(sessions.Session, "actions_now", lambda session, steps: np.ones((1, steps, 1)))
     for steps, count in ((24, 0), (48, 1)):
         ear, settings = Ear(), small(method="dense", algorithm="td3", seeds=1, steps=steps, td3={"warmup": 24})
-        run = lare.train(toy_spec(), settings, out=tmp_path / str(steps), listeners=[ear])
+        run = lare_rl.train(toy_spec(), settings, out=tmp_path / str(steps), listeners=[ear])
         assert sum(line.startswith("The policy chooses") for line in ear.heard) == count
         assert [line.get(SATURATION) for line in run.metrics()] == [1.0 if count else None]

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jax_toys import Echo
-from lare.algorithms import qmix
-from lare.tasks.particles.env import ParticleJaxEnv
-from lare.tasks.particles.task import STEPS
-from lare.training import sequences
-from lare.training.collect_device import DeviceCollector, play
-from lare.training.compiled import compiled
-from lare.training.streams import Stream, stream_keys
-from recipes import QUICK, config_of
+from helpers.jax_toys import Echo
+from helpers.recipes import QUICK, config_of
+from lare_rl.algorithms import qmix
+from lare_rl.envs.particles.particle_env import ParticleJaxEnv
+from lare_rl.envs.particles.task import STEPS
+from lare_rl.training import sequences
+from lare_rl.training.collect_device import DeviceCollector, play
+from lare_rl.training.compiled import compiled
+from lare_rl.training.streams import Stream, stream_keys
 
 SEEDS, ENVS, TIME = (0, 3), 4, 9
 ENV = Echo()

@@ -10,19 +10,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import lare
-from jax_toys import Echo, echo_spec
-from lare.tasks.env import EnvSpec, Team, env_action
-from lare.tasks.environment import EnvironmentFault
-from lare.tasks.gymnasium import GymnasiumEnv
-from lare.tasks.on_host import OnHost
-from lare.tasks.table import FAMILIES, Family, make_host_env
-from lare.tasks.workers import LocalEnvs, WorkerEnvs
-from lare.training.collect_host import Diverged, HostEpisodes, evaluate
-from lare.training.streams import Stream, episode_seed
-from lare.training.train import Interrupted
-from tiers import long
-from toys import At, figures, toy_spec
+import lare_rl
+from helpers.jax_toys import Echo, echo_spec
+from helpers.tiers import long
+from helpers.toys import At, figures, toy_spec
+from lare_rl.envs.families import FAMILIES, Family, make_host_env
+from lare_rl.envs.guarded_gymnasium import EnvironmentFault
+from lare_rl.envs.gymnasium_env import GymnasiumEnv
+from lare_rl.envs.interface import EnvSpec, Team, env_action
+from lare_rl.envs.jax_on_host import OnHost
+from lare_rl.envs.workers import LocalEnvs, WorkerEnvs
+from lare_rl.training.collect_host import Diverged, HostEpisodes, evaluate
+from lare_rl.training.streams import Stream, episode_seed
+from lare_rl.training.train import Interrupted
 
 
 class Given(gymnasium.Wrapper):
@@ -242,15 +242,15 @@ def test_an_environment_that_writes_into_one_array_is_stored_as_it_was_then(givi
 @pytest.mark.parametrize(("kind", "algorithm"), [long(LocalEnvs, "td3"), (WorkerEnvs, "ppo")])
 def test_a_run_of_two_environments_a_seed_resumes_bit_for_bit(kind, algorithm, small, tmp_path, monkeypatch):
     """In this process, and in processes of their own."""
-    monkeypatch.setattr("lare.training.collect_host.WorkerEnvs", kind)
-    task = toy_spec(environment="toys:toys/Chase-v0")
+    monkeypatch.setattr("lare_rl.training.collect_host.WorkerEnvs", kind)
+    task = toy_spec(environment="helpers.toys:toys/Chase-v0")
     settings = small(method="rrdu", algorithm=algorithm, environments=2, steps=192, evaluate_every=48, seeds=2)
-    whole = lare.train(task, settings, out=tmp_path / "whole", listeners=[])
+    whole = lare_rl.train(task, settings, out=tmp_path / "whole", listeners=[])
     assert [line["step"] for line in whole.metrics()[::2]] == [48, 96, 144, 192]
     stop = At(72, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(Interrupted):
-        lare.train(task, settings, out=tmp_path / "run", listeners=[stop])
-    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+        lare_rl.train(task, settings, out=tmp_path / "run", listeners=[stop])
+    assert figures(lare_rl.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
 @pytest.mark.parametrize("algorithm", [long("qmix"), "ippo"])
@@ -263,20 +263,20 @@ def test_many_agents_on_the_host_resume_bit_for_bit(algorithm, small_many, tmp_p
         return env
 
     monkeypatch.setitem(FAMILIES, "hosted", Family(hosted))
-    monkeypatch.setattr("lare.training.collect_host.WorkerEnvs", LocalEnvs)
+    monkeypatch.setattr("lare_rl.training.collect_host.WorkerEnvs", LocalEnvs)
     task = echo_spec(environment="hosted/three")
     changes = {"environments": 2, "rollout_steps": 10, "steps": 160, "evaluate_every": 40, "evaluation_episodes": 2}
     settings = small_many(algorithm=algorithm, method="rrdu", seeds=1, **changes)
-    whole = lare.train(task, settings, out=tmp_path / "whole", listeners=[])
+    whole = lare_rl.train(task, settings, out=tmp_path / "whole", listeners=[])
     stop = At(100, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(Interrupted):
-        lare.train(task, settings, out=tmp_path / "run", listeners=[stop])
-    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+        lare_rl.train(task, settings, out=tmp_path / "run", listeners=[stop])
+    assert figures(lare_rl.resume(tmp_path / "run", listeners=[])) == figures(whole)
     assert 3 <= whole.metrics()[-1]["evaluation/length"] <= 6
 
 
 def test_environments_in_processes_of_their_own_give_the_same():
-    maker = partial(make_host_env, toy_spec(environment="toys:toys/Chase-v0"))
+    maker = partial(make_host_env, toy_spec(environment="helpers.toys:toys/Chase-v0"))
     with WorkerEnvs([maker] * 4) as workers:
         there, here = HostEpisodes(workers, (0, 1), 2), lanes((0, 1), 2)
         there.begin()

@@ -8,14 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit import closed_form, decomposition, returns
-from lare.credit.returns import FormFound
-from lare.credit.settings import CreditSettings
-from lare.data import replay
-from lare.training import episodes
-from lare.training import learner as common
-from lare.training.episodes import learn_returns, sum_again
-from recipes import (
+from helpers.recipes import (
     LENGTHS,
     RIVALS,
     TOGETHER,
@@ -29,7 +22,14 @@ from recipes import (
     untrained,
     with_steps,
 )
-from tiers import long
+from helpers.tiers import long
+from lare_rl.credit import closed_form, decomposition, returns
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.returns import FormFound
+from lare_rl.data import replay
+from lare_rl.training import episodes
+from lare_rl.training import learner as common
+from lare_rl.training.episodes import learn_returns, sum_again
 
 LONG = LENGTHS * 8
 """Lengths of many episodes."""

@@ -4,15 +4,15 @@ import jax
 import numpy as np
 import pytest
 
-import lare
-from lare.credit.explanation import Explanation
-from lare.credit.returns import FormFound
-from lare.credit.words import entry_names, words
-from lare.latent.function import verified
-from lare.tasks.load import read_task
-from lare.training.explain import explanation_of
-from tiers import long
-from toys import Ear, toy_spec
+import lare_rl
+from helpers.tiers import long
+from helpers.toys import Ear, toy_spec
+from lare_rl.credit.explanation import Explanation
+from lare_rl.credit.explanation_text import entry_names, words
+from lare_rl.credit.returns import FormFound
+from lare_rl.envs.load import read_task
+from lare_rl.latent.function import verified
+from lare_rl.training.explain import explanation_of
 
 
 def found(**changes):
@@ -236,20 +236,20 @@ def test_a_run_is_explained(method, small, tmp_path):
     function = verified(source, toy_spec()) if method != "rrdu" else None
     settings = small(method=method, algorithm="td3", seeds=1, steps=600)
     ear = Ear()
-    run = lare.train(toy_spec(), settings, function=function, out=tmp_path / "run", listeners=[ear])
+    run = lare_rl.train(toy_spec(), settings, function=function, out=tmp_path / "run", listeners=[ear])
     lines = explanation_of(run)
     assert any("of the variation of the returns of" in line for line in lines)
     assert ear.heard[-len(lines) :] == lines
     assert (f"not the decoder of {method}" in lines[0]) == (method != "lare-bayes")
     assert ("The factors explain" in " ".join(lines)) == (method != "rrdu")
-    assert "What the returns say" in lare.write_report([run.directory]).read_text()
+    assert "What the returns say" in lare_rl.write_report([run.directory]).read_text()
 
 
 @pytest.mark.long
 def test_many_agents_are_explained_by_factors_alone(small_many, tmp_path):
     source = "def evaluation_func(o, a):\n    return [o[:, 0:1] * a[:, 0:1], o[:, 1:2]]\n"
     task = read_task("CN-6")
-    run = lare.train(
+    run = lare_rl.train(
         task,
         small_many(method="lare-rd", seeds=1, steps=800, capacity=2000),
         function=verified(source, task),

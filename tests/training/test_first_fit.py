@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import lare
-from lare.data import replay
-from lare.latent.function import verified
-from lare.run.decide import decide
-from lare.run.directory import create
-from lare.tasks.load import read_task
-from lare.training import first_fit, session
-from lare.training.compiled import compiled
-from lare.training.first_fit import PATIENCE, fit_until_it_stops_helping, held_out, with_smaller_updates
-from lare.training.seeds import of_seed
-from toys import At, figures
+import lare_rl
+from helpers.toys import At, figures
+from lare_rl.config.resolve import decide
+from lare_rl.data import replay
+from lare_rl.envs.load import read_task
+from lare_rl.latent.function import verified
+from lare_rl.runs.directory import create
+from lare_rl.training import first_fit, session
+from lare_rl.training.compiled import compiled
+from lare_rl.training.first_fit import PATIENCE, fit_until_it_stops_helping, held_out, with_smaller_updates
+from lare_rl.training.seed_axis import of_seed
 
 
 def every_step(buffer):
@@ -131,14 +131,14 @@ def test_a_run_that_is_resumed_after_its_first_fit_makes_no_other(small_many, tm
         method="lare-rd", seeds=1, environments=12, steps=900, evaluate_every=300, capacity=2000, first_fit="held-out"
     )
     given = {"function": verified(PHI, task)}
-    whole = lare.train(task, settings, out=tmp_path / "whole", listeners=[], **given)
+    whole = lare_rl.train(task, settings, out=tmp_path / "whole", listeners=[], **given)
 
     def stop():
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        lare.train(task, settings, out=tmp_path / "run", listeners=[At(600, stop)], **given)
-    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+        lare_rl.train(task, settings, out=tmp_path / "run", listeners=[At(600, stop)], **given)
+    assert figures(lare_rl.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
 def test_a_run_that_is_stopped_during_its_first_fit_begins_again(small_many, tmp_path, monkeypatch):
@@ -147,7 +147,7 @@ def test_a_run_that_is_stopped_during_its_first_fit_begins_again(small_many, tmp
         method="lare-rd", seeds=1, environments=12, steps=600, evaluate_every=300, capacity=2000, first_fit="held-out"
     )
     given = {"function": verified(PHI, task)}
-    whole = lare.train(task, settings, out=tmp_path / "whole", listeners=[], **given)
+    whole = lare_rl.train(task, settings, out=tmp_path / "whole", listeners=[], **given)
 
     def ask_to_stop(learner):
         os.kill(os.getpid(), signal.SIGINT)
@@ -155,8 +155,8 @@ def test_a_run_that_is_stopped_during_its_first_fit_begins_again(small_many, tmp
 
     with monkeypatch.context() as patch:
         patch.setattr(first_fit, "has_enough", ask_to_stop)
-        with pytest.raises(lare.LareError) as stopped:
-            lare.train(task, settings, out=tmp_path / "run", listeners=[], **given)
-    said = f"stopped during the decoder's first fit; to continue: lare train --resume {tmp_path / 'run'}"
+        with pytest.raises(lare_rl.LareError) as stopped:
+            lare_rl.train(task, settings, out=tmp_path / "run", listeners=[], **given)
+    said = f"stopped during the decoder's first fit; to continue: lare-rl train --resume {tmp_path / 'run'}"
     assert str(stopped.value) == said
-    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+    assert figures(lare_rl.resume(tmp_path / "run", listeners=[])) == figures(whole)

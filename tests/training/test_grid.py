@@ -4,15 +4,15 @@ import jax
 import numpy as np
 import pytest
 
-import lare
-from lare.algorithms.table import ALGORITHMS
-from lare.credit.methods import METHODS
-from lare.errors import LareError
-from lare.latent.function import verified
-from lare.tasks.load import read_task
-from lare.training import session as sessions
-from tiers import long
-from toys import pick_spec, toy_spec
+import lare_rl
+from helpers.tiers import long
+from helpers.toys import pick_spec, toy_spec
+from lare_rl.algorithms.table import ALGORITHMS
+from lare_rl.credit.methods import METHODS
+from lare_rl.envs.load import read_task
+from lare_rl.errors import LareError
+from lare_rl.latent.function import verified
+from lare_rl.training import session as sessions
 
 GRID = [("td3", method) for method in METHODS]
 GRID += [("ippo", method) for method in ("lare-bayes", "arel")]
@@ -51,7 +51,7 @@ def trained(kind, method, small, small_many, out):
     settings = (small_many if many else small)(
         method=method, algorithm=kind, seeds=1, **({} if many else {"steps": 120})
     )
-    return lare.train(task, settings, function=given_for(row, task), out=out, listeners=[])
+    return lare_rl.train(task, settings, function=given_for(row, task), out=out, listeners=[])
 
 
 def fits(kind, row):
@@ -79,7 +79,7 @@ def test_every_method_trains_and_reports_or_is_refused(method, kind, small, smal
     assert "critic/loss" in lines[-1]
     assert (run.directory / "latent_function.py").exists() == row.latent
     if (kind, method) == ("td3", "lare-rrdu"):
-        assert lare.write_report([run.directory]).read_text().count("<svg") >= 1
+        assert lare_rl.write_report([run.directory]).read_text().count("<svg") >= 1
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_methods_where_agents_leave(judged_from, method, small_many, echo, tmp_p
     settings = small_many(method=method, algorithm="qmix", seeds=1, steps=100, rollout_steps=25)
 
     def train():
-        return lare.train(task, settings, function=given_for(row, task), out=tmp_path / "run", listeners=[])
+        return lare_rl.train(task, settings, function=given_for(row, task), out=tmp_path / "run", listeners=[])
 
     if row.whole_episodes or (row.for_many_only and judged_from == "state"):
         with pytest.raises(LareError, match=rf"^{method} (looks at whole episodes|assigns credit among agents)[^\n]*$"):

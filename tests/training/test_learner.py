@@ -8,17 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.credit import closed_form, returns
-from lare.credit.basis import Basis
-from lare.credit.closed_form import LinearDecoder
-from lare.credit.methods import TABLE, Fit, Reward
-from lare.credit.settings import CreditSettings
-from lare.data import replay
-from lare.data.sampling import sample_parts
-from lare.normalise import magnitude
-from lare.tasks.env import EnvSpec, Team
-from lare.training import learner as common
-from recipes import (
+from helpers.recipes import (
     ALONE,
     LENGTHS,
     RIVALS,
@@ -35,7 +25,17 @@ from recipes import (
     untrained,
     with_steps,
 )
-from tiers import long
+from helpers.tiers import long
+from lare_rl.credit import closed_form, returns
+from lare_rl.credit.basis import Basis
+from lare_rl.credit.closed_form import LinearDecoder
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.methods import TABLE, Fit, Reward
+from lare_rl.data import replay
+from lare_rl.data.sampling import sample_parts
+from lare_rl.envs.interface import EnvSpec, Team
+from lare_rl.nn.normalise import magnitude
+from lare_rl.training import learner as common
 
 ENDS = np.cumsum(LENGTHS)[:-1]
 MANY = partial(config_of, algorithm="ippo", env=TOGETHER)

@@ -7,13 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.algorithms import td3
-from lare.credit.settings import CreditSettings
-from lare.data import replay
-from lare.training import learner as common
-from lare.training import off_policy
-from lare.training.compiled import compiled
-from recipes import (
+from helpers.recipes import (
     ALONE,
     config_of,
     factors_for,
@@ -26,6 +20,12 @@ from recipes import (
     untrained,
     with_steps,
 )
+from lare_rl.algorithms import td3
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.data import replay
+from lare_rl.training import learner as common
+from lare_rl.training import off_policy
+from lare_rl.training.compiled import compiled
 
 
 def test_relabelling_is_by_the_newest_decoder():

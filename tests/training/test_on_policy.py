@@ -8,11 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.normalise import standardise
-from lare.training import learner as common
-from lare.training import on_policy
-from lare.training.compiled import compiled
-from recipes import (
+from helpers.recipes import (
     ALONE,
     LENGTHS,
     QUICK,
@@ -29,7 +25,11 @@ from recipes import (
     untrained,
     with_steps,
 )
-from tiers import long
+from helpers.tiers import long
+from lare_rl.nn.normalise import standardise
+from lare_rl.training import learner as common
+from lare_rl.training import on_policy
+from lare_rl.training.compiled import compiled
 
 ppo = partial(config_of, algorithm="ppo", rollout_steps=20)
 ippo = partial(config_of, algorithm="ippo", rollout_steps=20)

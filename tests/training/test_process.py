@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from lare.training import process
+from lare_rl.training import process
 
 
 def test_signals_in_quick_succession_are_one_request(monkeypatch, capfd):

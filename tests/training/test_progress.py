@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from lare.training.progress import Terminal
+from lare_rl.training.progress import Terminal
 
 
 def lines_of(*evaluations):

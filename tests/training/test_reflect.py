@@ -7,16 +7,16 @@ import gymnasium
 import numpy as np
 import pytest
 
-from lare.errors import LareError
-from lare.latent.design import design
-from lare.latent.function import verified
-from lare.latent.verify import random_steps
-from lare.llm import prompts
-from lare.llm.recording import RecordedModel, read_recording
-from lare.tasks.play import Episode, episodes_of
-from lare.training import reflect as module
-from lare.training.reflect import EPISODES, evidence_of, reflect
-from toys import Chase, Says, toy_spec
+from helpers.toys import Chase, Says, toy_spec
+from lare_rl.envs.play import Episode, episodes_of
+from lare_rl.errors import LareError
+from lare_rl.latent.design import design
+from lare_rl.latent.function import verified
+from lare_rl.latent.verify import random_steps
+from lare_rl.llm import prompts
+from lare_rl.llm.recording import RecordedModel, read_recording
+from lare_rl.training import reflect as module
+from lare_rl.training.reflect import EPISODES, evidence_of, reflect
 
 
 def source(*factors: str) -> str:

@@ -8,13 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare.data import replay
-from lare.data.sampling import episodes_at, sample_distinct_episodes
-from lare.normalise import standardise
-from lare.training import learner as common
-from lare.training import sequences
-from lare.training.compiled import compiled
-from recipes import (
+from helpers.recipes import (
     LENGTHS,
     TOGETHER,
     TOTAL,
@@ -29,7 +23,13 @@ from recipes import (
     untrained,
     with_steps,
 )
-from tiers import long
+from helpers.tiers import long
+from lare_rl.data import replay
+from lare_rl.data.sampling import episodes_at, sample_distinct_episodes
+from lare_rl.nn.normalise import standardise
+from lare_rl.training import learner as common
+from lare_rl.training import sequences
+from lare_rl.training.compiled import compiled
 
 qmix = partial(config_of, algorithm="qmix", env=TOGETHER, environments=2)
 

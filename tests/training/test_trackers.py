@@ -4,14 +4,14 @@ import builtins
 
 import pytest
 
-import lare
-from lare.errors import LareError, pip_install
-from lare.training.trackers import MLflow, WeightsAndBiases
-from toys import toy_spec
+import lare_rl
+from helpers.toys import toy_spec
+from lare_rl.errors import LareError, pip_install
+from lare_rl.training.trackers import MLflow, WeightsAndBiases
 
 
 def trained(small, listener, out):
-    return lare.train(toy_spec(), small(method="rrdu", steps=120), out=out, listeners=[listener])
+    return lare_rl.train(toy_spec(), small(method="rrdu", steps=120), out=out, listeners=[listener])
 
 
 def numbers_of(run, seed):

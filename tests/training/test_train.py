@@ -14,27 +14,27 @@ import jax
 import numpy as np
 import pytest
 
-import lare
-from lare.algorithms.settings import PPOSettings
-from lare.algorithms.table import ALGORITHMS
-from lare.credit.methods import METHODS
-from lare.credit.settings import CreditSettings
-from lare.data import replay
-from lare.errors import LareError
-from lare.latent.function import verified
-from lare.run import checkpoint
-from lare.run.checkpoint import saved_host
-from lare.run.decide import decide
-from lare.run.directory import open_run
-from lare.run.formats import FORMAT
-from lare.source import source
-from lare.tasks.environment import EnvironmentFault
-from lare.training import session as sessions
-from lare.training.collect_host import HostCollector
-from lare.training.session import load_actor
-from lare.training.train import Interrupted
-from tiers import long
-from toys import PHI, At, figures, pick_spec, toy_spec
+import lare_rl
+from helpers.tiers import long
+from helpers.toys import PHI, At, figures, pick_spec, toy_spec
+from lare_rl.algorithms.settings import PPOSettings
+from lare_rl.algorithms.table import ALGORITHMS
+from lare_rl.config.migrate import FORMAT
+from lare_rl.config.resolve import decide
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.methods import METHODS
+from lare_rl.data import replay
+from lare_rl.envs.guarded_gymnasium import EnvironmentFault
+from lare_rl.errors import LareError
+from lare_rl.latent.function import verified
+from lare_rl.runs import checkpoint
+from lare_rl.runs.checkpoint import saved_host
+from lare_rl.runs.directory import open_run
+from lare_rl.training import session as sessions
+from lare_rl.training.collect_host import HostCollector
+from lare_rl.training.session import load_actor
+from lare_rl.training.train import Interrupted
+from lare_rl.util.provenance import source
 
 
 def needed(method, function):
@@ -44,7 +44,7 @@ def needed(method, function):
 
 def test_a_factor_that_is_not_finite_stops_the_run_and_harms_nothing(small, tmp_path, monkeypatch):
     settings, task = small(), toy_spec()
-    whole = lare.train(task, settings, function=verified(PHI, task), out=tmp_path / "whole", listeners=[])
+    whole = lare_rl.train(task, settings, function=verified(PHI, task), out=tmp_path / "whole", listeners=[])
     collect = HostCollector.collect
 
     def beyond(collector, actor, step):
@@ -55,7 +55,7 @@ def test_a_factor_that_is_not_finite_stops_the_run_and_harms_nothing(small, tmp_
 
     monkeypatch.setattr(HostCollector, "collect", beyond)
     with pytest.raises(LareError, match="factor 'f_near' is -inf for the observation") as error:
-        lare.train(task, settings, function=verified(PHI, task), out=tmp_path / "run", listeners=[])
+        lare_rl.train(task, settings, function=verified(PHI, task), out=tmp_path / "run", listeners=[])
     monkeypatch.undo()
     assert str(error.value).endswith(
         f"it was given the batch in {tmp_path / 'run' / 'failed_batch.npz'}; the last checkpoint is whole"
@@ -63,21 +63,23 @@ def test_a_factor_that_is_not_finite_stops_the_run_and_harms_nothing(small, tmp_
     with np.load(tmp_path / "run" / "failed_batch.npz") as batch:
         assert (batch["observation"].shape, batch["action"].shape) == ((24, 2), (24, 1))
         assert (batch["observation"] == np.float32(1e30)).any()
-    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+    assert figures(lare_rl.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
 def test_a_run_says_what_is_random_and_what_is_done_already(small, tmp_path):
     heard = At(-1, None)
-    lare.train(toy_spec(), small(steps=180, method="dense"), out=tmp_path / "run", listeners=[heard])
+    lare_rl.train(toy_spec(), small(steps=180, method="dense"), out=tmp_path / "run", listeners=[heard])
     warmup = small().td3.warmup
     assert heard.messages == [f"the first {warmup:,} steps are random (td3.warmup): the policy is not trained yet"]
     heard = At(-1, None)
-    lare.resume(tmp_path / "run", listeners=[heard])
+    lare_rl.resume(tmp_path / "run", listeners=[heard])
     assert heard.messages == [
         "nothing is left to do: it has made its 180 steps; more --steps (steps=... in Python) make it longer"
     ]
     heard = At(-1, None)
-    lare.train(toy_spec(), small(steps=24, evaluate_every=24, method="dense"), out=tmp_path / "few", listeners=[heard])
+    lare_rl.train(
+        toy_spec(), small(steps=24, evaluate_every=24, method="dense"), out=tmp_path / "few", listeners=[heard]
+    )
     assert heard.messages == [
         "all 24 steps are random, and the policy is not trained: td3.warmup is 36; take more steps or a smaller td3.warmup"
     ]
@@ -90,7 +92,7 @@ def test_a_run_says_what_was_set_in_vain(small, tmp_path):
         def said(self, message):
             heard.append(message)
 
-    lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[Listener(-1, None)])
+    lare_rl.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[Listener(-1, None)])
     assert heard[1].startswith("fit_updates makes no difference to dense (and ")
 
 
@@ -100,7 +102,7 @@ def test_a_run_says_what_was_set_in_vain(small, tmp_path):
         (
             "llm-reward",
             2,
-            "llm-reward needs a function with one array, the reward, and this one has 2: lare design TASK --kind reward "
+            "llm-reward needs a function with one array, the reward, and this one has 2: lare-rl design TASK --kind reward "
             "writes one",
         ),
         ("lare-signs", 17, "lare-signs tries all signs of at most 16 factors, and there are 17"),
@@ -110,14 +112,14 @@ def test_a_method_that_can_do_nothing_with_so_many_factors(method, arrays, messa
     rows = ", ".join(f"o[:, 0:1] * {1 + place}" for place in range(arrays))
     function = verified(f"def evaluation_func(o, a):\n    return [{rows}]\n", toy_spec())
     with pytest.raises(LareError) as error:
-        lare.train(toy_spec(), small(method=method), function=function, out=tmp_path / "run", listeners=[])
+        lare_rl.train(toy_spec(), small(method=method), function=function, out=tmp_path / "run", listeners=[])
     assert str(error.value) == message
     assert not (tmp_path / "run").exists()
 
 
 def test_a_function_is_given_by_its_path(small, phi, tmp_path):
     phi.save(tmp_path / "phi.py")
-    run = lare.train(toy_spec(), small(steps=60), function=tmp_path / "phi.py", out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(toy_spec(), small(steps=60), function=tmp_path / "phi.py", out=tmp_path / "run", listeners=[])
     assert run.function.source == phi.source
 
 
@@ -125,14 +127,14 @@ def test_a_function_is_given_by_its_path(small, phi, tmp_path):
 def test_the_number_of_candidates_is_a_setting(small, tmp_path):
     """Without self-prompting: the first recorded candidate is the function."""
     settings = small(steps=60, candidates=1)
-    run = lare.train("Reacher-v4", settings, out=tmp_path / "run", listeners=[])
-    assert run.function.source == lare.design(lare.load_task("Reacher-v4"), candidates=1).source
-    assert run.function.source != lare.design(lare.load_task("Reacher-v4")).source
+    run = lare_rl.train("Reacher-v4", settings, out=tmp_path / "run", listeners=[])
+    assert run.function.source == lare_rl.design(lare_rl.load_task("Reacher-v4"), candidates=1).source
+    assert run.function.source != lare_rl.design(lare_rl.load_task("Reacher-v4")).source
 
 
 @pytest.mark.parametrize("judges", [long("before"), long("after"), "both"])
 def test_judges(judges, small, phi, tmp_path):
-    run = lare.train(toy_spec(), small(judges=judges, steps=60), function=phi, out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(toy_spec(), small(judges=judges, steps=60), function=phi, out=tmp_path / "run", listeners=[])
     with np.load(run.checkpoint / "rows-1.npz") as rows:
         assert rows["factors"].shape[-1] == (4 if judges == "both" else 2)
         observation, action, z = (rows[name][0, 0, :, 0] for name in ("observation", "action", "factors"))
@@ -146,19 +148,19 @@ def test_a_killed_run_resumes_bit_for_bit(algorithm, method, small, phi, tmp_pat
     """SIGKILL in a process of its own, in the middle of an episode and between two checkpoints."""
     settings = small(method=method, algorithm=algorithm)
     given = needed(method, phi)
-    whole = lare.train(toy_spec(), settings, function=given, out=tmp_path / "whole", listeners=[])
+    whole = lare_rl.train(toy_spec(), settings, function=given, out=tmp_path / "whole", listeners=[])
     if given:
         given.save(tmp_path / "phi")
     (tmp_path / "settings.json").write_text(settings.model_dump_json())
     script = """
 import json, os, signal, sys
-from toys import At, toy_spec
-import lare
+from helpers.toys import At, toy_spec
+import lare_rl
 spec = toy_spec()
 kill = At(156, lambda: os.kill(os.getpid(), signal.SIGKILL))
-settings = lare.Settings(**json.load(open("settings.json")))
-given = lare.load_function("phi.py", spec) if os.path.exists("phi.py") else None
-lare.train(spec, settings, function=given, out="killed", listeners=[kill])
+settings = lare_rl.Settings(**json.load(open("settings.json")))
+given = lare_rl.load_function("phi.py", spec) if os.path.exists("phi.py") else None
+lare_rl.train(spec, settings, function=given, out="killed", listeners=[kill])
 """
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
     died = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True)
@@ -167,7 +169,7 @@ lare.train(spec, settings, function=given, out="killed", listeners=[kill])
     # What was written after the checkpoint, whole or not, comes again.
     with (tmp_path / "killed" / "metrics.jsonl").open("a") as file:
         file.write('{"step": 180, "seed": 0}\n{"ste')
-    resumed = lare.resume(tmp_path / "killed", listeners=[])
+    resumed = lare_rl.resume(tmp_path / "killed", listeners=[])
     assert figures(resumed) == figures(whole)
     with np.load(whole.checkpoint / "state.npz") as a, np.load(resumed.checkpoint / "state.npz") as b:
         for name in a.files:
@@ -176,9 +178,9 @@ lare.train(spec, settings, function=given, out="killed", listeners=[kill])
 
 
 def test_resuming_a_finished_run_changes_nothing(small, tmp_path):
-    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
     before = figures(run)
-    assert figures(lare.resume(tmp_path / "run", listeners=[])) == before
+    assert figures(lare_rl.resume(tmp_path / "run", listeners=[])) == before
 
 
 @pytest.mark.parametrize(
@@ -190,10 +192,10 @@ def test_an_extended_run_is_a_run_that_was_longer_from_the_start(algorithm, meth
     ppo = {"anneal": False, "hidden": (8,), "minibatch_size": 16, "epochs": 2}
     settings = small(method=method, algorithm=algorithm, ppo=ppo, capacity=200)
     given = needed(method, phi)
-    whole = lare.train(spec, settings, function=given, out=tmp_path / "whole", listeners=[])
+    whole = lare_rl.train(spec, settings, function=given, out=tmp_path / "whole", listeners=[])
     half = settings.model_copy(update={"steps": 120})
-    run = lare.train(spec, half, function=given, out=tmp_path / "run", listeners=[])
-    longer = lare.resume(run.directory, steps=settings.steps, listeners=[])
+    run = lare_rl.train(spec, half, function=given, out=tmp_path / "run", listeners=[])
+    longer = lare_rl.resume(run.directory, steps=settings.steps, listeners=[])
     assert figures(longer) == figures(whole)
     assert longer.config.ended_at == (120,)
     assert open_run(run.directory).config == longer.config
@@ -209,9 +211,9 @@ def test_a_replay_that_grows_holds_what_it_held(method, small, phi, tmp_path):
     half, settings = small(method=method, steps=120), small(method=method)
     assert [decide(one, toy_spec()).rows(20) for one in (half, settings)] == [242, 482]
     given = needed(method, phi)
-    whole = lare.train(toy_spec(), settings, function=given, out=tmp_path / "whole", listeners=[])
-    run = lare.train(toy_spec(), half, function=given, out=tmp_path / "run", listeners=[])
-    longer = lare.resume(run.directory, steps=240, listeners=[])
+    whole = lare_rl.train(toy_spec(), settings, function=given, out=tmp_path / "whole", listeners=[])
+    run = lare_rl.train(toy_spec(), half, function=given, out=tmp_path / "run", listeners=[])
+    longer = lare_rl.resume(run.directory, steps=240, listeners=[])
     for one, other in zip(figures(longer), figures(whole), strict=True):
         known = {name: value for name, value in other.items() if value is not None}
         assert one.keys() == other.keys()
@@ -226,60 +228,60 @@ def test_a_replay_that_grows_holds_what_it_held(method, small, phi, tmp_path):
     ],
 )
 def test_steps_that_a_run_cannot_be_extended_to(steps, message, small, tmp_path):
-    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
     with pytest.raises(LareError, match=message):
-        lare.resume(run.directory, steps=steps, listeners=[])
+        lare_rl.resume(run.directory, steps=steps, listeners=[])
     assert open_run(run.directory).config == run.config
 
 
 def test_tensorboard_goes_on_where_a_run_had_it(small, tmp_path):
     settings = small(method="dense", steps=60, seeds=1)
-    run = lare.train(toy_spec(), settings, out=tmp_path / "run", tensorboard=True, listeners=[])
+    run = lare_rl.train(toy_spec(), settings, out=tmp_path / "run", tensorboard=True, listeners=[])
     assert len(list((run.directory / "tensorboard").rglob("events*"))) == 1
-    lare.resume(run.directory, steps=120, listeners=[])
+    lare_rl.resume(run.directory, steps=120, listeners=[])
     assert len(list((run.directory / "tensorboard").rglob("events*"))) == 2
 
 
 def test_the_best_policy_is_kept_beside_the_last(small, tmp_path):
     """Of each seed, that of the first of its highest evaluations."""
-    run = lare.train(toy_spec(), small(method="dense", seeds=3), out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(toy_spec(), small(method="dense", seeds=3), out=tmp_path / "run", listeners=[])
     _, _, since = load_actor(run, of_best=True)
     for place, seed in enumerate(run.seeds):
         lines = [line for line in run.metrics() if line["seed"] == seed]
         assert since[place] == max(lines, key=lambda line: line["evaluation/return"])["step"]
-    last, best = (lare.evaluate_run(run, 3, best=which)["Chase"] for which in (False, True))
+    last, best = (lare_rl.evaluate_run(run, 3, best=which)["Chase"] for which in (False, True))
     assert [np.array_equal(a, b) for a, b in zip(last, best, strict=True)] == (since == 240).tolist()
     assert not np.all(since == 240)
 
 
 def test_resuming_before_the_first_checkpoint_starts_anew(small, tmp_path):
-    whole = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    whole = lare_rl.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
     before = figures(whole)
     for path in (*whole.checkpoint.iterdir(), whole.directory / "metrics.jsonl"):
         path.unlink()
-    assert figures(lare.resume(tmp_path / "run", listeners=[])) == before
+    assert figures(lare_rl.resume(tmp_path / "run", listeners=[])) == before
 
 
 def test_metrics_that_are_older_than_the_checkpoint_are_not_made_up(small, tmp_path):
     """As when a run is copied while it trains, its metrics first."""
-    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
     path = run.directory / "metrics.jsonl"
     whole = path.read_text()
     first = whole.splitlines(keepends=True)[0]
     message = f"has {len(first)} bytes, and the checkpoint needs {len(whole)}: was the run copied while it was training"
     path.write_text(first)
     with pytest.raises(LareError, match=message):
-        lare.resume(run.directory, listeners=[])
+        lare_rl.resume(run.directory, listeners=[])
     assert path.read_text() == first
     path.unlink()
     with pytest.raises(LareError, match="has 0 bytes"):
-        lare.resume(run.directory, listeners=[])
+        lare_rl.resume(run.directory, listeners=[])
 
 
 @pytest.mark.parametrize("changed", [np.zeros(7), np.array("text"), np.zeros((2, 1), complex), None])
 def test_a_checkpoint_of_other_environments_is_a_line(small, tmp_path, changed):
     with pytest.raises(Interrupted):
-        lare.train(
+        lare_rl.train(
             toy_spec(),
             small(method="dense"),
             out=tmp_path / "run",
@@ -294,16 +296,16 @@ def test_a_checkpoint_of_other_environments_is_a_line(small, tmp_path, changed):
             arrays[name] = changed
     np.savez(path, **arrays)
     with pytest.raises(LareError, match=r"^the checkpoint in .*checkpoint does not fit its environments: [^\n]+$"):
-        lare.resume(tmp_path / "run", listeners=[])
+        lare_rl.resume(tmp_path / "run", listeners=[])
 
 
 def test_an_episode_that_cannot_be_restored_is_dropped_and_said(small, tmp_path):
     spec = toy_spec(environment="toys/Forgetful-v0")
     stop = At(108, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(Interrupted):
-        lare.train(spec, small(method="rrdu"), out=tmp_path / "run", listeners=[stop])
+        lare_rl.train(spec, small(method="rrdu"), out=tmp_path / "run", listeners=[stop])
     listener = At(0, lambda: None)
-    run = lare.resume(tmp_path / "run", listeners=[listener])
+    run = lare_rl.resume(tmp_path / "run", listeners=[listener])
     assert listener.messages == [
         f"episode 5 of seed {seed} was dropped after 8 steps: the same actions did not lead to the same observation again"
         for seed in (0, 1)
@@ -314,9 +316,11 @@ def test_an_episode_that_cannot_be_restored_is_dropped_and_said(small, tmp_path)
 def test_what_is_played_after_a_dropped_episode_is_all_in_the_next_checkpoint(small, tmp_path):
     spec, out = toy_spec(environment="toys/Forgetful-v0"), tmp_path / "run"
     with pytest.raises(Interrupted):
-        lare.train(spec, small(method="rrdu"), out=out, listeners=[At(108, lambda: signal.raise_signal(signal.SIGINT))])
+        lare_rl.train(
+            spec, small(method="rrdu"), out=out, listeners=[At(108, lambda: signal.raise_signal(signal.SIGINT))]
+        )
     with pytest.raises(Interrupted):
-        lare.resume(out, listeners=[At(132, lambda: signal.raise_signal(signal.SIGINT))])
+        lare_rl.resume(out, listeners=[At(132, lambda: signal.raise_signal(signal.SIGINT))])
     held = sessions.load_learner(open_run(out))[1].replay
     for seed in (0, 1):
         one = jax.tree.map(lambda leaf, seed=seed: leaf[seed], held)
@@ -330,15 +334,15 @@ def test_what_is_played_after_a_dropped_episode_is_all_in_the_next_checkpoint(sm
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stop_saves_and_goes_on_as_if_nothing_had_been(number, small, phi, tmp_path):
-    whole = lare.train(toy_spec(), small(), function=phi, out=tmp_path / "whole", listeners=[])
+    whole = lare_rl.train(toy_spec(), small(), function=phi, out=tmp_path / "whole", listeners=[])
     handler = signal.getsignal(number)
     stop = At(84, lambda: signal.raise_signal(number))
     with pytest.raises(Interrupted) as caught:
-        lare.train(toy_spec(), small(), function=phi, out=tmp_path / "run", listeners=[stop])
-    said = f"stopped at step 84 of {small().steps} and saved; to continue: lare train --resume {tmp_path / 'run'}"
+        lare_rl.train(toy_spec(), small(), function=phi, out=tmp_path / "run", listeners=[stop])
+    said = f"stopped at step 84 of {small().steps} and saved; to continue: lare-rl train --resume {tmp_path / 'run'}"
     assert str(caught.value) == said
     assert signal.getsignal(number) is handler
-    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+    assert figures(lare_rl.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
 @pytest.mark.parametrize(
@@ -355,7 +359,7 @@ def test_a_broken_environment_stops_the_run_and_leaves_it_whole(fault, message, 
     monkeypatch.setitem(gymnasium.registry["toys/Broken-v0"].kwargs, "fault", fault)
     spec = toy_spec(environment="toys/Broken-v0")
     with pytest.raises(EnvironmentFault) as caught:
-        lare.train(spec, small(method="dense"), out=tmp_path / "run", listeners=[])
+        lare_rl.train(spec, small(method="dense"), out=tmp_path / "run", listeners=[])
     assert str(caught.value) == message
     run = open_run(tmp_path / "run")
     assert run.has_checkpoint()
@@ -375,60 +379,60 @@ def test_a_full_disk_leaves_the_last_checkpoint_whole(small, tmp_path, monkeypat
     with pytest.raises(
         LareError, match=r"state.npz cannot be written \(No space left on device\); an existing file is unchanged"
     ):
-        lare.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[])
+        lare_rl.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[])
     monkeypatch.undo()
     assert not list((tmp_path / "run" / "checkpoint").glob("*.new"))
-    whole = lare.train(toy_spec(), small(method="dense"), out=tmp_path / "whole", listeners=[])
-    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+    whole = lare_rl.train(toy_spec(), small(method="dense"), out=tmp_path / "whole", listeners=[])
+    assert figures(lare_rl.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
 def test_a_run_never_overwrites_another(small, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "precious").write_text("mine")
     with pytest.raises(LareError, match="exists, and a run never overwrites another"):
-        lare.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[])
+        lare_rl.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[])
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["precious"]
 
 
 def test_default_directories_are_numbered(small, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     settings = small(method="dense", steps=60)
-    names = [lare.train(toy_spec(), settings, listeners=[]).directory.name for _ in range(2)]
+    names = [lare_rl.train(toy_spec(), settings, listeners=[]).directory.name for _ in range(2)]
     assert names == ["Chase-dense-td3-s0", "Chase-dense-td3-s0-2"]
 
 
 def test_two_processes_cannot_train_in_one_directory(small, tmp_path):
     def intrude():
         with pytest.raises(LareError, match="another process is training in"):
-            lare.resume(tmp_path / "run", listeners=[])
+            lare_rl.resume(tmp_path / "run", listeners=[])
 
-    lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[At(24, intrude)])
+    lare_rl.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[At(24, intrude)])
 
 
 def test_a_small_ring_forgets_and_goes_on(small, tmp_path):
     """A replay that holds three episodes: row files that are overwritten are deleted, and the rest resumes."""
     settings = small(method="rrdu", capacity=64, seeds=1)
-    whole = lare.train(toy_spec(), settings, out=tmp_path / "whole", listeners=[])
+    whole = lare_rl.train(toy_spec(), settings, out=tmp_path / "whole", listeners=[])
     assert not (whole.checkpoint / "rows-1.npz").exists()
     stop = At(192, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(Interrupted):
-        lare.train(toy_spec(), settings, out=tmp_path / "run", listeners=[stop])
-    assert figures(lare.resume(tmp_path / "run", listeners=[])) == figures(whole)
+        lare_rl.train(toy_spec(), settings, out=tmp_path / "run", listeners=[stop])
+    assert figures(lare_rl.resume(tmp_path / "run", listeners=[])) == figures(whole)
 
 
 @pytest.mark.parametrize("out", [".", "..", "/"])
 def test_a_directory_that_is_always_there(out, small, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(LareError, match=rf"^{re.escape(out)} exists, and a run never overwrites another"):
-        lare.train(toy_spec(), small(method="dense", steps=60), out=out, listeners=[])
+        lare_rl.train(toy_spec(), small(method="dense", steps=60), out=out, listeners=[])
 
 
 def test_a_run_whose_checkpoint_was_deleted_keeps_what_it_measured(small, tmp_path):
-    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
     measured = run.metrics()
     shutil.rmtree(run.checkpoint)
     with pytest.raises(LareError) as error:
-        lare.resume(run.directory, listeners=[])
+        lare_rl.resume(run.directory, listeners=[])
     assert str(error.value) == f"{run.directory} has no checkpoint any more: it cannot be resumed"
     assert run.metrics() == measured
 
@@ -436,7 +440,7 @@ def test_a_run_whose_checkpoint_was_deleted_keeps_what_it_measured(small, tmp_pa
 def test_training_that_diverges_says_so(small, tmp_path):
     settings = small(method="dense", td3={"learning_rate": 1e30, "batch_size": 8, "hidden": (8,), "warmup": 24})
     with pytest.raises(LareError, match="training diverged: the policy of seed 0 is not finite any more"):
-        lare.train(toy_spec(), settings, out=tmp_path / "run", listeners=[])
+        lare_rl.train(toy_spec(), settings, out=tmp_path / "run", listeners=[])
 
 
 def test_what_has_diverged_is_not_saved_when_it_is_stopped(small, tmp_path, monkeypatch):
@@ -450,7 +454,7 @@ def test_what_has_diverged_is_not_saved_when_it_is_stopped(small, tmp_path, monk
     monkeypatch.setattr(sessions.Session, "advance", spoilt)
     stop = At(84, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(LareError) as error:
-        lare.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[stop])
+        lare_rl.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[stop])
     assert str(error.value) == (
         "training diverged: critic/loss of seed 1 is not finite at step 84; the last checkpoint is whole"
     )
@@ -463,14 +467,14 @@ def test_what_has_diverged_is_not_saved_when_it_is_stopped(small, tmp_path, monk
 @pytest.mark.parametrize("choice", [{"draw": 1}, {"candidates": 1}])
 def test_a_function_that_is_given_is_not_chosen_among_recorded_ones(choice, small, phi, tmp_path):
     with pytest.raises(LareError, match="draw and candidates choose a recorded function, and a function is given"):
-        lare.train(toy_spec(), small(**choice), function=phi, out=tmp_path / "run", listeners=[])
+        lare_rl.train(toy_spec(), small(**choice), function=phi, out=tmp_path / "run", listeners=[])
 
 
 @pytest.mark.parametrize("config", [{"lare": "0.9"}, {"lare": "0.9", "format": 1}])
 def test_a_run_of_another_version_is_refused_in_one_line(config, tmp_path):
     path = tmp_path / "config.json"
     path.write_text(json.dumps({"settings": {"chunk": 50}, "discrete": False, **config}))
-    for read in (open_run, lambda directory: lare.resume(directory, listeners=[])):
+    for read in (open_run, lambda directory: lare_rl.resume(directory, listeners=[])):
         with pytest.raises(LareError) as error:
             read(tmp_path)
         assert str(error.value) == (
@@ -481,7 +485,7 @@ def test_a_run_of_another_version_is_refused_in_one_line(config, tmp_path):
 
 def test_a_function_that_nobody_needs(phi, small, tmp_path):
     with pytest.raises(LareError, match=r"^rrdu needs no latent function, and one is given: leave it out$"):
-        lare.train(toy_spec(), small(method="rrdu"), function=phi, out=tmp_path / "run", listeners=[])
+        lare_rl.train(toy_spec(), small(method="rrdu"), function=phi, out=tmp_path / "run", listeners=[])
 
 
 @pytest.mark.parametrize("error", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")])
@@ -491,7 +495,7 @@ def test_a_replay_that_the_memory_does_not_hold(error, small, tmp_path, monkeypa
 
     monkeypatch.setattr(sessions, "new_learner", full)
     with pytest.raises(LareError) as told:
-        lare.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[])
+        lare_rl.train(toy_spec(), small(method="dense"), out=tmp_path / "run", listeners=[])
     assert str(told.value) == (
         "the memory is full: 2 seeds with a replay of 482 rows each; fewer seeds or a smaller capacity need less"
     )
@@ -499,22 +503,26 @@ def test_a_replay_that_the_memory_does_not_hold(error, small, tmp_path, monkeypa
 
 def test_a_replay_too_small_for_an_episode_is_refused(small, tmp_path):
     with pytest.raises(LareError, match="capacity = 20 is too small: an iteration of Chase takes up to 44"):
-        lare.train(toy_spec(), small(method="dense", capacity=20), out=tmp_path / "run", listeners=[])
+        lare_rl.train(toy_spec(), small(method="dense", capacity=20), out=tmp_path / "run", listeners=[])
     with pytest.raises(
         LareError,
         match="steps = 400 are too few: an episode of HalfCheetah-v4 takes up to 1000",
     ):
-        lare.train("HalfCheetah-v4", small(steps=400, rollout_steps=4, evaluate_every=20), out=tmp_path / "few")
+        lare_rl.train("HalfCheetah-v4", small(steps=400, rollout_steps=4, evaluate_every=20), out=tmp_path / "few")
     with pytest.raises(LareError, match="capacity = 43 is too small: an iteration of Chase takes up to 44"):
-        lare.train(toy_spec(), small(method="dense", capacity=43), out=tmp_path / "run", listeners=[])
+        lare_rl.train(toy_spec(), small(method="dense", capacity=43), out=tmp_path / "run", listeners=[])
     with pytest.raises(LareError, match="capacity = 43 is too small: a rollout of Chase takes up to 44"):
-        lare.train(toy_spec(), small(algorithm="ppo", method="rrdu", capacity=43), out=tmp_path / "run", listeners=[])
+        lare_rl.train(
+            toy_spec(), small(algorithm="ppo", method="rrdu", capacity=43), out=tmp_path / "run", listeners=[]
+        )
     assert not (tmp_path / "run").exists()
 
 
 def test_seeds_differ_and_are_their_own(small, tmp_path):
-    pair = lare.train(toy_spec(), small(method="dense", seeds=2), out=tmp_path / "pair", listeners=[]).metrics()
-    alone = lare.train(toy_spec(), small(method="dense", seeds=1, seed=1), out=tmp_path / "one", listeners=[]).metrics()
+    pair = lare_rl.train(toy_spec(), small(method="dense", seeds=2), out=tmp_path / "pair", listeners=[]).metrics()
+    alone = lare_rl.train(
+        toy_spec(), small(method="dense", seeds=1, seed=1), out=tmp_path / "one", listeners=[]
+    ).metrics()
     second = [line for line in pair if line["seed"] == 1]
     for a, b in zip(second, alone, strict=True):
         assert a["evaluation/return"] == pytest.approx(b["evaluation/return"], rel=1e-2)
@@ -522,21 +530,23 @@ def test_seeds_differ_and_are_their_own(small, tmp_path):
 
 
 def test_measures_are_reported(small, tmp_path):
-    run = lare.train(
+    run = lare_rl.train(
         toy_spec(measures=("distance",)), small(method="dense", steps=60), out=tmp_path / "run", listeners=[]
     )
     assert run.metrics()[-1]["evaluation/distance"] > 0
     with pytest.raises(LareError, match="the task measures 'nonsense', but the last step's info has only distance"):
-        lare.train(toy_spec(measures=("nonsense",)), small(method="dense"), out=tmp_path / "two", listeners=[])
+        lare_rl.train(toy_spec(measures=("nonsense",)), small(method="dense"), out=tmp_path / "two", listeners=[])
 
 
 def test_tensorboard_events(small, tmp_path):
-    run = lare.train(toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[], tensorboard=True)
+    run = lare_rl.train(
+        toy_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[], tensorboard=True
+    )
     assert len(list((run.directory / "tensorboard").glob("seed-*/events*"))) == 2
 
 
 def test_config_says_what_the_run_depends_on(small, phi, tmp_path):
-    run = lare.train(toy_spec(), small(steps=60), function=phi, out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(toy_spec(), small(steps=60), function=phi, out=tmp_path / "run", listeners=[])
     config = json.loads((run.directory / "config.json").read_text())
     assert config["function_sha256"] == [phi.digest]
     assert config["task_sha256"] == toy_spec().digest
@@ -561,7 +571,7 @@ def test_config_says_what_the_run_depends_on(small, phi, tmp_path):
 def test_must_learn_the_toy(algorithm, method, phi, tmp_path):
     """A random policy gets -33 a seed, standing still -7; the optimum is 0."""
     small = {"hidden": (32, 32), "learning_rate": 3e-3, "batch_size": 64, "gamma": 0.5, "warmup": 500}
-    settings = lare.Settings(
+    settings = lare_rl.Settings(
         algorithm=algorithm,
         method=method,
         steps=2000,
@@ -570,13 +580,13 @@ def test_must_learn_the_toy(algorithm, method, phi, tmp_path):
         **{algorithm: ALGORITHMS[algorithm].settings.model_copy(update=small)},
         credit=CreditSettings(hidden=(32, 32), learning_rate=3e-3, drawn_steps=8, steps=64),
     )
-    run = lare.train(toy_spec(), settings, function=needed(method, phi), out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(toy_spec(), settings, function=needed(method, phi), out=tmp_path / "run", listeners=[])
     assert run.metrics()[-1]["evaluation/return"] > -3
 
 
 @pytest.mark.parametrize("method", ["dense", long("lare-bayes")])
 def test_ppo_must_learn_the_toy(method, phi, tmp_path):
-    settings = lare.Settings(
+    settings = lare_rl.Settings(
         algorithm="ppo",
         method=method,
         steps=8000,
@@ -586,7 +596,7 @@ def test_ppo_must_learn_the_toy(method, phi, tmp_path):
         fit_updates=50,
         credit=CreditSettings(hidden=(32, 32), learning_rate=3e-3, drawn_steps=8, steps=64),
     )
-    run = lare.train(toy_spec(), settings, function=needed(method, phi), out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(toy_spec(), settings, function=needed(method, phi), out=tmp_path / "run", listeners=[])
     assert run.metrics()[-1]["evaluation/return"] > -3
 
 
@@ -596,7 +606,7 @@ def test_ppo_must_learn_to_choose(method, tmp_path):
     """A random policy gets 5 of 20, the best 20."""
     spec = pick_spec()
     function = verified("def evaluation_func(o, a):\n    return [(o * a) @ np.ones((4, 1))]\n", spec)
-    settings = lare.Settings(
+    settings = lare_rl.Settings(
         algorithm="ppo",
         method=method,
         steps=4000,
@@ -606,20 +616,20 @@ def test_ppo_must_learn_to_choose(method, tmp_path):
         fit_updates=50,
         credit=CreditSettings(hidden=(32,), learning_rate=3e-3, drawn_steps=8, steps=64),
     )
-    run = lare.train(spec, settings, function=needed(method, function), out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(spec, settings, function=needed(method, function), out=tmp_path / "run", listeners=[])
     assert sessions.config_for(run).env.discrete
     assert run.metrics()[-1]["evaluation/return"] > 17
 
 
 def test_a_run_whose_state_has_another_structure_names_the_version_that_trained_it(small, tmp_path, monkeypatch):
     """A version with pairs of entries, after one without."""
-    monkeypatch.setattr("lare.credit.basis.MOST_PAIRED", 0)
-    monkeypatch.setattr("lare.run.directory.source", lambda: "0.1.0")
-    run = lare.train(toy_spec(), small(method="bayes", steps=156), out=tmp_path / "run", listeners=[])
+    monkeypatch.setattr("lare_rl.credit.basis.MOST_PAIRED", 0)
+    monkeypatch.setattr("lare_rl.runs.directory.source", lambda: "0.1.0")
+    run = lare_rl.train(toy_spec(), small(method="bayes", steps=156), out=tmp_path / "run", listeners=[])
     monkeypatch.undo()
     jax.clear_caches()
     with pytest.raises(LareError) as error:
-        lare.resume(run, steps=996)
+        lare_rl.resume(run, steps=996)
     assert str(error.value) == (
         f"the checkpoint {run.checkpoint / 'state.npz'} cannot be read: .credit[0].decoder.weight has shape (2, 21), not (2, 24); "
         f"the run is of LaRe 0.1.0, and this is LaRe {source()}"

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from lare.latent.design import DesignFailed
-from lare.llm.recording import Recorder
-from lare.tasks.load import load_task
+from helpers.toys import toy_spec
+from lare_rl.envs.load import load_task
+from lare_rl.latent.design import DesignFailed
+from lare_rl.llm.recording import Recorder
 from paper import correlations
 from paper.exhibits import budgets
-from toys import toy_spec
 
 
 def test_steps_of_one_agent_follow_each_other():
@@ -32,7 +32,7 @@ def test_steps_of_many_agents_have_the_rewards_of_each():
 def test_the_page(monkeypatch):
     monkeypatch.setattr(correlations, "PRINTED", {"Reacher-v4": ("1", "2", "3", "4")})
     budget = budgets()["smoke"].model_copy(update={"functions": 2})
-    page = correlations.page_of(budget, "lare reproduce table-1")
+    page = correlations.page_of(budget, "lare-rl reproduce table-1")
     row = next(line for line in page.text.splitlines() if line.startswith("| Reacher-v4 |"))
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert cells[1].split()[1] == "(11),"

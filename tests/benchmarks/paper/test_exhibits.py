@@ -7,20 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lare.cli import studies
-from lare.credit.methods import METHODS
-from lare.errors import LareError
-from lare.experiments import processes, statistics
-from lare.experiments.jobs import as_json, check, train_one
-from lare.experiments.scores import ERROR, RETURN, SUMMED_RETURN
-from lare.experiments.sweep import Share
-from lare.llm.recording import shipped_recordings
-from lare.run.directory import describe
-from lare.training import train as training
+from helpers.toys import At
+from lare_rl.cli import studies
+from lare_rl.compare import statistics
+from lare_rl.compare.scores import ERROR, RETURN, SUMMED_RETURN
+from lare_rl.credit.methods import METHODS
+from lare_rl.errors import LareError
+from lare_rl.llm.recording import shipped_recordings
+from lare_rl.runs.directory import describe
+from lare_rl.sweep import processes
+from lare_rl.sweep.jobs import as_json, check, train_one
+from lare_rl.sweep.sweep import Share
+from lare_rl.training import train as training
 from paper.exhibits import OURS, Exhibit, budgets, exhibits, jobs_of
 from paper.reproduce import UNTRAINED, listed, reproduce
 from paper.trained import MEANING, TRAVELLED, WON, verdict
-from toys import At
 
 EXHIBITS = exhibits()
 BUDGETS = tuple(budgets())
@@ -97,7 +98,7 @@ def test_every_exhibit_becomes_a_page(name, made_up, tmp_path):
     page = reproduce(name, "smoke", Share(), tmp_path / "runs", tmp_path / "out")
     text = page.read_text()
     origin = "Not in the paper" if exhibit.source == OURS else f"The paper's {exhibit.source}"
-    assert text.startswith(f"# {exhibit.title}\n\n{origin}, by `lare reproduce {name} --budget smoke`.")
+    assert text.startswith(f"# {exhibit.title}\n\n{origin}, by `lare-rl reproduce {name} --budget smoke`.")
     assert all(f"| {label} |" in text for label in exhibit.contenders)
     assert all(f"* {difference}" in text for difference in exhibit.differences)
     for task in exhibit.tasks[:1]:
@@ -224,7 +225,7 @@ def test_all_of_them_goes_on_after_one_that_fails(command, made_up, monkeypatch)
     status, out, err = command("reproduce", "all", "--budget", "smoke")
     assert status == 2
     assert out.split() == [word for name in NAMES if name != "errors" for word in ("wrote", name)]
-    assert err == f"errors: no luck\nlare: 1 of {len(NAMES)} exhibits have no page\n"
+    assert err == f"errors: no luck\nlare-rl: 1 of {len(NAMES)} exhibits have no page\n"
 
 
 def test_the_list(command):
@@ -236,7 +237,7 @@ def test_the_list(command):
 def test_an_exhibit_that_is_not_there(command):
     status, _, err = command("reproduce", "figure-9")
     assert status == 2
-    assert err == f"lare: no exhibit 'figure-9'; the exhibits are {', '.join(NAMES)}\n"
+    assert err == f"lare-rl: no exhibit 'figure-9'; the exhibits are {', '.join(NAMES)}\n"
 
 
 def test_without_a_checkout(command, monkeypatch, tmp_path):
@@ -244,7 +245,7 @@ def test_without_a_checkout(command, monkeypatch, tmp_path):
     status, _, err = command("reproduce")
     assert status == 2
     assert err == (
-        "lare: lare reproduce needs a checkout, whose directory benchmarks/paper describes the exhibits: clone the repository, and "
+        "lare-rl: lare-rl reproduce needs a checkout, whose directory benchmarks/paper describes the exhibits: clone the repository, and "
         "install it there by pip install -e '.[statistics]'\n"
     )
 

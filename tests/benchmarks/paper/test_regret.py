@@ -8,7 +8,7 @@ from paper.exhibits import budgets
 
 def test_the_page(monkeypatch):
     monkeypatch.setattr(regret, "REDUNDANT", (1, 6))
-    found = regret.page_of(budgets()["smoke"], "lare reproduce theory")
+    found = regret.page_of(budgets()["smoke"], "lare-rl reproduce theory")
     rows = [line.split("|") for line in found.text.splitlines() if line.startswith(("| 1 (latent)", "| 6 "))]
     assert [row[2].strip() for row in rows] == ["6", "36"]
     assert [row[7].strip() for row in rows] == ["3 of 3", "3 of 3"]

@@ -1,1 +1,0 @@
-"""A run: its settings, and its files on the disk."""

@@ -1,1 +1,0 @@
-"""Tasks: environments, and the texts that describe them to a language model."""

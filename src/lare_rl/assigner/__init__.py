@@ -1,0 +1,1 @@
+"""`CreditAssigner`: proxy rewards for your own training loop."""

@@ -1,0 +1,80 @@
+"""The command line. Each command is one function; its arguments are its options, and tyro writes the help.
+
+Modules that are slow to import are imported inside the command that needs them.
+"""
+
+import contextlib
+import io
+import os
+import sys
+import traceback
+
+from lare_rl.cli.design import design
+from lare_rl.cli.functions import new_task, prompt, verify
+from lare_rl.cli.lists import algorithms, methods, tasks
+from lare_rl.cli.logs import relabel
+from lare_rl.cli.parse import parse
+from lare_rl.cli.runs import cross_play, evaluate, export, report, train
+from lare_rl.cli.studies import compare, reproduce, sweep
+from lare_rl.cli.terminal import progress, say
+from lare_rl.errors import LareError
+from lare_rl.util import compilation
+from lare_rl.util.provenance import source
+from lare_rl.util.sanitize import in_a_line
+
+DESCRIPTION = (
+    "Train reinforcement learning on episodic rewards, through latent rewards that a language model wrote. "
+    "lare-rl --version prints the version of the code; --debug, with any command, prints the traceback of an error."
+)
+COMMANDS = {
+    "tasks": tasks,
+    "methods": methods,
+    "algorithms": algorithms,
+    "new-task": new_task,
+    "prompt": prompt,
+    "design": design,
+    "verify": verify,
+    "relabel": relabel,
+    "train": train,
+    "evaluate": evaluate,
+    "sweep": sweep,
+    "report": report,
+    "export": export,
+    "compare": compare,
+    "cross-play": cross_play,
+    "reproduce": reproduce,
+}
+
+
+def main() -> None:
+    """`lare-rl`: a user's mistake is one line on stderr and exit status 2 (--debug prints its traceback too)."""
+    for stream in (sys.stdout, sys.stderr):  # so that a character that the terminal cannot show raises no error
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    debug = len(arguments) < len(sys.argv) - 1
+    try:
+        if arguments == ["--version"]:
+            say(source())
+        else:
+            command = parse(COMMANDS, DESCRIPTION, arguments)
+            os.environ.update(compilation.variables(os.environ))  # JAX reads them when a command imports it
+            command()
+    except LareError as error:
+        if debug:
+            traceback.print_exc()
+        progress(f"lare-rl: {in_a_line(error)}")
+        sys.exit(error.status)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            # The reader has closed the pipe. Without this, Python would raise again when it flushes at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.exit(1)
+        if debug:
+            traceback.print_exc()
+        progress(f"lare-rl: {in_a_line(error)}")
+        with contextlib.suppress(OSError):  # the output that is still buffered cannot be written either
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(2)

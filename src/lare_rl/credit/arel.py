@@ -1,0 +1,93 @@
+"""AREL: agent-temporal attention for reward redistribution (Xiao, Ramasubramanian and Poovendran, AAMAS 2022).
+
+Attention over the steps of each agent alternates with attention over the agents of each step. The sum over the agents then
+gives one reward for each step, which every agent receives:
+
+    r_hat_{i,t} = y_t = w . sum_i h_{i,t},    penalty = 20 / T^2 E Var_t(y)
+
+The published penalty is 20 E Var_t(y), added to the squared error of the sum of T rewards. Here it is added to the squared
+error of their mean, hence 1 / T^2. y is multiplied by sqrt(T), as the outputs of other decoders are by sqrt(nT): see
+`decomposition.py`.
+
+The adapter that LaRe's authors published repeats y_t over the agents, but then reads the array in another axis order. It
+thus gives rewards to the wrong agents and steps. Here all agents receive y_t at step t.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from lare_rl.credit.decoders import Decoded
+from lare_rl.nn.attention import LayerNorm, attend, causal
+from lare_rl.nn.networks import MLP, Linear
+
+WIDEST, DEPTH, HEADS, READ_OUT = 100, 3, 3, 50
+"""The largest token width, the number of pairs of blocks, the heads in each block (each head is as wide as a token), and the
+width of the layers before the sum over the agents."""
+
+VARIANCE_PENALTY = 20.0
+
+
+class Block(eqx.Module):
+    """y = LN(x + attention(x)), then LN(y + FF(y)), over the tokens."""
+
+    projections: Float[Array, "size projected"]
+    """Projects tokens to the queries, keys and values of all heads, without biases."""
+    merge: Linear
+    feed_forward: MLP
+    norms: tuple[LayerNorm, LayerNorm]
+
+    def __init__(self, size: int, *, key: PRNGKeyArray):
+        keys = jax.random.split(key, 3)
+        self.projections = Linear(size, 3 * HEADS * size, key=keys[0]).weight
+        self.merge = Linear(HEADS * size, size, key=keys[1])
+        self.feed_forward = MLP(size, (4 * size,), size, key=keys[2])
+        self.norms = LayerNorm(size), LayerNorm(size)
+
+    def __call__(
+        self, x: Float[Array, "*batch tokens size"], mask: Bool[Array, "tokens tokens"] | None
+    ) -> Float[Array, "*batch tokens size"]:
+        projected = jnp.split(x @ self.projections, 3, axis=-1)
+        query, key, value = (part.reshape(*x.shape[:-1], HEADS, x.shape[-1]) for part in projected)
+        y = self.norms[0](x + self.merge(attend(query, key, value, mask)))
+        return self.norms[1](y + self.feed_forward(y))
+
+
+class AREL(eqx.Module):
+    """The published network, layer by layer."""
+
+    embed: Linear
+    position: Float[Array, "steps size"]
+    over_time: tuple[Block, ...]
+    over_agents: tuple[Block, ...]
+    read_out: tuple[Linear, Linear, Linear]
+
+    def __init__(self, features: int, steps: int, *, key: PRNGKeyArray):
+        size = min(features, WIDEST)
+        embed_key, position_key, time_key, agents_key, *read_keys = jax.random.split(key, 7)
+        self.embed = Linear(features, size, key=embed_key)
+        self.position = jax.random.normal(position_key, (steps, size))
+        self.over_time = tuple(Block(size, key=key) for key in jax.random.split(time_key, DEPTH))
+        self.over_agents = tuple(Block(size, key=key) for key in jax.random.split(agents_key, DEPTH))
+        self.read_out = (
+            Linear(size, READ_OUT, key=read_keys[0]),
+            Linear(READ_OUT, READ_OUT, key=read_keys[1]),
+            Linear(READ_OUT, 1, key=read_keys[2]),
+        )
+
+    def __call__(self, features: Float[Array, "rows agents features"], key: PRNGKeyArray | None) -> Decoded:
+        steps = len(self.position)
+        rows, agents = features.shape[:2]
+        x = self.embed(features).reshape(-1, steps, agents, self.position.shape[-1])
+        x = jnp.swapaxes(x, 1, 2) + self.position
+        for time, agent in zip(self.over_time, self.over_agents, strict=True):
+            x = time(x, causal(steps))
+            x = jnp.swapaxes(agent(jnp.swapaxes(x, 1, 2), None), 1, 2)
+        first, second, last = self.read_out
+        y = math.sqrt(steps) * last(jnp.sum(second(first(x)), axis=1))[..., 0]
+        penalty = VARIANCE_PENALTY / steps**2 * jnp.var(y, axis=1, ddof=1, keepdims=True)
+        of_rows = y, jnp.broadcast_to(penalty, y.shape)
+        return Decoded(*(jnp.broadcast_to(values.reshape(rows, 1), (rows, agents)) for values in of_rows))

@@ -1,0 +1,44 @@
+"""The settings of a decoder. `Method.settings` in `methods.py` says which of them a method reads."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from lare_rl.errors import Checked
+
+RECENT = 5000
+"""Proxy rewards are compared with the true rewards over this many newest steps, of every agent."""
+
+
+class CreditSettings(Checked):
+    """How the decoder is fitted."""
+
+    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
+    """Widths of the decoder's hidden layers."""
+    learning_rate: Annotated[float, Field(gt=0)] = 3e-4
+    """Adam's step size."""
+    weight_decay: Annotated[float, Field(ge=0)] = 0.0
+    """The weights, times this factor, are added to their gradient."""
+    normalise: bool = True
+    """Normalise features and returns by running statistics. The published form does not."""
+    sum_form: bool = False
+    """Fit the return R of an episode (Eq. 6 of the paper), not its mean R/T (the published code for one agent)."""
+    drawn_steps: Annotated[int, Field(ge=2)] = 64
+    """K: steps drawn from an episode by RRD and its variants."""
+    steps: Annotated[int, Field(ge=2)] = 256
+    """Steps in one update of the decoder: K steps from each of steps / K episodes, or whole episodes with about this many steps in
+    total. On particle tasks, whose episodes all have T = 25 steps: steps / T episodes, even if only K steps of each are drawn."""
+    episodes: Annotated[int, Field(ge=1)] = 8
+    """diaster (single agents): whole episodes in one update of its decoder."""
+    score: Literal["auto", "sum", "average"] = "auto"
+    """Whether the score of an episode is a sum over its steps, or an average or a grade, which does not grow with the number of
+    steps. `auto`: the task's `score` or, without one, the form that has predicted returns better so far."""
+    optimism: Annotated[float, Field(ge=0)] = 0.0
+    """lare-bayes and other methods in closed form: the algorithm's reward is the proxy reward plus this many of its posterior
+    deviations. Uncertain steps thus look better."""
+    encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
+    """Widths of the hidden layers of VIB's encoder."""
+    bottleneck: Annotated[int, Field(ge=1)] = 8
+    """Size of the code in the middle of VIB."""
+    divergence: Annotated[float, Field(ge=0)] = 5e-3
+    """Weight of the code's divergence relative to the squared error of the mean (with `sum_form`: T^2 times as much)."""

@@ -1,0 +1,28 @@
+"""Steps of some environments as they are collected, before they go into the replay."""
+
+from typing import NamedTuple
+
+from jaxtyping import Bool, Float
+
+from lare_rl.envs.interface import Numbers, Timestep
+
+
+class Trajectory(NamedTuple):
+    """Consecutive steps of some environments. An episode may continue in the next trajectory.
+
+    `*lead` is the seeds' axis, or nothing within functions of one seed.
+    """
+
+    before: Timestep
+    """What the environment showed before each action: [*lead time envs ...]."""
+    action: Float[Numbers, "*lead time envs agents action"]
+    """The policy's action: in [-1, 1], or one-hot."""
+    taken: Float[Numbers, "*lead time envs agents action"]
+    """The same action in the environment's units."""
+    after: Timestep
+    """What the environment showed after each action. At the end of an episode this is its final time step, not the next reset."""
+
+    @property
+    def ended(self) -> Bool[Numbers, "*lead time envs"]:
+        """Whether the step was the last of its episode: terminated or truncated."""
+        return self.after.terminated | self.after.truncated

@@ -1,0 +1,1 @@
+"""Environments: one interface, and one file for each family."""

@@ -1,0 +1,128 @@
+"""The particle tasks as PettingZoo environments, for libraries that step one environment at a time on the host."""
+
+from copy import deepcopy
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium.spaces import Box, Discrete, Space
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from lare_rl.envs.particles.catalogue import find_particle_task
+from lare_rl.envs.particles.drawing import draw, pixels
+from lare_rl.envs.particles.task import ACTIONS, STEPS, ParticleTask
+from lare_rl.envs.particles.world import State
+from lare_rl.errors import LareError, needs_extra
+
+try:
+    from pettingzoo import ParallelEnv
+except ImportError:
+    raise needs_extra("lare_rl.envs.particles.parallel_env", "particles") from None
+
+
+@partial(jax.jit, static_argnums=0)
+def start(task: ParticleTask, key: PRNGKeyArray) -> tuple[State, Float[Array, "agents observation"]]:
+    state = task.reset(key)
+    return state, task.observe(state)
+
+
+@partial(jax.jit, static_argnums=0)
+def advance(
+    task: ParticleTask, state: State, action: Int[Array, " agents"], key: PRNGKeyArray
+) -> tuple[State, Float[Array, "agents observation"], Float[Array, " agents"]]:
+    state = task.step(state, action, key)
+    return state, task.observe(state), task.reward(state)
+
+
+class ParticleEnv(ParallelEnv[str, Any, Any]):
+    """A particle task as a PettingZoo environment, with individual rewards.
+
+    An agent's name consists of its team and its number within the team: `agent_0`, or `predator_0` and `prey_0`.
+
+    >>> environment = ParticleEnv("CN-6")
+    >>> observations, _ = environment.reset(seed=0)
+    >>> observations["agent_5"].shape
+    (26,)
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10, "is_parallelizable": True}  # noqa: RUF012
+
+    def __init__(self, name: str, render_mode: str | None = None):
+        if render_mode not in (None, "rgb_array"):
+            raise LareError(f"no render mode {render_mode!r}; there is 'rgb_array'")
+        self.task = find_particle_task(name)
+        self.metadata = {**self.metadata, "name": name}
+        self.render_mode = render_mode
+        self.possible_agents = [
+            f"{team.name}_{number}" for team in self.task.teams for number in range(team.stop - team.start)
+        ]
+        view, moves = Box(-np.inf, np.inf, (self.task.observation_size,), np.float32), Discrete(ACTIONS)
+        # Each agent needs its own space, because a space has its own random number generator.
+        self.observation_spaces: dict[str, Space[Any]] = {agent: deepcopy(view) for agent in self.possible_agents}
+        self.action_spaces: dict[str, Space[Any]] = {agent: deepcopy(moves) for agent in self.possible_agents}
+        self.agents: list[str] = []
+        self.current: State | None = None
+        self.key = jax.random.key(np.random.default_rng().integers(2**31))
+
+    def observation_space(self, agent: str) -> Space[Any]:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Space[Any]:
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+        """Start an episode. The same seed gives the same episode. Options are ignored."""
+        if seed is not None:
+            self.key = jax.random.key(seed)
+        self.current, observation = start(self.task, self.next_key())
+        self.agents, self.steps = list(self.possible_agents), 0
+        return self.by_agent(np.asarray(observation)), {agent: {} for agent in self.agents}
+
+    def step(
+        self, actions: dict[str, Any]
+    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        state, acted = self.now(), self.agents
+        if not acted:
+            return {}, {}, {}, {}, {}
+        for agent in acted:
+            if not self.action_spaces[agent].contains(actions.get(agent)):
+                raise LareError(f"the action of {agent} is {actions.get(agent)!r}; it must be 0 to {ACTIONS - 1}")
+        chosen = jnp.asarray([int(actions[agent]) for agent in acted])
+        self.current, observation, reward = advance(self.task, state, chosen, self.next_key())
+        self.steps += 1
+        ended = self.steps == STEPS
+        results = (
+            self.by_agent(np.asarray(observation)),
+            self.by_agent(np.asarray(reward).tolist()),
+            dict.fromkeys(acted, False),
+            dict.fromkeys(acted, ended),
+            {agent: {} for agent in acted},
+        )
+        if ended:
+            self.agents = []
+        return results
+
+    def render(self) -> np.ndarray:
+        """The state as pixels (height, width, 3)."""
+        return pixels(draw(self.task, np.asarray(self.now().position)))
+
+    def state(self) -> np.ndarray:
+        """Positions and velocities of everything, in one row."""
+        return np.concatenate([np.asarray(part).ravel() for part in self.now()])
+
+    def now(self) -> State:
+        """The state of the world. Raises `LareError` before the first reset."""
+        if self.current is None:
+            raise LareError("there is no episode yet: reset the environment first")
+        return self.current
+
+    def by_agent(self, values: Any) -> dict[str, Any]:
+        return dict(zip(self.possible_agents, values, strict=True))
+
+    def next_key(self) -> PRNGKeyArray:
+        self.key, now = jax.random.split(self.key)
+        return now

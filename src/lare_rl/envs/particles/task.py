@@ -1,0 +1,56 @@
+"""The definition of a particle task: a world, and pure functions on single states, without a batch axis."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from lare_rl.envs.interface import Team
+from lare_rl.envs.particles.world import State, World, move, push
+
+STEPS = 25
+"""The length of every episode. No episode ends earlier."""
+ACTIONS = 5
+"""Stay, left (-x), right (+x), down (-y), up (+y)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleTask:
+    """A task. Its functions can be compiled and mapped over states, actions and keys.
+
+    The learning agents are the first entities of its world. Other moving entities follow a script.
+
+    >>> import jax
+    >>> from lare_rl.envs.particles.catalogue import find_particle_task
+    >>> task = find_particle_task("CN-6")
+    >>> state = task.reset(jax.random.key(0))
+    >>> state = task.step(state, jnp.zeros(task.agents, int), jax.random.key(1))
+    >>> task.observe(state).shape, task.reward(state).shape
+    ((6, 26), (6,))
+    """
+
+    name: str
+    teams: tuple[Team, ...]
+    """All learning agents, in order."""
+    observation_size: int
+    radius: float
+    """Agents start within ±radius, but may leave this square."""
+    world: World
+    reset: Callable[[PRNGKeyArray], State]
+    """The first state of an episode."""
+    observe: Callable[[State], Float[Array, "agents observation"]]
+    """Each learning agent's observation of a state."""
+    reward: Callable[[State], Float[Array, " agents"]]
+    """Each learning agent's reward for a step that led to this state."""
+    script: Callable[[State, PRNGKeyArray], Int[Array, " scripted"]] = lambda state, key: jnp.zeros(0, int)
+    """The actions of entities that move but do not learn."""
+
+    @property
+    def agents(self) -> int:
+        return self.teams[-1].stop
+
+    def step(self, state: State, action: Int[Array, " agents"], key: PRNGKeyArray) -> State:
+        """All agents act at once. The key is only used by the script."""
+        every = jnp.concatenate([action, self.script(state, key)])
+        return move(self.world, state, push(self.world, every))

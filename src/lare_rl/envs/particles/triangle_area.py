@@ -1,0 +1,80 @@
+"""Triangle area: three agents should form a large triangle and avoid three obstacles.
+
+    R = sum_i (0.1 * area - #{l: |x_i - x_l| < AGENT + OBSTACLE})       the same for every agent
+
+after `simple_area` of LaRe. The area is half the cross product of two sides. The published code uses Heron's formula, which may
+take the root of a negative number because of rounding.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare_rl.envs.particles.nearest import distances, relative, rows, span
+from lare_rl.envs.particles.task import ParticleTask, Team
+from lare_rl.envs.particles.world import State, World, at_rest
+
+AGENTS, OBSTACLES = range(3), range(3, 6)
+AGENT, OBSTACLE = 0.15, 0.4
+"""Radii."""
+SENSITIVITY = 5.0
+AREA_WEIGHT = 0.1
+START = 0.2
+"""Agents start within ±START,"""
+RADIUS = 1.5
+"""and obstacles lie within ±RADIUS."""
+
+
+def triangle_area() -> ParticleTask:
+    return ParticleTask(
+        name="TriangleArea",
+        teams=(Team("agent", 0, len(AGENTS)),),
+        observation_size=4 + 2 * len(OBSTACLES) + 2 * (len(AGENTS) - 1),
+        radius=RADIUS,
+        world=world(),
+        reset=reset,
+        observe=observe,
+        reward=reward,
+    )
+
+
+def world() -> World:
+    """Agents and obstacles push each other when they touch."""
+    size = np.array([AGENT] * len(AGENTS) + [OBSTACLE] * len(OBSTACLES), np.float32)
+    return World(
+        size=size,
+        moving=len(AGENTS),
+        colliding=len(size),
+        sensitivity=np.full(len(AGENTS), SENSITIVITY, np.float32),
+        max_speed=np.full(len(AGENTS), np.inf, np.float32),
+        contact=size[:, None] + size,
+    )
+
+
+def reset(key: PRNGKeyArray) -> State:
+    """An obstacle may overlap the agents at the start, and then pushes them away."""
+    reach = jnp.array([START] * len(AGENTS) + [RADIUS] * len(OBSTACLES))
+    return at_rest(reach[:, None] * jax.random.uniform(key, (len(reach), 2), minval=-1, maxval=1))
+
+
+def observe(state: State) -> Float[Array, "agents observation"]:
+    """Each agent's own velocity and position; the obstacles, in a fixed order; the two other agents, sorted by x and then y."""
+    agents = span(state.position, AGENTS)
+    obstacles = jnp.broadcast_to(jnp.array(OBSTACLES), (len(AGENTS), len(OBSTACLES)))
+    others = jnp.array([[j for j in AGENTS if j != i] for i in AGENTS])
+    offset = relative(state.position, AGENTS, others)
+    order = jax.vmap(lambda pair: jnp.lexsort((pair[:, 1], pair[:, 0])))(offset)
+    return rows(
+        span(state.velocity, AGENTS),
+        agents,
+        relative(state.position, AGENTS, obstacles),
+        jnp.take_along_axis(offset, order[..., None], axis=1),
+    )
+
+
+def reward(state: State) -> Float[Array, " agents"]:
+    first, second = state.position[1] - state.position[0], state.position[2] - state.position[0]
+    area = jnp.abs(first[0] * second[1] - first[1] * second[0]) / 2
+    overlaps = jnp.sum(distances(state.position, AGENTS, OBSTACLES) < AGENT + OBSTACLE)
+    return jnp.full(len(AGENTS), len(AGENTS) * AREA_WEIGHT * area - overlaps)

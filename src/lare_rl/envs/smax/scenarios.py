@@ -1,0 +1,108 @@
+"""The types of units, and the armies of each battle.
+
+All figures except those of the colossus are the defaults of SMAX in JaxMARL 0.2.0 (Rutherford et al., 2024; `smax_env.py`,
+Apache-2.0), where shields count as health. JaxMARL has no colossus. Its figures here are those of StarCraft II: health (200, and
+a shield of 150), range, cooldown and speed. Its two attacks of 10 are one attack of 20, which hits only the target.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lare_rl.envs.smax import NAMES
+from lare_rl.errors import LareError, did_you_mean
+
+
+class UnitType(NamedTuple):
+    """The figures of all units of a type. Lengths are in units of the field, times in seconds."""
+
+    speed: float
+    damage: float
+    reach: float
+    """An attack hits a unit whose centre is nearer than this."""
+    sight: float
+    radius: float
+    health: float
+    cooldown: float
+    """The time between two attacks, without the random addition."""
+
+
+UNIT_TYPES = {
+    "marine": UnitType(3.15, 9, 5, 9, 0.375, 45, 0.61),
+    "marauder": UnitType(2.25, 10, 6, 10, 0.5625, 125, 1.07),
+    "stalker": UnitType(4.13, 13, 6, 10, 0.625, 160, 1.87),
+    "zealot": UnitType(3.15, 8, 2, 9, 0.5, 150, 0.86),
+    "zergling": UnitType(4.13, 5, 2, 8, 0.375, 35, 0.5),
+    "hydralisk": UnitType(3.15, 12, 5, 9, 0.625, 80, 0.59),
+    "colossus": UnitType(3.15, 20, 7, 10, 1.0, 350, 1.07),
+}
+"""The order defines the types' numbers in observations and states."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """A battle. Along an axis of units, ours come first."""
+
+    name: str
+    ours: tuple[str, ...]
+    theirs: tuple[str, ...]
+    limit: int
+    """The most steps of an episode."""
+    unit_types: int = 6
+    """The number of types in the one-hot encoding of observations and states."""
+
+    @property
+    def allies(self) -> int:
+        return len(self.ours)
+
+    @property
+    def enemies(self) -> int:
+        return len(self.theirs)
+
+    @property
+    def units(self) -> int:
+        return self.allies + self.enemies
+
+    @cached_property
+    def unit_type(self) -> Int[np.ndarray, " units"]:
+        """Each unit's number in UNIT_TYPES."""
+        numbers = list(UNIT_TYPES)
+        return np.array([numbers.index(name) for name in (*self.ours, *self.theirs)])
+
+    @cached_property
+    def enemy(self) -> Float[np.ndarray, " units"]:
+        """1 for the enemy's units, 0 for ours."""
+        return np.repeat(np.array([0, 1], np.float32), [self.allies, self.enemies])
+
+    def each(self, figure: str) -> Float[np.ndarray, " units"]:
+        """A figure of each unit's type."""
+        return np.array([getattr(UNIT_TYPES[name], figure) for name in (*self.ours, *self.theirs)], np.float32)
+
+
+def army(colossi: int = 0, stalkers: int = 0, zealots: int = 0) -> tuple[str, ...]:
+    return ("colossus",) * colossi + ("stalker",) * stalkers + ("zealot",) * zealots
+
+
+SCENARIOS = {
+    scenario.name: scenario
+    for scenario in (
+        Scenario("2s3z", army(0, 2, 3), army(0, 2, 3), 120),
+        Scenario("3s_vs_5z", army(0, 3, 0), army(0, 0, 5), 250),
+        Scenario("1c3s5z", army(1, 3, 5), army(1, 3, 5), 180, unit_types=7),
+    )
+}
+"""The battles, with their time limits in SMAC."""
+
+
+def find_scenario(name: str) -> Scenario:
+    """The battle of that name.
+
+    Raises:
+        LareError: no battle has this name; the message lists all names.
+    """
+    if name in SCENARIOS:
+        return SCENARIOS[name]
+    raise LareError(f"no battle {name!r}{did_you_mean(name, SCENARIOS)}; the battles of SMAX are {', '.join(NAMES)}")

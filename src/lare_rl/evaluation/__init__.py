@@ -1,0 +1,1 @@
+"""Evaluation of trained policies: returns, films, and credit of new episodes."""

@@ -1,0 +1,1 @@
+"""Export of policies and rewards to ONNX and NumPy, for programs without LaRe and JAX."""

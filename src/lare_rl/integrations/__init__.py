@@ -1,0 +1,1 @@
+"""Adapters of `CreditAssigner` for Gymnasium, Stable-Baselines3, PettingZoo and TorchRL."""

@@ -1,0 +1,1 @@
+"""Drafts of task files: `lare-rl new-task`."""

@@ -1,0 +1,1 @@
+"""Neural network layers, optimisers and running statistics."""

@@ -1,0 +1,258 @@
+"""What a program can import, and which attributes its values have. Every attribute is in a table of this file."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import functools
+import math
+from collections.abc import Iterator as Iterate
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lare_rl.phi import python_functions
+from lare_rl.phi.arrays import Array, BatchSize, Masked
+from lare_rl.phi.complex_numbers import Complex, call_with_complex
+from lare_rl.phi.graph import Refused
+from lare_rl.phi.numpy_functions import FUNCTIONS, call_numpy
+from lare_rl.phi.numpy_functions.creation import INDEXED
+from lare_rl.phi.numpy_functions.registry import KIND_OF_DTYPE
+from lare_rl.phi.numpy_functions.tables import Polynomial
+from lare_rl.phi.text import DICT_METHODS, LIST_METHODS, SET_METHODS, TEXT_METHODS, call_method
+from lare_rl.phi.values import Bound, Function, Named, Set, type_of
+
+if TYPE_CHECKING:
+    from lare_rl.phi.interpreter import Interpreter
+
+MODULES = {
+    "numpy": "np", "numpy.linalg": "np.linalg", "numpy.polynomial": "np.polynomial", "numpy.typing": "np.typing",
+    "numpy.polynomial.polynomial": "np.polynomial.polynomial", "numpy.lib.stride_tricks": "np.lib.stride_tricks",
+    "numpy.polynomial.chebyshev": "np.polynomial.chebyshev", "numpy.fft": "np.fft",
+    **{name: name for name in (
+        "math typing __future__ functools itertools operator collections collections.abc dataclasses enum warnings abc numbers "
+        "types"
+    ).split()},
+}  # fmt: skip
+"""Modules that can be imported. Of most of them, only the names below and the functions of `python_functions.py` exist."""
+
+NAMES = frozenset(
+    "dataclasses.dataclass dataclasses.field enum.Enum enum.IntEnum enum.IntFlag enum.auto abc.ABC abc.abstractmethod "
+    "collections.OrderedDict collections.abc.Sequence collections.abc.Callable collections.abc.Iterable collections.abc.Mapping "
+    "functools.lru_cache functools.cache functools.wraps warnings.catch_warnings warnings.filterwarnings warnings.simplefilter "
+    "warnings.warn numbers.Number numbers.Real numbers.Integral "
+    "np.errstate np.printoptions np.seterr np.set_printoptions np.ndarray np.number np.generic np.floating np.integer np.bool_ "
+    "np.linalg np.linalg.LinAlgError np.polynomial np.polynomial.polynomial np.polynomial.chebyshev np.polynomial.legendre "
+    "np.polynomial.hermite np.polynomial.hermite_e np.polynomial.laguerre np.lib np.lib.stride_tricks np.typing "
+    "np.typing.NDArray np.typing.ArrayLike np.finfo np.iinfo np.dtype np.vectorize np.s_ np.index_exp np.isscalar np.fft "
+    "np.ndindex np.issubdtype types.SimpleNamespace".split()
+)
+"""Names of modules that are neither functions on arrays nor constants."""
+
+IGNORED_CALLS = frozenset(
+    "np.seterr np.set_printoptions warnings.filterwarnings warnings.simplefilter warnings.warn functools.wraps".split()
+)
+"""Functions that change no number: they do nothing."""
+
+CONSTANTS: dict[str, Any] = {
+    "np.pi": math.pi, "np.e": math.e, "np.inf": math.inf, "np.nan": math.nan, "np.newaxis": None, "np.euler_gamma": np.euler_gamma,
+    "np.True_": True, "np.False_": False, "math.pi": math.pi, "math.e": math.e, "math.inf": math.inf, "math.nan": math.nan,
+    "math.tau": math.tau, "np.PINF": math.inf, "np.NINF": -math.inf, "np.Inf": math.inf, "np.NaN": math.nan,
+}  # fmt: skip
+
+ARRAY_METHODS = frozenset(
+    "sum prod mean max min any all std var ptp argmax argmin argsort cumsum cumprod astype clip round flatten ravel dot repeat "
+    "reshape squeeze swapaxes take transpose copy diagonal trace searchsorted nonzero partition argpartition conj "
+    "conjugate choose".split()
+)
+"""Methods of arrays that are functions of NumPy with the same name and arguments."""
+
+HINTS = {
+    "np.random": "a factor must not depend on chance",
+    "np.unique": "count with comparisons, such as (x[:, :, None] == values).any(1)",
+    "np.nanmedian": "replace NaN first, then use np.median",
+    "np.nanpercentile": "replace NaN first, then use np.percentile",
+    "np.nanquantile": "replace NaN first, then use np.quantile",
+    "np.histogram": "count with comparisons, such as ((x >= low) & (x < high)).sum(axis=1)",
+    "np.linalg.svd": "for 2 x 2 matrices, use np.linalg.eigvalsh; else sums of squares, np.trace or np.linalg.det",
+    "np.linalg.eig": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
+    "np.linalg.eigh": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
+    "np.linalg.eigvals": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
+    "np.linalg.lstsq": "use np.linalg.solve for at most 4 x 4 numbers",
+    "np.load": "a program has no files", "np.save": "a program has no files", "np.memmap": "a program has no files",
+    "np.fromfile": "a program has no files", "np.loadtxt": "a program has no files", "np.savetxt": "a program has no files",
+}  # fmt: skip
+"""What to write instead of some names that are not available."""
+
+
+def imported(statement: ast.Import | ast.ImportFrom) -> Iterate[tuple[str, Any]]:
+    """The names that an import defines, and their values."""
+    if isinstance(statement, ast.Import):
+        for alias in statement.names:
+            _check_module(alias.name)
+            package = alias.name.partition(".")[0]
+            yield alias.asname or package, Named(MODULES[alias.name if alias.asname else package])
+        return
+    module = statement.module or ""
+    if statement.level:
+        raise Refused("E-IMPORT", "relative imports are not available: import numpy and math only")
+    _check_module(module)
+    for alias in statement.names:
+        if alias.name == "*":
+            prefix, names = (
+                f"{MODULES[module]}.",
+                [*CONSTANTS, *NAMES, *python_functions.BUILTINS, *(f"np.{name}" for name in FUNCTIONS)],
+            )
+            yield from (
+                (n[len(prefix) :], CONSTANTS.get(n, Named(n)))
+                for n in names
+                if n.startswith(prefix) and n.count(".") == 1
+            )
+            continue
+        full = f"{module}.{alias.name}"
+        value = Named(MODULES[full]) if full in MODULES else module_attribute(MODULES[module], alias.name)
+        yield alias.asname or alias.name, value
+
+
+def _check_module(name: str) -> None:
+    if name not in MODULES:
+        raise Refused("E-IMPORT", f"import {name[:60]}: only numpy and math are available")
+
+
+def attribute(interpreter: Interpreter, owner: Any, name: str) -> Any:
+    """owner.name, for every owner that is not of a class of the program.
+
+    Raises:
+        Refused: NumPy or Python may have it, but it is not available.
+    """
+    match owner:
+        case Named(module):
+            return module_attribute(module, name)
+        case Array():
+            return array_attribute(interpreter, owner, name)
+        case Complex() if name in ("real", "imag"):
+            return getattr(owner, name)
+        case Complex() if name in ("shape", "ndim", "size"):
+            return array_attribute(interpreter, owner.real, name)
+        case Complex():
+            return Bound(lambda *args, **kwargs: call_with_complex(name, [owner, *args], kwargs))
+        case complex() if name in ("real", "imag"):
+            return owner.real if name == "real" else owner.imag
+        case Polynomial() if name in ("coef", "coeffs", "c"):
+            return owner.falling if name != "coef" else owner.falling[::-1]
+        case Polynomial() if name == "deriv":
+            return Bound(lambda: Polynomial(call_numpy("polyder", [owner.falling], {})))
+        case np.finfo() | np.iinfo() if name in ("eps", "tiny", "max", "min", "resolution", "smallest_normal"):
+            return getattr(owner, name).item() if hasattr(getattr(owner, name), "item") else getattr(owner, name)
+        case str() | list() | dict() if name in _methods(owner):
+            return Bound(lambda *args, **kwargs: call_method(interpreter, owner, name, args, kwargs))
+        case tuple() if name in ("index", "count"):
+            return Bound(lambda value: call_method(interpreter, list(owner), name, [value], {}))
+        case slice() if name in ("start", "stop", "step"):
+            return {"start": owner.start, "stop": owner.stop, "step": owner.step}[name]
+        case bool() | int() | float():
+            if name in ("value", "real"):  # of an entry of an Enum
+                return owner
+            if name in ("is_integer", "item"):
+                return Bound(lambda: owner if name == "item" else float(owner).is_integer())
+        case Function() if name == "__name__":
+            return owner.name
+        case Masked() if name in ("clip", "astype", "round", "copy"):
+            return Bound(lambda *args, **kwargs: call_numpy(name, [owner, *args], kwargs) if name != "copy" else owner)
+    if isinstance(owner, Masked):
+        raise Refused(
+            "E-ROWS", f"x[mask].{name[:60]}: what a mask selects differs from row to row: use np.where(mask, x, 0)"
+        )
+    raise Refused("E-ATTRIBUTE", f".{name[:60]} of a {type_of(owner)} is not available")
+
+
+def module_attribute(module: str, name: str) -> Any:
+    """module.name"""
+    full = f"{module}.{name}"
+    if full in CONSTANTS:
+        return CONSTANTS[full]
+    if module == "np" and name == "dtype":
+        return Named("np.dtype")
+    if module in ("typing", "__future__") or full in NAMES or full in python_functions.BUILTINS:
+        return Named(full)
+    if module.startswith("np"):
+        short = full.removeprefix("np.")
+        if short in FUNCTIONS or short in INDEXED or short in KIND_OF_DTYPE or f"{short}.outer" in FUNCTIONS:
+            return Named(full)
+        if name == "__name__":
+            return module
+        raise Refused("E-NUMPY", f"{full[:80]} is not available{hint(full)}")
+    if name == "__name__":
+        return module.rpartition(".")[2]
+    raise Refused("E-ATTRIBUTE", f"{full[:80]} is not available{hint(full)}")
+
+
+@functools.lru_cache(maxsize=256)
+def hint(full: str) -> str:
+    """What to write instead of a name that is not available."""
+    full = full[:80]
+    if full in HINTS:
+        return f": {HINTS[full]}"
+    names = [f"np.{name}" for name in FUNCTIONS] + list(python_functions.BUILTINS)
+    near = difflib.get_close_matches(full, names, 1, 0.8)
+    return f": is {near[0]} meant?" if near else ""
+
+
+def array_attribute(interpreter: Interpreter, array: Array, name: str) -> Any:
+    match name:
+        case "shape" | "ndim":
+            return getattr(array, name)
+        case "size":
+            return call_numpy("size", [array], {})
+        case "T" | "mT":
+            return call_numpy("transpose" if name == "T" else "matrix_transpose", [array], {})
+        case "real":
+            return array
+        case "dtype":
+            return Named({"float": "np.float32", "int": "np.int64", "bool": "np.bool_"}[array.kind])
+        case "flat":
+            return list(interpreter.items(call_numpy("ravel", [array], {})))
+        case "item":
+            return Bound(lambda *index: (array[index] if index else array).number())
+        case "tolist":
+            return Bound(lambda: _to_list(interpreter, array))
+        case "fill":
+            return Bound(lambda value: array.__setitem__(..., value))
+        case "sort":
+            return Bound(lambda axis=-1: array.__setitem__(..., call_numpy("sort", [array], {"axis": axis})))
+        case "view":
+            return Bound(lambda *dtype: array if not dtype else _refuse_view())
+        case _ if name in ARRAY_METHODS:
+            return Bound(lambda *args, **kwargs: array_method(array, name, args, kwargs))
+    names = difflib.get_close_matches(name, ARRAY_METHODS, 1, 0.8)
+    more = f": is .{names[0]} meant?" if names else ": call a function of NumPy"
+    raise Refused("E-ATTRIBUTE", f".{name[:60]} of an array is not available{more}")
+
+
+def _refuse_view() -> None:
+    raise Refused("E-ATTRIBUTE", ".view of another type is not available: use astype")
+
+
+def _to_list(interpreter: Interpreter, array: Array) -> Any:
+    values = array.constant
+    if values is None:
+        raise Refused("E-FLOW", "numbers that differ from row to row cannot become a list: compute with the array")
+    interpreter.meter.pay_for_list(values.size)
+    return values.tolist()
+
+
+def array_method(array: Array, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """A method of an array: the function of NumPy of this name."""
+    if name == "flatten":
+        return call_numpy("ravel", [array], {}).copy()
+    if name in ("reshape", "transpose") and (len(args) > 1 or (args and isinstance(args[0], BatchSize))):
+        args = (args,)
+    if name == "reshape" and "shape" not in kwargs and not args:
+        args = (kwargs.pop("newshape", ()),)
+    return call_numpy(name, [array, *args], kwargs)
+
+
+def _methods(owner: Any) -> frozenset[str]:
+    """The methods of a text, a list, a set or a dictionary."""
+    tables = {str: TEXT_METHODS, Set: SET_METHODS, dict: DICT_METHODS}
+    return tables.get(type(owner), LIST_METHODS)

@@ -1,0 +1,170 @@
+"""Complex arrays, as two real ones: np.exp(1j * angle), np.abs, np.angle, np.fft.rfft. A factor is always real."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lare_rl.phi.arrays import COMPLEX_OPERATIONS, Array, Complex, Operand, as_array, elementwise
+from lare_rl.phi.graph import Refused, current_builder
+from lare_rl.phi.numpy_functions import call_numpy
+from lare_rl.phi.numpy_functions.registry import numpy_function
+
+LONGEST_TRANSFORM = 256
+"""The most numbers of a Fourier transform."""
+PART_BY_PART = frozenset(
+    "sum mean reshape ravel transpose swapaxes moveaxis take concatenate stack cumsum diff roll flip expand_dims squeeze copy "
+    "broadcast_to repeat tile split hsplit array_split array asarray hstack vstack column_stack atleast_1d atleast_2d".split()
+)
+"""Functions that act on the real and on the imaginary part in the same way."""
+
+
+def as_complex(value: Any) -> Complex:
+    if isinstance(value, Complex):
+        return value
+    if isinstance(value, complex):
+        return Complex(as_array(value.real), as_array(value.imag))
+    array = as_array(value)
+    return Complex(array, elementwise("multiply", array, 0.0))
+
+
+def is_complex(value: Any) -> bool:
+    """Whether a value, or an entry of a list, is complex."""
+    if isinstance(value, (list, tuple)):
+        return any(isinstance(item, (Complex, complex)) for item in value)
+    return isinstance(value, (Complex, complex))
+
+
+def call_with_complex(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+    """Call a function of NumPy. At least one argument is complex."""
+    if name in COMPLEX_FUNCTIONS:
+        return COMPLEX_FUNCTIONS[name](*args, **kwargs)
+    if name not in PART_BY_PART:
+        raise Refused("E-NUMPY", f"np.{name} of complex numbers is not available: use np.abs, np.angle, .real or .imag")
+
+    def part(value: Any, which: str) -> Any:
+        if isinstance(value, (list, tuple)) and is_complex(value):
+            return [part(item, which) for item in value]
+        return getattr(as_complex(value), which) if is_complex(value) or isinstance(value, Array) else value
+
+    parts = [
+        call_numpy(name, [part(args[0], which), *args[1:]], {key: part(value, which) for key, value in kwargs.items()})
+        for which in ("real", "imag")
+    ]
+    if isinstance(parts[0], list):
+        return [Complex(*pair) for pair in zip(*parts, strict=True)]
+    return Complex(*parts)
+
+
+def _multiply(x: Complex, y: Complex) -> Complex:
+    return Complex(x.real * y.real - x.imag * y.imag, x.real * y.imag + x.imag * y.real)
+
+
+def _divide(x: Complex, y: Complex) -> Complex:
+    size = y.real * y.real + y.imag * y.imag
+    product = _multiply(x, Complex(y.real, -y.imag))
+    return Complex(product.real / size, product.imag / size)
+
+
+def _power(x: Any, y: Any) -> Any:
+    if not isinstance(y, int) or not 0 < y <= 8:
+        raise Refused("E-NUMPY", "complex numbers have whole powers from 1 to 8 only")
+    result = as_complex(x)
+    for _ in range(y - 1):
+        result = _multiply(result, as_complex(x))
+    return result
+
+
+def _exp(x: Complex) -> Complex:
+    size = elementwise("exp", x.real)
+    return Complex(size * elementwise("cos", x.imag), size * elementwise("sin", x.imag))
+
+
+_OPERATIONS: dict[str, Callable[..., Any]] = {
+    "add": lambda x, y: Complex(x.real + y.real, x.imag + y.imag),
+    "subtract": lambda x, y: Complex(x.real - y.real, x.imag - y.imag),
+    "multiply": _multiply,
+    "divide": _divide,
+    "negative": lambda x: Complex(-x.real, -x.imag),
+    "abs": lambda x: elementwise("hypot", x.real, x.imag),
+    "exp": _exp,
+    "where": lambda c, x, y: Complex(
+        elementwise("where", c.real, x.real, y.real), elementwise("where", c.real, x.imag, y.imag)
+    ),
+}
+for _name, _function in _OPERATIONS.items():
+    COMPLEX_OPERATIONS[_name] = lambda *x, f=_function: f(*map(as_complex, x))
+COMPLEX_OPERATIONS["power"] = _power
+
+COMPLEX_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    **COMPLEX_OPERATIONS,
+    "absolute": lambda x: COMPLEX_OPERATIONS["abs"](x),
+    "square": lambda x: _multiply(as_complex(x), as_complex(x)),
+    "real": lambda x: as_complex(x).real,
+    "imag": lambda x: as_complex(x).imag,
+    "conj": lambda x: Complex(as_complex(x).real, -as_complex(x).imag),
+    "conjugate": lambda x: Complex(as_complex(x).real, -as_complex(x).imag),
+    "angle": lambda x: elementwise("arctan2", as_complex(x).imag, as_complex(x).real),
+}
+
+
+@numpy_function()
+def angle(z: Operand) -> Any:
+    return elementwise("arctan2", elementwise("multiply", z, 0.0), z)
+
+
+@numpy_function()
+def imag(val: Operand) -> Any:
+    return elementwise("multiply", val, 0.0)
+
+
+@numpy_function("fft.fft")
+def fft(a: Any, n: Any = None, axis: int = -1) -> Complex:
+    """Sum over t of a_t exp(-2 pi i k t / n)."""
+    return _transform(a, axis, -1.0, half=False)
+
+
+@numpy_function("fft.ifft")
+def ifft(a: Any, n: Any = None, axis: int = -1) -> Complex:
+    result = _transform(a, axis, 1.0, half=False)
+    size = result.real.row_shape[result.real.axis(axis)]
+    return Complex(result.real / size, result.imag / size)
+
+
+@numpy_function("fft.rfft")
+def rfft(a: Any, n: Any = None, axis: int = -1) -> Complex:
+    return _transform(a, axis, -1.0, half=True)
+
+
+def _transform(a: Any, axis: int, sign: float, half: bool) -> Complex:
+    x = as_complex(a)
+    (at,) = x.real.row_axes(axis)
+    n = x.real.row_shape[at]
+    if n > LONGEST_TRANSFORM:
+        raise Refused("E-COST", f"np.fft of {n} numbers: at most {LONGEST_TRANSFORM}")
+    phase = sign * 2 * math.pi * np.outer(np.arange(n), np.arange(n // 2 + 1 if half else n)) / n
+    cos, sin = np.cos(phase), np.sin(phase)
+
+    def product(array: Array, matrix: np.ndarray) -> Any:
+        return call_numpy("moveaxis", [call_numpy("tensordot", [array, matrix], {"axes": [[at], [0]]}), -1, at], {})
+
+    real = product(x.real, cos) - product(x.imag, sin)
+    return Complex(real, product(x.real, sin) + product(x.imag, cos))
+
+
+COMPLEX_FUNCTIONS |= {"fft.fft": fft, "fft.ifft": ifft, "fft.rfft": rfft}
+
+
+def _register_frequencies(name: str) -> None:
+    def frequencies(n: int, d: float = 1.0) -> Array:
+        current_builder().check_size([n])
+        return as_array(getattr(np.fft, name)(n, d))
+
+    numpy_function(f"fft.{name}")(frequencies)
+
+
+_register_frequencies("rfftfreq")
+_register_frequencies("fftfreq")

@@ -1,0 +1,301 @@
+"""Functions that make arrays: of constants, of nested lists, of functions."""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from lare_rl.phi.arrays import ALL, Array, BatchSize, as_array, broadcast, elementwise, stack
+from lare_rl.phi.graph import Refused, current_builder
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, as_float, astype, constant_of, kind_of, numpy_function
+from lare_rl.phi.numpy_functions.shapes import column_stack, concatenate_, ravel, split_shape
+
+
+@numpy_function()
+def array(object: Any, dtype: Any = None, ndmin: Any = 0) -> Array:  # noqa: A002
+    x = asarray(as_array(object), dtype).copy()
+    return x[(None,) * (ndmin - x.ndim)] if ndmin > x.ndim else x
+
+
+@numpy_function(
+    "asarray", "asanyarray", "ascontiguousarray", "asfortranarray", "asarray_chkfinite", "require", "fromiter"
+)
+def asarray(a: Array, dtype: Any = None, count: Any = -1) -> Array:
+    return a if dtype is None or kind_of(dtype) == a.kind else astype(a, dtype)
+
+
+@numpy_function("copy")
+def copy(a: Array) -> Array:
+    return a.copy()
+
+
+@numpy_function("astype")
+def astype_(x: Array, dtype: Any) -> Array:
+    return astype(x, dtype)
+
+
+@numpy_function()
+def full(shape: Any, fill_value: Any, dtype: Any = None) -> Array:
+    filled = broadcast(as_array(fill_value), *split_shape(shape)).copy()
+    return filled if dtype is None else astype(filled, dtype)
+
+
+@numpy_function()
+def zeros(shape: Any, dtype: Any = "float") -> Array:
+    return full(shape, 0, dtype)
+
+
+@numpy_function()
+def ones(shape: Any, dtype: Any = "float") -> Array:
+    return full(shape, 1, dtype)
+
+
+@numpy_function()
+def empty(shape: Any, dtype: Any = "float") -> Array:
+    """Not a number, until the program has written numbers into it."""
+    return full(shape, math.nan if kind_of(dtype) == "float" else 0, dtype)
+
+
+@numpy_function()
+def full_like(a: Array, fill_value: Any, dtype: Any = None, shape: Any = None) -> Array:
+    return full(a.shape if shape is None else shape, fill_value, a.kind if dtype is None else dtype)
+
+
+@numpy_function()
+def zeros_like(a: Array, dtype: Any = None, shape: Any = None) -> Array:
+    return full_like(a, 0, dtype, shape)
+
+
+@numpy_function()
+def ones_like(a: Array, dtype: Any = None, shape: Any = None) -> Array:
+    return full_like(a, 1, dtype, shape)
+
+
+@numpy_function()
+def empty_like(prototype: Array, dtype: Any = None, shape: Any = None) -> Array:
+    return empty(prototype.shape if shape is None else shape, prototype.kind if dtype is None else dtype)
+
+
+@numpy_function()
+def arange(start: Any, stop: Any = None, step: Any = 1, dtype: Any = None) -> Array:
+    start, stop = (0, start) if stop is None else (start, stop)
+    if isinstance(stop, BatchSize) and (start, step) == (0, 1) and stop.factor == 1:
+        builder = current_builder()
+        return Array(builder.add("row_number", (), (1,), "int"), 0)
+    first, last, width = (x if isinstance(x, (int, float)) else as_array(x).number() for x in (start, stop, step))
+    if not width or not math.isfinite((last - first) / width):
+        raise ValueError("np.arange needs finite numbers, and a step that is not 0")
+    current_builder().check_size([max(0, math.ceil((last - first) / width))])
+    numbers = as_array(np.arange(first, last, width))
+    return numbers if dtype is None else astype(numbers, dtype)
+
+
+def _register_series(name: str, function: Callable[..., np.ndarray]) -> None:
+    def series(start: float, stop: float, num: int = 50, endpoint: Any = True, base: float = 10.0) -> Array:
+        current_builder().check_size([num])
+        more = {"base": base} if name == "logspace" else {}
+        return as_array(function(start, stop, num, bool(endpoint), **more))
+
+    numpy_function(name)(series)
+
+
+for _name in ("linspace", "logspace", "geomspace"):
+    _register_series(_name, getattr(np, _name))
+
+
+@numpy_function()
+def eye(N: int, M: int | None = None, k: int = 0, dtype: Any = "float") -> Array:  # noqa: N803
+    shape = N, N if M is None else M
+    current_builder().check_size(shape)
+    return astype(np.eye(*shape, k), dtype)
+
+
+@numpy_function()
+def identity(n: int, dtype: Any = "float") -> Array:
+    return eye(n, dtype=dtype)
+
+
+@numpy_function()
+def tri(N: int, M: int | None = None, k: int = 0, dtype: Any = "float") -> Array:  # noqa: N803
+    shape = N, N if M is None else M
+    current_builder().check_size(shape)
+    return astype(np.tri(*shape, k), dtype)
+
+
+@numpy_function()
+def tril(m: Array, k: int = 0) -> Any:
+    return elementwise("where", tri(*_last_axes(m), k, "bool"), m, 0)
+
+
+@numpy_function()
+def triu(m: Array, k: int = 0) -> Any:
+    return elementwise("where", tri(*_last_axes(m), k - 1, "bool"), 0, m)
+
+
+def _last_axes(m: Array) -> tuple[int, ...]:
+    m.row_axes((-1, -2))
+    return m.row_shape[-2:]
+
+
+@numpy_function()
+def diag(v: Array, k: int = 0) -> Any:
+    if v.ndim == 2:
+        return FUNCTIONS["diagonal"](v, k)
+    v.row_axes(0)
+    current_builder().check_size([v.row_shape[0] + abs(k)] * 2)
+    positions = np.diag(np.arange(1, v.row_shape[0] + 1), k)
+    padded = concatenate_([v, astype(np.zeros(1), v.kind)])
+    return padded[as_array(positions - 1)]  # position -1 is the 0 behind
+
+
+@numpy_function()
+def diagflat(v: Array, k: int = 0) -> Any:
+    return diag(ravel(v), k)
+
+
+@numpy_function()
+def meshgrid(*xi: Array, indexing: Any = "xy", sparse: Any = False, copy: Any = True) -> list[Any]:
+    for x in xi:
+        x.row_axes(None)
+    current_builder().check_size([math.prod(x.row_shape) for x in xi])
+    flat = [ravel(x) for x in xi]
+    order = [1, 0, *range(2, len(xi))] if indexing == "xy" and len(xi) > 1 else list(range(len(xi)))
+    grids = [x[tuple(ALL if j == i else None for j in order)] for i, x in enumerate(flat)]
+    return grids if sparse else FUNCTIONS["broadcast_arrays"](*grids)
+
+
+@numpy_function("ix_")
+def ix_(*args: Array) -> tuple[Any, ...]:
+    return tuple(x[tuple(ALL if j == i else None for j in range(len(args)))] for i, x in enumerate(args))
+
+
+@numpy_function()
+def fromfunction(function: Callable[..., Any], shape: Any, *, dtype: Any = "float") -> Any:
+    sizes = [operator.index(n) for n in shape]
+    current_builder().check_size([*sizes, len(sizes) or 1])
+    return function(*(astype(grid, dtype) for grid in np.indices(sizes)))
+
+
+@numpy_function()
+def apply_along_axis(func1d: Callable[..., Any], axis: int, arr: Array, *args: Any, **kwargs: Any) -> Any:
+    """A function of each series along an axis. It is called once for all rows, and once for each place on other axes."""
+    (at,) = arr.row_axes(axis)
+    lead = [i for i in range(arr.ndim) if i not in (at, arr.batch_axis)]
+    if at != arr.ndim - 1 or (arr.batch_axis is not None and (arr.batch_axis or arr.row_shape[0] != 1)):
+        raise Refused(
+            "E-NUMPY", "np.apply_along_axis is available along the last axis: write the function with axis=-1"
+        )
+    in_row = Array(arr.node, None).reshaped((-1, arr.row_shape[at]), None)  # arrays of one row, without a batch axis
+    series = [as_array(func1d(in_row[i], *args, **kwargs)) for i in range(in_row.row_shape[0])]
+    results = stack(series, 0)
+    shape = (*(arr.row_shape[i] for i in lead), *results.row_shape[1:])
+    return Array(
+        current_builder().reshape(results.node, shape if arr.batch_axis is None else (1, *shape)), arr.batch_axis
+    )
+
+
+class Concatenator:
+    """np.r_ and np.c_: arrays joined by an index. Slices stand for ranges."""
+
+    def __init__(self, columns: bool):
+        self.columns = columns
+
+    def __getitem__(self, index: Any) -> Any:
+        items = [self.item(item) for item in (index if isinstance(index, tuple) else (index,))]
+        if self.columns:
+            return column_stack(items)
+        return concatenate_([x if x.ndim else x[None] for x in items])
+
+    def item(self, item: Any) -> Array:
+        if isinstance(item, slice) and isinstance(item.step, complex):  # 5j: five numbers
+            return FUNCTIONS["linspace"](as_float(item.start or 0), as_float(item.stop), int(item.step.imag))
+        if isinstance(item, slice):
+            return arange(item.start or 0, item.stop, 1 if item.step is None else item.step)
+        return as_array(item)
+
+
+class Grid:
+    """np.mgrid and np.ogrid: grids of ranges."""
+
+    def __init__(self, sparse: bool):
+        self.sparse = sparse
+
+    def __getitem__(self, index: Any) -> Any:
+        ranges = [Concatenator(False).item(item) for item in (index if isinstance(index, tuple) else (index,))]
+        grids = meshgrid(*ranges, indexing="ij", sparse=self.sparse)
+        return grids if self.sparse else FUNCTIONS["stack"](grids)
+
+
+INDEXED = {"r_": Concatenator(False), "c_": Concatenator(True), "mgrid": Grid(False), "ogrid": Grid(True)}
+"""Objects of NumPy that are used with an index."""
+
+
+# --- of constants alone, by NumPy itself --------------------------------------------------------------------------------
+
+LARGEST_CONSTANT, LARGEST_SYSTEM = 1024, 64
+"""The most numbers of each argument of these functions, and the most of those that solve equations."""
+
+
+def register_constant_function(
+    name: str,
+    options: str = "",
+    largest: int = LARGEST_CONSTANT,
+    work: Callable[[Any], int] = lambda x: 20 * np.size(x),
+) -> None:
+    """Register a function of constants that NumPy itself computes.
+
+    Args:
+        name: its name behind `np.`.
+        options: the keywords that it takes.
+        largest: the most numbers of an argument, and the largest integer.
+        work: what it costs to compute, for each of its arguments.
+    """
+    function: Any = functools.reduce(getattr, name.split("."), np)
+
+    def of_constants(*args: Any, **kwargs: Any) -> Any:
+        unknown = set(kwargs) - set(options.split())
+        if unknown or len(args) > 3:
+            raise Refused("E-NUMPY", f"np.{name} takes constants, and {options or 'no keywords'}")
+        values = [plain_constant(x, name, largest) for x in args]
+        more = {key: plain_constant(x, name, largest) for key, x in kwargs.items()}
+        current_builder().spend(sum(map(work, values)))
+        result = function(*values, **more)
+        return tuple(map(as_array, result)) if isinstance(result, (tuple, list)) else as_array(result)
+
+    numpy_function(name)(of_constants)
+
+
+def plain_constant(x: Any, name: str, largest: int) -> Any:
+    """A small constant as NumPy takes it: a number, or an array of at most two axes."""
+    if isinstance(x, (bool, float)) or x is None:
+        return x
+    values = constant_of(x, f"the arguments of np.{name}")
+    if values.ndim > 2 or values.size > largest or (values.dtype.kind == "i" and np.abs(values).max() > largest):
+        raise Refused("E-COST", f"np.{name} of more than {largest} numbers, or of larger integers")
+    return values.item() if values.ndim == 0 else values
+
+
+for _name, _options in {
+    "nonzero": "", "flatnonzero": "", "argwhere": "", "union1d": "", "intersect1d": "", "setdiff1d": "", "setxor1d": "",
+    "unique": "return_index return_inverse return_counts", "array_equal": "", "trim_zeros": "", "i0": "", "hanning": "",
+    "hamming": "", "blackman": "", "bartlett": "", "kaiser": "", "histogram": "bins", "bincount": "minlength",
+    "vander": "N increasing", "triu_indices_from": "k", "tril_indices_from": "k",
+}.items():  # fmt: skip
+    register_constant_function(_name, _options)
+for _name, _options in {
+    "roots": "", "poly": "", "polyfit": "deg", "tril_indices": "k m", "triu_indices": "k m", "diag_indices": "",
+    "cov": "ddof rowvar", "corrcoef": "rowvar", "gcd": "", "lcm": "", "allclose": "rtol atol",
+}.items():  # fmt: skip
+    register_constant_function(_name, _options, LARGEST_SYSTEM)
+
+
+@numpy_function()
+def indices(dimensions: Any, dtype: Any = "int") -> Array:
+    sizes = [operator.index(n) for n in dimensions]
+    current_builder().check_size([*sizes, len(sizes)])
+    return astype(np.indices(sizes), dtype)

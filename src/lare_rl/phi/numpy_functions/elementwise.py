@@ -1,0 +1,172 @@
+"""Functions on each number, and Python's operators on arrays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from lare_rl.phi.arrays import ALL, Array, Operand, as_array, concatenate, elementwise, invert, power
+from lare_rl.phi.graph import ELEMENTWISE, Refused
+from lare_rl.phi.numpy_functions.registry import UFUNCS, as_numbers, as_operand, call_numpy, numpy_function
+
+UNARY = frozenset(
+    "sqrt exp log log1p expm1 exp2 log2 log10 cbrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh arctanh abs "
+    "negative sign floor ceil trunc rint isnan isinf isfinite signbit logical_not".split()
+)
+ALIASES = {
+    "abs": "absolute fabs", "remainder": "mod", "divide": "true_divide", "trunc": "fix", "arccos": "acos", "arcsin": "asin",
+    "arctan": "atan", "arctan2": "atan2", "arccosh": "acosh", "arcsinh": "asinh", "arctanh": "atanh",
+    "left_shift": "bitwise_left_shift", "right_shift": "bitwise_right_shift",
+}  # fmt: skip
+LARGEST_FLOAT = float(np.finfo(np.float32).max)
+
+
+def _register_ufunc(op: str, function: Callable[..., Any]) -> None:
+    def unary(x: Operand, /, *, where: Any = True) -> Any:
+        return function(x)
+
+    def binary(x1: Operand, x2: Operand, /, *, where: Any = True) -> Any:
+        return function(x1, x2)
+
+    names = [op, *ALIASES.get(op, "").split()]
+    numpy_function(*names)(unary if op in UNARY else binary)
+    UFUNCS.update(names)
+
+
+for _op in ELEMENTWISE:
+    _register_ufunc(_op, lambda *x, op=_op: elementwise(op, *x))
+UNARY |= {"square", "reciprocal", "positive", "degrees", "radians", "rad2deg", "deg2rad", "bitwise_not", "invert", "isneginf",
+          "isposinf", "conj", "conjugate", "real", "bitwise_invert"}  # fmt: skip
+for _name, _function in {
+    "power": power,
+    "pow": power,
+    "float_power": lambda x, y: power(elementwise("multiply", x, 1.0), y),
+    "square": lambda x: elementwise("multiply", x, x),
+    "reciprocal": lambda x: elementwise("divide", 1.0, x),
+    "positive": lambda x: x,
+    "conj": lambda x: x,
+    "conjugate": lambda x: x,
+    "real": lambda x: x,
+    "degrees": lambda x: elementwise("multiply", x, 180 / math.pi),
+    "rad2deg": lambda x: elementwise("multiply", x, 180 / math.pi),
+    "radians": lambda x: elementwise("multiply", x, math.pi / 180),
+    "deg2rad": lambda x: elementwise("multiply", x, math.pi / 180),
+    "bitwise_not": invert,
+    "invert": invert,
+    "bitwise_invert": invert,
+    "isposinf": lambda x: elementwise("equal", x, math.inf),
+    "isneginf": lambda x: elementwise("equal", x, -math.inf),
+    "ldexp": lambda x, n: elementwise("multiply", x, elementwise("exp2", n)),
+}.items():
+    _register_ufunc(_name, _function)
+
+
+# --- functions that are made of others ----------------------------------------------------------------------------------
+
+
+@numpy_function()
+def where(condition: Operand, x: Operand | None = None, y: Operand | None = None) -> Any:
+    if x is None or y is None:
+        raise Refused("E-NUMPY", "np.where needs three arguments: where a condition holds differs from row to row")
+    return elementwise("where", condition, as_operand(x), as_operand(y))
+
+
+@numpy_function()
+def clip(a: Operand, a_min: Any = None, a_max: Any = None, *, min: Any = None, max: Any = None) -> Any:  # noqa: A002
+    for op, bound in (("maximum", min if a_min is None else a_min), ("minimum", max if a_max is None else a_max)):
+        a = a if bound is None else elementwise(op, a, as_operand(bound))
+    return a
+
+
+@numpy_function()
+def divmod_(x1: Operand, x2: Operand) -> tuple[Any, Any]:
+    return x1 // x2, x1 % x2
+
+
+@numpy_function()
+def modf(x: Operand) -> tuple[Any, Any]:
+    whole = elementwise("trunc", x)
+    return elementwise("subtract", x, whole), whole
+
+
+@numpy_function()
+def heaviside(x1: Operand, x2: Operand) -> Any:
+    at_zero = elementwise("where", elementwise("equal", x1, 0), x2, x1)  # NaN stays NaN
+    return elementwise("where", x1 > 0, 1.0, elementwise("where", x1 < 0, 0.0, at_zero))
+
+
+@numpy_function()
+def sinc(x: Operand) -> Any:
+    angle = elementwise("multiply", x, math.pi)
+    divisor = elementwise("where", elementwise("equal", angle, 0), 1.0, angle)
+    return elementwise("where", elementwise("equal", angle, 0), 1.0, elementwise("sin", angle) / divisor)
+
+
+@numpy_function()
+def nan_to_num(x: Operand, copy: Any = True, nan: Any = 0.0, posinf: Any = None, neginf: Any = None) -> Any:
+    x = elementwise("where", elementwise("isnan", x), nan, x)
+    x = elementwise("where", elementwise("equal", x, math.inf), LARGEST_FLOAT if posinf is None else posinf, x)
+    return elementwise("where", elementwise("equal", x, -math.inf), -LARGEST_FLOAT if neginf is None else neginf, x)
+
+
+@numpy_function("round", "around", "round_")
+def round_(a: Operand, decimals: int = 0) -> Any:
+    if decimals == 0:
+        return elementwise("rint", a)
+    scale = 10.0 ** max(-30, min(decimals, 30))
+    return elementwise("divide", elementwise("rint", elementwise("multiply", a, scale)), scale)
+
+
+@numpy_function()
+def isclose(a: Operand, b: Operand, rtol: Any = 1e-5, atol: Any = 1e-8, equal_nan: Any = False) -> Any:
+    near = abs(a - b) <= atol + rtol * abs(b)
+    both_nan = elementwise("logical_and", elementwise("isnan", a), elementwise("isnan", b))
+    close = elementwise(
+        "logical_or", elementwise("logical_and", near, elementwise("isfinite", b)), elementwise("equal", a, b)
+    )
+    return elementwise("logical_or", close, both_nan) if equal_nan else close
+
+
+@numpy_function()
+def select(condlist: Sequence[Any], choicelist: Sequence[Any], default: Any = 0) -> Any:
+    result = as_operand(default)
+    for condition, choice in reversed(list(zip(condlist, choicelist, strict=True))):
+        result = elementwise("where", condition, as_operand(choice), result)
+    return result
+
+
+@numpy_function()
+def choose(a: Array, choices: Any, mode: Any = "raise") -> Any:
+    choices = list(choices)
+    return select([elementwise("equal", a, i) for i in range(len(choices) - 1)], choices[:-1], choices[-1])
+
+
+@numpy_function()
+def unwrap(p: Array, discont: Any = None, axis: int = -1, *, period: Any = 2 * math.pi) -> Any:
+    """P with jumps of more than half a period removed: p_t + sum over u <= t of the correction of p_u - p_(u-1)."""
+    p = as_numbers(p)
+    if p.row_shape[p.row_axes(axis)[0]] == 1:
+        return p
+    step = call_numpy("diff", [p], {"axis": axis})
+    wrapped = (step + period / 2) % period - period / 2
+    at_half = elementwise("logical_and", wrapped == -period / 2, step > 0)
+    correction = elementwise("where", at_half, period / 2, wrapped) - step
+    correction = elementwise("where", abs(step) < (period / 2 if discont is None else discont), 0.0, correction)
+    shift = call_numpy("cumsum", [correction], {"axis": axis})
+    first = call_numpy("zeros_like", [p[(*(ALL,) * p.axis(axis), slice(0, 1))]], {})
+    return p + concatenate([first, shift], axis)
+
+
+@numpy_function()
+def piecewise(x: Array, condlist: Any, funclist: Sequence[Any], *args: Any, **kw: Any) -> Any:
+    """Values, or results of functions, where conditions hold. The interpreter has applied the functions to x."""
+    conditions = list(condlist) if isinstance(condlist, (list, tuple)) else [condlist]
+    choices = list(funclist)
+    default = choices[-1] if len(choices) > len(conditions) else 0
+    result = as_operand(default)
+    for condition, choice in zip(conditions, choices, strict=False):  # the last condition that holds decides
+        result = elementwise("where", condition, as_operand(choice), result)
+    return elementwise("multiply", as_array(result), 1.0) if x.kind == "float" else result

@@ -1,0 +1,158 @@
+"""The functions of NumPy that a program can call, by name. Nothing else of NumPy can be reached.
+
+A function is registered with NumPy's name and parameters. Its annotations say what its arguments are converted to: an `Array`, an
+`Operand` (an array or x[mask]), a list of arrays, an int, a float. `out=` and `dtype=` are handled here for all functions.
+"""
+
+from __future__ import annotations
+
+import inspect
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from lare_rl.phi.arrays import Array, Operand, as_array, elementwise
+from lare_rl.phi.graph import Kind, Refused, current_builder
+
+Function = Callable[..., Any]
+
+FUNCTIONS: dict[str, Function] = {}
+"""All functions, by their names behind `np.`: "sum", "linalg.norm", "add.reduce"."""
+
+KIND_OF_DTYPE: dict[str, Kind] = {
+    **dict.fromkeys("float float16 float32 float64 double single half longdouble f4 f8 f d floating".split(), "float"),
+    **dict.fromkeys(
+        "int int8 int16 int32 int64 intp int_ uint8 uint16 uint32 uint64 uint i4 i8 i integer byte ubyte short".split(),
+        "int",
+    ),
+    **dict.fromkeys("bool bool_ ?".split(), "bool"),
+}
+"""The kinds of NumPy's types. Their precision is not followed: all numbers are float32, int32 or bool when a graph is computed."""
+
+IGNORED = frozenset("order casting subok copy like device".split())
+"""Arguments of NumPy that change no number."""
+
+_SIGNATURES: dict[str, inspect.Signature] = {}
+
+
+def numpy_function(*names: str) -> Callable[[Function], Function]:
+    """Register a function under NumPy's names for it; without any, under its own. A last underscore is left out."""
+
+    def register(function: Function) -> Function:
+        for name in names or (function.__name__.rstrip("_"),):
+            FUNCTIONS[name] = function
+            _SIGNATURES[name] = inspect.signature(function)
+        return function
+
+    return register
+
+
+def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+    """Call a registered function with the values of a program."""
+    signature = _SIGNATURES[name]
+    own = {
+        key: value
+        for key, value in kwargs.items()
+        if key in signature.parameters or key not in ("out", "dtype", *IGNORED)
+    }
+    try:
+        bound = signature.bind(*args, **own)
+    except TypeError as error:
+        raise Refused("E-NUMPY", f"np.{name}: {error}; it takes {signature_text(name)}") from None
+    for key, value in bound.arguments.items():
+        parameter = signature.parameters[key]
+        convert = _CONVERSIONS.get(parameter.annotation)
+        if convert is not None and parameter.kind is parameter.VAR_POSITIONAL:
+            bound.arguments[key] = tuple(convert(item) for item in value)
+        elif convert is not None:
+            bound.arguments[key] = convert(value)
+    out, dtype = kwargs.get("out"), kwargs.get("dtype")
+    if out is None and own.get("where", True) is not True and name in UFUNCS:
+        raise Refused(
+            "E-NUMPY", f"np.{name} with where= needs out=: without it, NumPy returns memory that nobody has written"
+        )
+    result = FUNCTIONS[name](*bound.args, **bound.kwargs)
+    if dtype is not None and "dtype" not in signature.parameters:
+        result = astype(result, dtype)
+    if out is not None:
+        out = out[0] if isinstance(out, tuple) else out
+        if not isinstance(out, Array):
+            raise TypeError("out= must be an array")
+        where = own.get("where", True) if name in UFUNCS else True
+        out[...] = result if where is True else elementwise("where", where, result, out)
+        return out
+    return result
+
+
+def signature_text(name: str) -> str:
+    """The parameters of a function, for a message."""
+    return ", ".join(str(p).partition(":")[0] for p in _SIGNATURES[name].parameters.values()) or "no arguments"
+
+
+UFUNCS: set[str] = set()
+"""Functions on each number that take `where=` together with `out=`."""
+
+
+def as_operand(value: Any) -> Any:
+    return value if isinstance(value, (Operand, complex)) else as_array(value)
+
+
+def as_arrays(values: Any) -> list[Array]:
+    if not isinstance(values, (list, tuple, Array)):
+        raise TypeError("a list or tuple of arrays is needed")
+    return [as_array(value) for value in values]
+
+
+def as_float(value: Any) -> float:
+    if not isinstance(value, (bool, int, float, Array)):
+        raise TypeError(f"a number is needed, not a {type(value).__name__}")
+    return float(value)
+
+
+def astype(x: Any, dtype: Any) -> Array:
+    array = as_array(x)
+    return Array(current_builder().cast(array.node, kind_of(dtype)), array.batch_axis)
+
+
+def as_numbers(x: Any) -> Array:
+    """An array of fractional numbers."""
+    return astype(x, "float")
+
+
+def kind_of(dtype: Any) -> Kind:
+    """The kind of a type: "float32", np.float32, float, x.dtype. Raises `Refused` for other types."""
+    name = dtype_name(dtype)
+    if name not in KIND_OF_DTYPE:
+        raise Refused("E-NUMPY", f"{name[:40]!r} is no available type: use float, np.float32, int or bool")
+    return KIND_OF_DTYPE[name]
+
+
+def dtype_name(dtype: Any) -> str:
+    """The name of a type without np., for a text or for what is known by its name; else an empty text."""
+    name = dtype if isinstance(dtype, str) else getattr(dtype, "name", "")
+    return name.removeprefix("np.") if isinstance(name, str) else ""
+
+
+def constant_of(x: Any, what: str) -> Any:
+    """The numbers of a constant. Raises `Refused` if they differ from row to row."""
+    values = as_array(x).constant
+    if values is None:
+        raise Refused("E-NUMPY", f"{what} must be the same for all rows")
+    return values
+
+
+def _optional(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda value: None if value is None else convert(value)
+
+
+_CONVERSIONS: dict[str, Callable[[Any], Any]] = {
+    "Array": as_array,
+    "Operand": as_operand,
+    "list[Array]": as_arrays,
+    "int": operator.index,
+    "float": as_float,
+    "Array | None": _optional(as_array),
+    "Operand | None": _optional(as_operand),
+    "int | None": _optional(operator.index),
+    "float | None": _optional(as_float),
+}

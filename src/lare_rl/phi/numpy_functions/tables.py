@@ -1,0 +1,164 @@
+"""Lookup in tables: steps, ramps, polynomials, sets."""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from lare_rl.phi.arrays import Array, as_array, elementwise
+from lare_rl.phi.graph import current_builder
+from lare_rl.phi.numpy_functions.creation import LARGEST_SYSTEM, plain_constant, register_constant_function
+from lare_rl.phi.numpy_functions.reductions import along
+from lare_rl.phi.numpy_functions.registry import as_float, as_numbers, constant_of, numpy_function
+
+
+def _steps_above(x: Array, edges: Array, op: str) -> Array:
+    """How many of some edges lie below each number (op "greater") or not above it ("greater_equal"). NaN lies above all."""
+    beyond = elementwise({"greater": "less_equal", "greater_equal": "less"}[op], x[..., None], edges)
+    return along("sum", elementwise("logical_not", beyond), -1)
+
+
+@numpy_function()
+def searchsorted(a: Array, v: Array, side: Any = "left", sorter: Any = None) -> Any:
+    edges = a if sorter is None else a[as_array(sorter)]
+    edges.row_axes(0)
+    return _steps_above(v, edges, "greater" if side == "left" else "greater_equal")
+
+
+@numpy_function()
+def digitize(x: Array, bins: Array, right: Any = False) -> Any:
+    edges = constant_of(bins, "the bins of np.digitize")
+    if len(edges) > 1 and edges[0] > edges[-1]:  # falling: bins[i - 1] > x >= bins[i]
+        count = _steps_above(x, as_array(edges), "greater_equal" if not right else "greater")
+        return elementwise("subtract", len(edges), count)
+    return _steps_above(x, as_array(edges), "greater" if right else "greater_equal")
+
+
+@numpy_function()
+def interp(x: Array, xp: Array, fp: Array, left: Any = None, right: Any = None, period: Any = None) -> Any:
+    """Straight lines between the points (xp, fp), constant before the first and behind the last."""
+    places = constant_of(xp, "xp of np.interp").astype(float)
+    x = as_numbers(x)
+    if period is not None:
+        x = elementwise("remainder", x, as_float(period))
+        order = np.argsort(places % as_float(period), kind="stable")
+        fp, places = fp[as_array(order)], (places % as_float(period))[order]
+        places = np.concatenate([[places[-1] - period], places, [places[0] + period]])
+        fp = fp[as_array([len(order) - 1, *range(len(order)), 0])]
+    if len(places) != fp.row_shape[0] or not (np.diff(places) >= 0).all():
+        raise ValueError("np.interp needs rising xp, and as many fp")
+    start = _interval(x, places)
+    low, high = fp[start], fp[elementwise("add", start, 1)]
+    left_edge, width = as_array(places[:-1])[start], as_array(np.diff(places))[start]
+    share = (x - left_edge) / elementwise("where", elementwise("equal", width, 0), 1.0, width)
+    result = low + (high - low) * elementwise("minimum", elementwise("maximum", share, 0.0), 1.0)
+    result = elementwise("where", elementwise("isnan", x), math.nan, result)
+    result = result if left is None else elementwise("where", elementwise("less", x, places[0]), left, result)
+    return result if right is None else elementwise("where", elementwise("greater", x, places[-1]), right, result)
+
+
+def _interval(x: Array, places: np.ndarray) -> Any:
+    """The number of the interval between places that each number lies in."""
+    if len(places) < 2:
+        raise ValueError("np.interp needs at least two points")
+    current_builder().check_size((math.prod(x.row_shape), len(places)))
+    return (
+        _steps_above(x, as_array(places[1:-1]), "greater_equal")
+        if len(places) > 2
+        else elementwise("multiply", 0, elementwise("isnan", x))
+    )
+
+
+@numpy_function()
+def unravel_index(indices: Array, shape: Any, order: Any = "C") -> tuple[Any, ...]:
+    sizes = [operator.index(size) for size in (shape if isinstance(shape, (tuple, list)) else [shape])]
+    current_builder().check_size(sizes)
+    strides = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
+    return tuple((indices // stride) % size for stride, size in zip(strides, sizes, strict=True))
+
+
+@numpy_function()
+def ravel_multi_index(multi_index: Any, dims: Any, mode: Any = "raise", order: Any = "C") -> Any:
+    sizes = [operator.index(size) for size in dims]
+    current_builder().check_size(sizes)
+    strides = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
+    terms = [elementwise("multiply", index, stride) for index, stride in zip(multi_index, strides, strict=True)]
+    return functools.reduce(lambda x, y: elementwise("add", x, y), terms)
+
+
+# --- polynomials --------------------------------------------------------------------------------------------------------
+
+
+class Polynomial:
+    """np.poly1d and np.polynomial.Polynomial: a function, with the coefficients from the highest power to the lowest."""
+
+    def __init__(self, falling: Array):
+        self.falling = falling
+
+    def __call__(self, x: Any) -> Any:
+        return polyval(self.falling, as_array(x))
+
+
+@numpy_function()
+def polyval(p: Any, x: Array) -> Any:
+    """p_0 x^n + ... + p_n, by Horner's rule."""
+    coefficients = p.falling if isinstance(p, Polynomial) else as_array(p)
+    result: Any = as_array(0.0)
+    for i in range(coefficients.row_shape[0]):
+        result = elementwise("add", elementwise("multiply", result, x), coefficients[i])
+    return result
+
+
+@numpy_function("polynomial.polynomial.polyval")
+def rising_polyval(x: Array, c: Any, tensor: Any = True) -> Any:
+    """c_0 + c_1 x + ... + c_n x^n."""
+    return polyval(as_array(c)[::-1], x)
+
+
+def _register_series_value(name: str, to_powers: Callable[[Any], np.ndarray]) -> None:
+    def value(x: Array, c: Any, tensor: Any = True) -> Any:
+        return rising_polyval(x, to_powers(plain_constant(c, name, LARGEST_SYSTEM)))
+
+    numpy_function(f"polynomial.{name}")(value)
+
+
+for _name, _convert in {
+    "chebyshev.chebval": np.polynomial.chebyshev.cheb2poly,
+    "legendre.legval": np.polynomial.legendre.leg2poly,
+    "hermite.hermval": np.polynomial.hermite.herm2poly,
+    "hermite_e.hermeval": np.polynomial.hermite_e.herme2poly,
+    "laguerre.lagval": np.polynomial.laguerre.lag2poly,
+}.items():
+    _register_series_value(_name, _convert)
+
+
+@numpy_function("polynomial.Polynomial", "polynomial.polynomial.Polynomial")
+def polynomial(coef: Array, domain: Any = None, window: Any = None) -> Polynomial:
+    return Polynomial(coef[::-1])
+
+
+@numpy_function("poly1d")
+def poly1d(c_or_r: Array) -> Polynomial:
+    return Polynomial(c_or_r)
+
+
+for _name in "polyadd polysub polymul polyder polyint polydiv".split():
+    register_constant_function(_name, "m", LARGEST_SYSTEM)
+for _name in "polyder polyint polymul polyadd".split():
+    register_constant_function(f"polynomial.polynomial.{_name}", "m", LARGEST_SYSTEM)
+
+
+# --- sets ---------------------------------------------------------------------------------------------------------------
+
+
+@numpy_function("isin", "in1d")
+def isin(element: Array, test_elements: Any, invert: Any = False, assume_unique: Any = False) -> Any:
+    values = as_array(list(test_elements) if isinstance(test_elements, (dict, range)) else test_elements)
+    values.row_axes(None)
+    hit = along("any", elementwise("equal", element[..., None], values.reshaped((-1,), None)), -1)
+    return elementwise("logical_not", hit) if invert else hit

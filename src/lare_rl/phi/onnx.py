@@ -1,0 +1,241 @@
+"""Writes a graph as an ONNX model (https://onnx.ai), for runtimes in other languages and on other devices.
+
+Every operation of a graph has a form in ONNX; some need several of its operations. All inputs and outputs have one batch axis.
+"""
+
+import math
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from lare_rl.phi.graph import Graph, Node
+
+OPSET = 18
+"""Version of ONNX's operations. Runtimes of 2023 and later support it."""
+BATCH = "batch"
+
+SAME = {
+    "abs": "Abs", "negative": "Neg", "sign": "Sign", "floor": "Floor", "ceil": "Ceil", "rint": "Round", "sqrt": "Sqrt",
+    "exp": "Exp", "log": "Log", "sin": "Sin", "cos": "Cos", "tan": "Tan", "arcsin": "Asin", "arccos": "Acos", "arctan": "Atan",
+    "sinh": "Sinh", "cosh": "Cosh", "tanh": "Tanh", "arcsinh": "Asinh", "arccosh": "Acosh", "arctanh": "Atanh",
+    "maximum": "Max", "minimum": "Min", "add": "Add", "subtract": "Sub", "multiply": "Mul", "divide": "Div", "isnan": "IsNaN",
+    "isinf": "IsInf", "logical_and": "And", "logical_or": "Or", "logical_xor": "Xor", "logical_not": "Not", "where": "Where",
+    "det": "Det", "bitwise_and": "BitwiseAnd", "bitwise_or": "BitwiseOr", "bitwise_xor": "BitwiseXor",
+}  # fmt: skip
+"""Operations that ONNX has under another name."""
+COMPARISONS = {
+    "less": "Less", "greater": "Greater", "less_equal": "LessOrEqual", "greater_equal": "GreaterOrEqual", "equal": "Equal",
+}  # fmt: skip
+REDUCTIONS = {
+    "sum": "ReduceSum", "prod": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin", "any": "ReduceMax", "all": "ReduceMin",
+}  # fmt: skip
+DTYPES = {"float": np.float32, "int": np.int64, "bool": np.bool_}
+
+
+def is_installed() -> bool:
+    """Whether the package `onnx` is installed."""
+    return find_spec("onnx") is not None
+
+
+def onnx_model(graph: Graph, name: str) -> Any:
+    """The model, checked by ONNX itself."""
+    import onnx
+    from onnx import helper
+
+    writer, values = _Writer(graph), []
+    for node in graph.nodes:
+        values.append(node.option if node.op == "input" else writer.write(node, [values[i] for i in node.inputs]))
+    for output, i in graph.outputs.items():
+        node = graph.nodes[i]
+        value = writer.for_each_row(values[i], node.shape) if node.op == "constant" else values[i]
+        writer.nodes.append(helper.make_node("Identity", [value], [output]))
+
+    def described(nodes: dict[str, Node]) -> list[Any]:
+        dtype = helper.np_dtype_to_tensor_dtype
+        return [
+            helper.make_tensor_value_info(key, dtype(np.dtype(DTYPES[node.kind])), (BATCH, *node.shape))
+            for key, node in nodes.items()
+        ]
+
+    outputs = {key: graph.nodes[i] for key, i in graph.outputs.items()}
+    body = helper.make_graph(writer.nodes, name, described(graph.inputs), described(outputs), writer.constants)
+    model = helper.make_model(body, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="lare", ir_version=9)
+    onnx.checker.check_model(model)
+    return model
+
+
+class _Writer:
+    """Writes operations, with one batch axis in front of every result that is no constant."""
+
+    def __init__(self, graph: Graph):
+        self.graph, self.nodes, self.constants = graph, [], []
+
+    def op(self, name: str, *inputs: Any, results: int = 1, **attributes: Any) -> Any:
+        """Add an operation of ONNX. Inputs that are not names become constants."""
+        from onnx import helper
+
+        names = [x if isinstance(x, str) else self.constant(x) for x in inputs]
+        outputs = [f"value_{len(self.nodes)}_{i}" for i in range(results)]
+        self.nodes.append(helper.make_node(name, names, outputs, **attributes))
+        return outputs[0] if results == 1 else outputs
+
+    def constant(self, value: Any) -> str:
+        from onnx import numpy_helper
+
+        array = np.asarray(value)
+        kinds = {"f": np.float32, "i": np.int64, "b": np.bool_}
+        self.constants.append(
+            numpy_helper.from_array(array.astype(kinds[array.dtype.kind]), f"constant_{len(self.constants)}")
+        )
+        return self.constants[-1].name
+
+    def for_each_row(self, constant: str, shape: tuple[int, ...]) -> str:
+        rows = self.op("Shape", next(iter(self.graph.inputs)), start=0, end=1)
+        return self.op("Expand", constant, self.op("Concat", rows, np.array(shape, int), axis=0))
+
+    def cast(self, x: str, kind: str) -> str:
+        from onnx import helper
+
+        return self.op("Cast", x, to=helper.np_dtype_to_tensor_dtype(np.dtype(DTYPES[kind])))
+
+    def write(self, node: Node, x: list[str]) -> str:
+        """Add an operation of the graph, and return the name of its result."""
+        inputs, op, kind, option = [self.graph.nodes[i] for i in node.inputs], self.op, node.kind, node.option
+        if node.op == "where" and kind == "bool":  # ONNX Runtime has no Where of truth values
+            return self.cast(op("Where", x[0], *(self.cast(value, "int") for value in x[1:])), "bool")
+        if node.op in SAME:
+            return op(SAME[node.op], *x)
+        if node.op in COMPARISONS:
+            x = [self.cast(value, "int") if i.kind == "bool" else value for value, i in zip(x, inputs, strict=True)]
+            return op(COMPARISONS[node.op], *x)
+        match node.op:
+            case "constant":
+                return self.constant(option)
+            case "cast" if kind == "bool":
+                return op("Not", op("Equal", x[0], np.zeros((), DTYPES[inputs[0].kind])))
+            case "cast":
+                return self.cast(x[0], kind)
+            case "gather" | "take" | "concat" | "einsum":
+                return self.rearranged(node, x, inputs)
+            case "argmax" | "argmin":
+                numbers = self.cast(x[0], "float") if inputs[0].kind == "bool" else x[0]
+                return op({"argmax": "ArgMax", "argmin": "ArgMin"}[node.op], numbers, axis=option, keepdims=0)
+            case "any" | "all":
+                return self.cast(op(REDUCTIONS[node.op], self.cast(x[0], "int"), np.array(option), keepdims=0), "bool")
+            case "sum" | "prod" | "max" | "min":
+                numbers = self.cast(x[0], "int") if kind == "bool" else x[0]
+                result = op(REDUCTIONS[node.op], numbers, np.array(option, int), keepdims=0)
+                return self.cast(result, "bool") if kind == "bool" else result
+            case "cumsum":
+                return op("CumSum", x[0], np.array(option))
+            case "cumprod":
+                entries = op("Split", x[0], axis=option, num_outputs=node.shape[option], results=node.shape[option])
+                entries = [entries] if isinstance(entries, str) else entries
+                for i in range(1, len(entries)):
+                    entries[i] = op("Mul", entries[i - 1], entries[i])
+                return op("Concat", *entries, axis=option)
+            case "sort" | "argsort":
+                size = np.array([node.shape[option]], int)
+                numbers = self.cast(x[0], "int") if inputs[0].kind == "bool" else x[0]
+                result = op("TopK", numbers, size, axis=option, largest=0, results=2)[node.op == "argsort"]
+                return self.cast(result, "bool") if kind == "bool" else result
+        return self.composed(node, x, kind)
+
+    def rearranged(self, node: Node, x: list[str], inputs: Sequence[Node]) -> str:
+        op, option = self.op, node.option
+        match node.op:
+            case "gather" if option.slices is not None:
+                shape = inputs[0].shape
+                cut = [(axis + 1, s) for axis, s in enumerate(option.slices) if s != slice(0, shape[axis], 1)]
+                value = x[0]
+                if cut:
+                    columns = zip(*[(s.start, s.stop, axis, s.step) for axis, s in cut], strict=True)
+                    value = op("Slice", value, *(np.array(column, int) for column in columns))
+                return op("Reshape", value, np.array([-1, *node.shape], int))
+            case "gather":
+                flat = op("Reshape", x[0], np.array([-1, math.prod(inputs[0].shape)], int))
+                numbers = op("Gather", flat, option.positions.reshape(-1), axis=1)
+                return op("Reshape", numbers, np.array([-1, *node.shape], int))
+            case "concat":
+                arrays = [
+                    self.for_each_row(value, i.shape) if i.op == "constant" else value
+                    for value, i in zip(x, inputs, strict=True)
+                ]
+                return op("Concat", *arrays, axis=-1)
+            case "take":
+                index = op("Min", op("Max", x[1], np.array(0)), np.array(inputs[0].shape[0] - 1))
+                if inputs[0].op == "constant":
+                    return op("Gather", x[0], index)
+                flat = op("Reshape", index, np.array([-1, math.prod(node.shape)], int))
+                return op("Reshape", op("GatherElements", x[0], flat, axis=1), np.array([-1, *node.shape], int))
+        terms, result = option.split("->")
+        letter = next(c for c in "ZYXWVUTSRQ" if c not in option)
+        marked = [
+            term.replace("...", "" if i.op == "constant" else letter)
+            for term, i in zip(terms.split(","), inputs, strict=True)
+        ]
+        return op("Einsum", *x, equation=",".join(marked) + "->" + result.replace("...", letter))
+
+    def composed(self, node: Node, x: list[str], kind: str) -> str:
+        """An operation on each number that needs several of ONNX."""
+        op = self.op
+        match node.op:
+            case "power":
+                return op("Pow", *x) if kind == "float" else op("Pow", x[0], op("Max", x[1], np.array(0)))
+            case "not_equal":
+                return op("Not", op("Equal", *x))
+            case "isfinite":
+                return op("Not", op("Or", op("IsNaN", x[0]), op("IsInf", x[0])))
+            case "signbit":
+                return op("Less", x[0], np.zeros((), DTYPES[self.graph.nodes[node.inputs[0]].kind]))
+            case "trunc":
+                return op("Mul", op("Sign", x[0]), op("Floor", op("Abs", x[0])))
+            case "log1p":
+                return op("Log", op("Add", x[0], 1.0))
+            case "expm1":
+                return op("Sub", op("Exp", x[0]), 1.0)
+            case "exp2":
+                return op("Pow", np.float32(2), x[0])
+            case "log2" | "log10":
+                return op("Mul", op("Log", x[0]), 1 / math.log(float(node.op[3:])))
+            case "cbrt":
+                return op("Mul", op("Sign", x[0]), op("Pow", op("Abs", x[0]), 1 / 3))
+            case "hypot":
+                return op("Sqrt", op("Add", op("Mul", x[0], x[0]), op("Mul", x[1], x[1])))
+            case "logaddexp" | "logaddexp2":
+                unit = 1.0 if node.op == "logaddexp" else math.log(2)
+                distance = op("Mul", op("Neg", op("Abs", op("Sub", *x))), unit)
+                return op("Add", op("Max", *x), op("Div", op("Log", op("Add", op("Exp", distance), 1.0)), unit))
+            case "copysign":
+                magnitude = op("Abs", x[0])
+                return op("Where", op("Less", x[1], 0.0), op("Neg", magnitude), magnitude)
+            case "fmax" | "fmin":
+                both = op({"fmax": "Max", "fmin": "Min"}[node.op], *x)
+                if kind != "float":
+                    return both
+                return op("Where", op("IsNaN", x[0]), x[1], op("Where", op("IsNaN", x[1]), x[0], both))
+            case "floor_divide" | "remainder" | "fmod" if kind == "float":
+                if node.op == "fmod":
+                    return op("Mod", *x, fmod=1)
+                quotient = op("Floor", op("Div", *x))
+                return quotient if node.op == "floor_divide" else op("Sub", x[0], op("Mul", x[1], quotient))
+            case "floor_divide" | "remainder" | "fmod":
+                zero = op("Equal", x[1], np.array(0))
+                divisor = op("Where", zero, np.array(1), x[1])
+                rest = op("Mod", x[0], divisor, fmod=int(node.op == "fmod"))
+                result = op("Div", op("Sub", x[0], rest), divisor) if node.op == "floor_divide" else rest
+                return op("Where", zero, np.array(0), result)
+            case "left_shift":
+                return op("Mul", x[0], op("Pow", np.array(2), x[1]))
+            case "right_shift":
+                divisor = op("Pow", np.array(2), x[1])
+                return op("Div", op("Sub", x[0], op("Mod", x[0], divisor)), divisor)
+            case "arctan2":
+                side = op("Where", op("Less", x[0], 0.0), np.float32(-math.pi), np.float32(math.pi))
+                half = op("Mul", op("Sign", x[0]), math.pi / 2)
+                angle = op("Atan", op("Div", *x))
+                left = op("Where", op("Equal", x[1], 0.0), half, op("Add", angle, side))
+                return op("Where", op("Greater", x[1], 0.0), angle, left)
+        raise NotImplementedError(node.op)

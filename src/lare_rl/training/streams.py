@@ -1,0 +1,60 @@
+"""Random numbers that are a function of seed, purpose and number, so that there is no state to save."""
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from lare_rl.algorithms.table import Noise
+
+
+class Stream(IntEnum):
+    """The purposes of random numbers. Each purpose has its own numbers, independent of the others."""
+
+    TRAINING_EPISODES = 0
+    EXPLORATION = 1
+    EVALUATION_EPISODES = 2
+    FIT = 3
+    EVALUATION_NOISE = 4
+
+
+def generator(seed: int, stream: Stream, number: int) -> np.random.Generator:
+    """Random numbers for the host."""
+    return np.random.default_rng([seed, stream, number])
+
+
+def episode_seed(seed: int, stream: Stream, episode: int) -> int:
+    """The seed with which an environment on the host is reset."""
+    return int(generator(seed, stream, episode).integers(2**31))
+
+
+@jax.jit
+def seed_keys(seeds: Int[Array, " seeds"], number: int | Array) -> Key[Array, " seeds"]:
+    """A key for each seed."""
+    return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), number))(seeds)
+
+
+def stream_keys(seeds: Sequence[int], stream: Stream, number: int) -> Key[Array, " seeds"]:
+    """A key for each seed, by a purpose and a number."""
+    streams = seed_keys(jnp.asarray(seeds), -1 - int(stream))
+    return jax.vmap(lambda key: jax.random.fold_in(key, number))(streams)
+
+
+def host_noise(random: np.random.Generator, noise: Noise, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    """Noise for a policy that collects on the host."""
+    match noise:
+        case Noise.NORMAL:
+            return random.standard_normal(shape).astype(np.float32)
+        case Noise.GUMBEL:
+            return random.gumbel(size=shape).astype(np.float32)
+        case Noise.UNIFORM:
+            return random.random(shape, np.float32)
+
+
+def device_noise(key: Array, noise: Noise, shape: tuple[int, ...]) -> Float[Array, "..."]:
+    """`host_noise` in compiled code."""
+    draw = {Noise.NORMAL: jax.random.normal, Noise.GUMBEL: jax.random.gumbel, Noise.UNIFORM: jax.random.uniform}
+    return draw[noise](key, shape)

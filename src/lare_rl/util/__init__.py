@@ -1,0 +1,1 @@
+"""Helpers that know nothing of reinforcement learning: files, safe reading, float64, compilation."""

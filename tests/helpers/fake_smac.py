@@ -1,0 +1,72 @@
+"""What SMAC's StarCraft2Env looks like from outside, with SMAX's battles within."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lare_rl.envs.smax.smax_env import SMAX
+
+FROM_SMAC = (4, 4, 0, 2, 1, 3)
+"""Nothing and stop, north, south, east, west, as SMAX counts them."""
+
+
+class FakeSmac:
+    """Asserts what SMAC asserts. `crash_at` is the step in which the game crashes."""
+
+    launched: tuple[int, ...] = ()
+
+    def __init__(self, map_name: str, difficulty: str, seed: int, crash_at: int | None = None):
+        assert difficulty == "7"
+        type(self).launched += (seed,)
+        self.env, self.key, self.crash_at = SMAX(map_name), jax.random.key(seed), crash_at
+        self.advance = jax.jit(self.env.step)
+        self.steps, self.closed, self.runs, self.ended = 0, False, False, False
+
+    def get_env_info(self) -> dict[str, int]:
+        spec = self.env.spec
+        shapes = {"obs_shape": spec.observation_size, "state_shape": spec.state_size}
+        counts = {"n_agents": spec.agents, "n_actions": spec.action_size + 1, "episode_limit": spec.max_steps}
+        return shapes | counts
+
+    def reset(self):
+        assert not self.closed
+        assert self.ended or not self.runs, "a second game is started"
+        self.runs = True
+        self.key, key = jax.random.split(self.key)
+        (self.state, self.seen), self.steps = jax.jit(self.env.reset)(key), 0
+        return self.get_obs(), self.get_state()
+
+    def get_obs(self) -> list[np.ndarray]:
+        return list(np.asarray(self.seen.observation))
+
+    def get_state(self) -> np.ndarray:
+        return np.asarray(self.seen.state)
+
+    def get_avail_actions(self) -> list[list[int]]:
+        rows = []
+        for alive, row in zip(self.seen.alive, np.asarray(self.seen.available, int), strict=True):
+            # Those of the living in SMAC's order; the dead may do nothing, and only that.
+            moves = [0, *(row[one] for one in FROM_SMAC[1:])]
+            rows.append([*moves, *row[5:]] if alive else [1] + [0] * len(row))
+        return rows
+
+    def step(self, actions: list[int]):
+        assert all(type(one) is int for one in actions)
+        assert all(row[one] for row, one in zip(self.get_avail_actions(), actions, strict=True)), "not available"
+        self.steps += 1
+        if self.steps == self.crash_at:
+            return 0, True, {}
+        self.key, key = jax.random.split(self.key)
+        choice = jnp.array([FROM_SMAC[one] if one < 6 else one - 1 for one in actions])
+        rows = jax.nn.one_hot(choice, self.env.spec.action_size)
+        self.state, self.seen = self.advance(self.state, rows, key)
+        over = bool(self.seen.terminated | self.seen.truncated)
+        self.ended = self.ended or over
+        return float(self.seen.reward.max()), over, {"battle_won": bool(self.seen.measures["won"])}
+
+    def close(self) -> None:
+        self.closed = True
+
+    def render(self, mode: str):
+        assert mode == "rgb_array"
+        return np.zeros((4, 4, 3), np.uint8)
