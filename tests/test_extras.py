@@ -55,6 +55,6 @@ def test_the_extra_is_there(message):
 
 def test_a_checkout_installs_itself_and_everybody_else_from_an_index(tmp_path):
     (tmp_path / "pyproject.toml").touch()
-    assert pip_install("llm", tmp_path / "src" / "lare") == f"pip install --editable '{tmp_path}[llm]'"
+    assert pip_install("llm", tmp_path / "src" / "lare_rl") == f"pip install --editable '{tmp_path}[llm]'"
     assert pip_install("llm", tmp_path / "site-packages" / "lare") == "pip install 'lare-rl[llm]'"
     assert pip_install("llm", tmp_path / "other" / "src" / "lare") == "pip install 'lare-rl[llm]'"

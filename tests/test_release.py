@@ -52,8 +52,8 @@ def test_the_wheel_holds_the_package_and_its_data_alone(built):
     with zipfile.ZipFile(built["wheel"]) as archive:
         names = archive.namelist()
         metadata = archive.read(f"lare_rl-{lare_rl.__version__}.dist-info/METADATA").decode()
-    assert {name.split("/")[0] for name in names} == {"lare", f"lare_rl-{lare_rl.__version__}.dist-info"}
-    every = {str(path.relative_to(ROOT / "src")) for path in (ROOT / "src" / "lare").rglob("*") if path.is_file()}
+    assert {name.split("/")[0] for name in names} == {"lare_rl", f"lare_rl-{lare_rl.__version__}.dist-info"}
+    every = {str(path.relative_to(ROOT / "src")) for path in (ROOT / "src" / "lare_rl").rglob("*") if path.is_file()}
     assert {name for name in every if "__pycache__" not in name} <= set(names)
     for line in ("License-Expression: MIT", "Requires-Python: >=3.11", "Project-URL: Paper, "):
         assert line in metadata

@@ -10,9 +10,9 @@ from jaxtyping import Float, PRNGKeyArray
 from lare_rl import theory
 from lare_rl.compare.statistics import Band, plus_minus
 from lare_rl.report import figures
-from lare_rl.theory import History, Table
 from paper.exhibits import Budget
 from paper.pages import Page, items, table
+from paper.theory import History, Table
 
 TITLE = "Regret with a latent table, and with a raw one"
 CORES, ACTIONS, HORIZON, DELTA = 3, 2, 5, 0.1

@@ -7,6 +7,7 @@ import sys
 import time
 from copy import deepcopy
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -183,8 +184,7 @@ while True:
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_with_their_parent_and_say_nothing(how):
     """The program has no `if __name__ == "__main__"`: workers do not run it again."""
-    paths = os.pathsep.join(os.path.dirname(os.path.dirname(one.__file__)) for one in (lare, hosts))
-    paths += os.pathsep + str(Path(hosts.__file__).parents[1])
+    paths = os.pathsep.join(str(Path(module.__file__).parents[1]) for module in (lare_rl, hosts))
     parent = subprocess.Popen(
         [sys.executable, "-c", PROGRAM],
         env=os.environ | {"PYTHONPATH": paths},

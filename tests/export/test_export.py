@@ -229,7 +229,7 @@ def run(small, tmp_path, phi):
 WITHOUT_LARE = """
 import sys
 import numpy as np
-sys.modules |= {"lare": None, "jax": None}
+sys.modules |= {"lare_rl": None, "jax": None}
 import exported
 steps = np.load("steps.npz")
 print(repr(exported.reward(**steps).tolist()))

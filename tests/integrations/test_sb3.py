@@ -624,7 +624,7 @@ def test_the_page_runs(tmp_path, monkeypatch, phi):
     page = Path(__file__).parents[2] / "docs" / "plugs" / "sb3.md"
     blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(lare, "load_task", lambda name: toy_spec(), raising=False)
+    monkeypatch.setattr(lare_rl, "load_task", lambda name: toy_spec(), raising=False)
     phi.save(tmp_path / "phi.py")
     names = {}
     for block in blocks:

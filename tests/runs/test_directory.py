@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from lare_rl.config.resolve import decide
-from lare_rl.runs.directory import Run, describe
-from lare_rl.config.settings import Settings
 from helpers.toys import pick_spec, toy_spec
+from lare_rl.config.resolve import decide
+from lare_rl.config.settings import Settings
+from lare_rl.runs.directory import Run, describe
 
 QMIX = "the policy has not been updated in 90 steps: qmix needs 128 finished episodes for its first update (qmix.batch_size)"
 RANDOM = "all 50 steps so far were random (td3.warmup is 60)"

@@ -11,18 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare_rl.errors import LareError
-from lare_rl.report.report import write_report
-from lare_rl.sweep.sweep import read_sweep
-from lare_rl.latent.saved import read_source
-from lare_rl.llm.model import recorded_model
-from lare_rl.runs import checkpoint, directory
-from lare_rl.config.resolve import decide
-from lare_rl.runs.directory import describe, open_run, read_config, read_metrics
+from helpers.toys import PHI, toy_spec
 from lare_rl.config.migrate import FORMAT
+from lare_rl.config.resolve import decide
 from lare_rl.config.settings import Settings
 from lare_rl.envs.load import read_task
-from helpers.toys import PHI, toy_spec
+from lare_rl.errors import LareError
+from lare_rl.latent.saved import read_source
+from lare_rl.llm.model import recorded_model
+from lare_rl.report.report import write_report
+from lare_rl.runs import checkpoint, directory
+from lare_rl.runs.directory import describe, open_run, read_config, read_metrics
+from lare_rl.sweep.sweep import read_sweep
 
 DEEP = "[" * 50_000
 TOO_DEEP = "it is nested more than 64 deep"

@@ -44,7 +44,7 @@ def parse(
         raise LareError(
             f"there is no command {arguments[0]!r}{did_you_mean(arguments[0], commands)}; see lare-rl --help"
         )
-    command = f"lare {arguments[0]}" if arguments and arguments[0] in commands else "lare"
+    command = f"lare-rl {arguments[0]}" if arguments and arguments[0] in commands else "lare-rl"
     raise LareError(f"{in_one_line(box.getvalue(), commands)}; see {command} --help")
 
 
@@ -118,7 +118,7 @@ def in_one_line(box: str, commands: Mapping[str, object]) -> str:
         return f"{found[1]} {found[3]}: {NUMBERS.get(kind, f'not of the kind {kind}')}"
     if found := re.fullmatch(r"Missing value for argument '(\S+)'\..*", said):
         return f"{found[1]} needs a value"
-    if found := re.fullmatch(r"Missing from (lare [\w-]+): (.*)", said):
+    if found := re.fullmatch(r"Missing from (lare-rl [\w-]+): (.*)", said):
         return f"{found[1]} needs {' and '.join(ARGUMENT.sub(described, one) for one in found[2].split('(required)') if one)}"
     if found := re.fullmatch(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*)\)", said):
         known = sorted(set(re.findall(r"'([^']*)'", found[3])) - {"None"})

@@ -32,7 +32,7 @@ def write_page(path: Path, title: str, body: str, refresh: int | None = None) ->
         LareError: the file cannot be written. An older file is left unchanged.
     """
     again = "" if refresh is None else f'<meta http-equiv="refresh" content="{refresh}">\n'
-    style = (files("lare_rl.experiments") / "report.css").read_text(encoding="utf-8")
+    style = (files("lare_rl.report") / "report.css").read_text(encoding="utf-8")
     page = PAGE.format(title=escape(title), style=style, body=body, refresh=again).encode()
     try:
         replace(path, lambda file: file.write(page))

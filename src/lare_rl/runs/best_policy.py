@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lare_rl.errors import LareError
-from lare_rl.util.files import write_atomically
 from lare_rl.runs.checkpoint import DAMAGED, fill, named_leaves, opened
+from lare_rl.util.files import write_atomically
 
 FILE = "best.npz"
 

@@ -24,19 +24,19 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from lare_rl.config.migrate import FORMAT, migrated
+from lare_rl.config.settings import ResolvedSettings
+from lare_rl.envs.families import env_spec
 from lare_rl.errors import Checked, LareError, shortened
-from lare_rl.util.files import write_atomically
-from lare_rl.util.safe_io import read_json, read_text
 from lare_rl.latent.factors import LatentRewardError
 from lare_rl.latent.function import LatentFunction, per_role
 from lare_rl.latent.saved import load, read_source
 from lare_rl.runs.checkpoint import STATE, saved_host
-from lare_rl.config.migrate import FORMAT, migrated
-from lare_rl.config.settings import ResolvedSettings
-from lare_rl.util.provenance import source
 from lare_rl.tasks.spec import Judges, TaskSpec
-from lare_rl.envs.families import env_spec
 from lare_rl.tasks.trust import check_trusted
+from lare_rl.util.files import write_atomically
+from lare_rl.util.provenance import source
+from lare_rl.util.safe_io import read_json, read_text
 
 CONFIG, METRICS, FUNCTION, CHECKPOINT = "config.json", "metrics.jsonl", "latent_function.py", "checkpoint"
 FAILED_BATCH = "failed_batch.npz"
@@ -365,7 +365,9 @@ def as_run(given: Run | str | Path) -> Run:
         return given
     if isinstance(given, (str, Path)):
         return open_run(given)
-    raise LareError(f"a run must be a directory, or come from lare_rl.train or lare_rl.open_run, and is {shortened(given)}")
+    raise LareError(
+        f"a run must be a directory, or come from lare_rl.train or lare_rl.open_run, and is {shortened(given)}"
+    )
 
 
 @contextlib.contextmanager

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lare_rl import theory
-from lare_rl.theory import MDP, Table
+from paper.theory import MDP, Table
 
 CORES, ACTIONS, HORIZON = 3, 2, 5
 
