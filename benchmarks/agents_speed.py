@@ -24,7 +24,7 @@ from measure import advance, interleave, new_session, show, summary, write
 
 TASKS = ("TriangleArea", "CN-6", "CN-15", "CN-30")
 """3, 6, 15 and 30 agents."""
-FITTING = tuple(row.name for row in METHODS.values() if not row.for_one_only)
+FITTING = tuple(row.name for row in METHODS.values() if not row.single_agent_only)
 """The methods that are measured on CN-6."""
 SEED = 0
 MINUTES = "minutes of 1000 updates"
@@ -39,19 +39,19 @@ def turn(of: Session) -> None:
     advance(of, of.settings.fit_every * of.settings.iteration_steps)
 
 
-def drawn(by_task: Mapping[str, Mapping[str, Any]]) -> str:
+def picture(by_task: Mapping[str, Mapping[str, Any]]) -> str:
     """Cost by the number of agents: the median of the rounds, with the least and the most."""
-    agents = [find_particle_task(task).agents for task in by_task]
+    agents = [find_particle_task(task).n_agents for task in by_task]
     least, median, most = (
         [row[f"{which} {MINUTES}"] for row in by_task.values()] for which in ("least", "median", "most")
     )
-    figure, (axes,) = figures.new_figure()
+    figure, (axes,) = figures.make_figure()
     axes.plot(agents, median, color=figures.COLOURS[0], marker="o")
     axes.fill_between(agents, least, most, color=figures.COLOURS[0], alpha=0.18, linewidth=0)
     for task, x, y in zip(by_task, agents, median, strict=True):
         axes.annotate(task, (x, y), (6, -12), textcoords="offset points")
     axes.set(xlabel="agents", ylabel="minutes for 2.05 million steps", xlim=(0, 33), ylim=(0, None))
-    return figures.on_white(figures.svg(figure))
+    return figures.add_white_background(figures.to_svg(figure))
 
 
 def main(rounds: int = 3) -> None:
@@ -60,24 +60,24 @@ def main(rounds: int = 3) -> None:
     Args:
         rounds: number of turns of each contender.
     """
-    found = {}
-    with tempfile.TemporaryDirectory() as place:
-        wanted = {
+    tables = {}
+    with tempfile.TemporaryDirectory() as folder:
+        contenders = {
             "lare-rd by task": {task: (task, "lare-rd", 1) for task in TASKS},
             "CN-6 by method": {method: ("CN-6", method, 1) for method in FITTING},
             "CN-6, lare-rd by seeds": {str(seeds): ("CN-6", "lare-rd", seeds) for seeds in (1, 3)},
         }
-        for title, rows in wanted.items():
-            sessions = {name: session(Path(place) / f"{title} {name}", *row) for name, row in rows.items()}
-            seconds = interleave({name: partial(turn, one) for name, one in sessions.items()}, rounds)
+        for title, rows in contenders.items():
+            sessions = {name: session(Path(folder) / f"{title} {name}", *row) for name, row in rows.items()}
+            seconds = interleave({name: partial(turn, item) for name, item in sessions.items()}, rounds)
             first = next(iter(rows))
-            found[title] = summary(seconds, 1, first)
-            show(title, found[title], first)
-            for name, row in found[title].items():
+            tables[title] = summary(seconds, 1, first)
+            show(title, tables[title], first)
+            for name, row in tables[title].items():
                 row |= {f"{which} {MINUTES}": row[f"{which} ms"] / 600 for which in ("median", "least", "most")}
                 print(f"{name:28s} {row[f'median {MINUTES}']:10.1f} minutes for 1000 updates")
-    PICTURE.write_text(drawn(found["lare-rd by task"]) + "\n", encoding="utf-8")
-    write("agents_speed", {"rounds": rounds, "seed": SEED, "ten updates and one fit": found})
+    PICTURE.write_text(picture(tables["lare-rd by task"]) + "\n", encoding="utf-8")
+    write("agents_speed", {"rounds": rounds, "seed": SEED, "ten updates and one fit": tables})
 
 
 if __name__ == "__main__":

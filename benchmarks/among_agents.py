@@ -16,12 +16,12 @@ from jaxtyping import Float
 
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv
-from lare_rl.evaluation.watch import on_device, proxy_of
+from lare_rl.evaluation.rollout import compute_proxy_rewards, unroll_policy
 from lare_rl.runs.directory import Run, open_run
-from lare_rl.training.compiled import module_of
-from lare_rl.training.factors import host_factors
-from lare_rl.training.seed_axis import of_seed
-from lare_rl.training.session import load_learner
+from lare_rl.training.compiled import training_module
+from lare_rl.training.factors import compute_host_factors
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
 from measure import apart, correlation, write
 
 EPISODES, KEY = 100, 7
@@ -29,15 +29,17 @@ EPISODES, KEY = 100, 7
 Rewards = Float[np.ndarray, "episodes steps agents"]
 
 
-def judged(run: Run, place: int) -> tuple[Rewards, Rewards]:
+def true_and_proxy_rewards(run: Run, seed_index: int) -> tuple[Rewards, Rewards]:
     """True and proxy rewards of some episodes of a seed."""
     (config, learner, *_), env = load_learner(run), make_env(run.config.task)
     assert isinstance(env, JaxEnv)
-    one = jax.tree.map(lambda leaf: leaf[place : place + 1], learner)
-    actor = module_of(config).actor(one, run.config.settings.steps, config)
-    steps, _, _ = on_device(env, config, actor, EPISODES, KEY)
-    proxy = proxy_of(of_seed(learner, place), steps, host_factors(run, config, steps), config)
-    return steps.after.reward.swapaxes(0, 1), proxy.swapaxes(0, 1)
+    one_seed = jax.tree.map(lambda leaf: leaf[seed_index : seed_index + 1], learner)
+    actor = training_module(config).get_actor(one_seed, run.config.settings.steps, config)
+    steps = unroll_policy(env, config, actor, EPISODES, KEY).steps
+    proxy = compute_proxy_rewards(
+        select_seed(learner, seed_index), steps, compute_host_factors(run, config, steps), config
+    )
+    return steps.next_timestep.reward.swapaxes(0, 1), proxy.swapaxes(0, 1)
 
 
 def figures(true: Rewards, proxy: Rewards) -> Mapping[str, float]:
@@ -52,16 +54,18 @@ def figures(true: Rewards, proxy: Rewards) -> Mapping[str, float]:
 
 
 def main(directories: list[str]) -> None:
-    found = {}
+    results = {}
     for directory in directories:
         run = open_run(directory)
-        of_run = {str(seed): figures(*judged(run, place)) for place, seed in enumerate(run.seeds)}
-        found[Path(directory).name] = {
-            name: {seed: round(row[name], 3) for seed, row in of_run.items()} for name in of_run[str(run.seeds[0])]
+        by_seed = {
+            str(seed): figures(*true_and_proxy_rewards(run, seed_index)) for seed_index, seed in enumerate(run.seeds)
         }
-        for name, row in found[Path(directory).name].items():
+        results[Path(directory).name] = {
+            name: {seed: round(row[name], 3) for seed, row in by_seed.items()} for name in by_seed[str(run.seeds[0])]
+        }
+        for name, row in results[Path(directory).name].items():
             print(f"{Path(directory).name:24s} {name:42s} {row}")
-    write("among_agents", {"episodes": EPISODES, "by run and seed": found})
+    write("among_agents", {"episodes": EPISODES, "by run and seed": results})
 
 
 if __name__ == "__main__":

@@ -19,13 +19,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lare_rl.credit import evidence
-from lare_rl.credit.basis import pairs
-from lare_rl.runs.directory import read_config
+from lare_rl.credit.basis import pair_products
+from lare_rl.runs.config_file import read_config
 from measure import write
-from stored import of_each_seed
+from stored import stored_episodes
 
 EPISODES = (8, 15, 25, 40, 60)
-ASKED = 5
+TEST_EPISODES = 5
 ROUNDS = 60
 SPEED = {"HalfCheetah-v4": 8, "Walker2d-v4": 8}
 """The entry of the observation that is the speed; 1 is the pitch of the body in both."""
@@ -94,66 +94,66 @@ def bases(z: Array, x: Array) -> Iterator[tuple[str, list[Array]]]:
     """Each basis by its name: the groups of features of standardised factors and entries."""
     yield "factors", [z]
     yield "factors, shapes", [z, CHOSEN(z)]
-    yield "factors, shapes, pairs", [z, CHOSEN(z), pairs(z)]
+    yield "factors, shapes, pairs", [z, CHOSEN(z), pair_products(z)]
     yield "factors, entries", [z, x]
     yield "entries", [x]
     yield "entries, shapes", [x, CHOSEN(x)]
-    yield "factors, pairs, entries", [z, pairs(z), x]
+    yield "factors, pairs, entries", [z, pair_products(z), x]
     yield "factors, entries, shapes of both; 3 frequencies, no pairs", [z, CHOSEN(z), x, CHOSEN(x)]
-    yield "entries, shapes, pairs", [x, CHOSEN(x), pairs(x)]
-    yield "all: pairs of entries too", [z, CHOSEN(z), pairs(z), x, CHOSEN(x), pairs(x)]
+    yield "entries, shapes, pairs", [x, CHOSEN(x), pair_products(x)]
+    yield "all: pairs of entries too", [z, CHOSEN(z), pair_products(z), x, CHOSEN(x), pair_products(x)]
     for name, shape in SHAPES.items():
-        yield f"all: {name}", [z, shape(z), pairs(z), x, shape(x)]
+        yield f"all: {name}", [z, shape(z), pair_products(z), x, shape(x)]
 
 
 @partial(jax.jit, static_argnames="group")
 def fitted(means: Array, returns: Array, length: Array, group: tuple[int, ...]) -> tuple[Array, Array]:
     numbers = np.array(group)
-    sums = evidence.add_episodes(evidence.no_sums(len(numbers)), means, returns, length)
-    known = evidence.unknown(len(numbers), int(numbers.max()) + 1)
-    found = evidence.fit(sums, 0, numbers, known, ROUNDS)
-    return found.weight, found.bias
+    sums = evidence.add_episodes(evidence.empty_statistics(len(numbers)), means, returns, length)
+    n_train = evidence.init_posterior(len(numbers), int(numbers.max()) + 1)
+    errors = evidence.fit(sums, 0, numbers, n_train, ROUNDS)
+    return errors.weight, errors.bias
 
 
-def standardised(rows: np.ndarray, known: int, until: int) -> Array:
+def standardised(rows: np.ndarray, n_train: int, end: int) -> Array:
     """Rows, standardised by the known steps."""
-    deviation = rows[:known].std(axis=0)
-    return jnp.asarray((rows[:until] - rows[:known].mean(axis=0)) / np.where(deviation > 0, deviation, 1))
+    deviation = rows[:n_train].std(axis=0)
+    return jnp.asarray((rows[:end] - rows[:n_train].mean(axis=0)) / np.where(deviation > 0, deviation, 1))
 
 
 def main(directory: str) -> None:
     task = read_config(Path(directory)).task.name
-    found: dict[str, list[tuple[float, float]]] = {}
-    for after, action, z, paid, ends in of_each_seed(directory):
-        truths = scores(after, action, paid, SPEED[task])
-        for count in (n for n in EPISODES if n + ASKED <= len(ends)):
-            known, until = ends[count - 1], ends[count + ASKED - 1]
-            standard = [standardised(rows, known, until) for rows in (z, np.concatenate([after, action], axis=1))]
+    errors: dict[str, list[tuple[float, float]]] = {}
+    for after, action, z, reward_paid, ends in stored_episodes(directory):
+        truths = scores(after, action, reward_paid, SPEED[task])
+        for count in (n for n in EPISODES if n + TEST_EPISODES <= len(ends)):
+            n_train, end = ends[count - 1], ends[count + TEST_EPISODES - 1]
+            standard = [standardised(rows, n_train, end) for rows in (z, np.concatenate([after, action], axis=1))]
             begins, length = np.append(0, ends[: count - 1]), np.diff(np.append(0, ends[:count]))
             for name, groups in bases(*standard):
                 features = np.asarray(jnp.concatenate(groups, axis=1), np.float64)
-                group = tuple(np.repeat(np.arange(len(groups)), [part.shape[1] for part in groups]).tolist())
-                means = np.add.reduceat(features[:known], begins) / length[:, None]
+                group = tuple(np.repeat(np.arange(len(groups)), [columns.shape[1] for columns in groups]).tolist())
+                means = np.add.reduceat(features[:n_train], begins) / length[:, None]
                 for reward in truths.values():
-                    true = reward[known:until]
-                    if true.std() == 0 or reward[:known].std() == 0:
+                    true = reward[n_train:end]
+                    if true.std() == 0 or reward[:n_train].std() == 0:
                         continue
                     with jax.enable_x64(True):
-                        weight, bias = fitted(means, np.add.reduceat(reward[:known], begins), length, group)
-                    r_hat = features[known:until] @ np.asarray(weight) + float(bias)
+                        weight, bias = fitted(means, np.add.reduceat(reward[:n_train], begins), length, group)
+                    r_hat = features[n_train:end] @ np.asarray(weight) + float(bias)
                     error = np.abs(r_hat - true).mean() / true.std()
-                    found.setdefault(name, []).append((np.corrcoef(r_hat, true)[0, 1], error))
+                    errors.setdefault(name, []).append((np.corrcoef(r_hat, true)[0, 1], error))
     table = {}
-    for name, each in found.items():
-        correlation, error = np.array(each).T
+    for name, fits in errors.items():
+        correlation, error = np.array(fits).T
         table[name] = {
             "correlation": round(float(np.nanmean(correlation)), 3),
             "error": round(float(error.mean()), 3),
             "median error": round(float(np.median(error)), 3),
-            "fits": len(each),
+            "fits": len(fits),
         }
         print(f"{name:62s} {table[name]}")
-    write("basis", {"task": task, "episodes": EPISODES, "asked": ASKED, "bases": table})
+    write("basis", {"task": task, "episodes": EPISODES, "asked": TEST_EPISODES, "bases": table})
 
 
 if __name__ == "__main__":

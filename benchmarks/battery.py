@@ -17,24 +17,24 @@ import numpy as np
 from gymnasium.spaces import Box
 
 import lare_rl
-from lare_rl.algorithms.settings import SACSettings
+from lare_rl.algorithms.sac import SACSettings
 from lare_rl.credit import basis
 from lare_rl.data import replay
-from lare_rl.training.learner import Paid, rewards
-from lare_rl.training.seed_axis import of_seed
-from lare_rl.training.session import load_learner
+from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
 from measure import write
 
 STEPS, WARMUP, SEEDS = 10_000, 2_000, 5
-RECENT = 2000
+RECENT_STEPS = 2000
 HALF_HOURS = 96
 CAPACITY = 10.0
 ROWS = {
-    "true rewards": ("dense", basis.MOST_PAIRED),
-    "bayes": ("bayes", basis.MOST_PAIRED),
+    "true rewards": ("dense", basis.MAX_PAIRED_RAW_FEATURES),
+    "bayes": ("bayes", basis.MAX_PAIRED_RAW_FEATURES),
     "bayes without pairs": ("bayes", 0),
-    "rrdu": ("rrdu", basis.MOST_PAIRED),
-    "return at the end": ("episodic", basis.MOST_PAIRED),
+    "rrdu": ("rrdu", basis.MAX_PAIRED_RAW_FEATURES),
+    "return at the end": ("episodic", basis.MAX_PAIRED_RAW_FEATURES),
 }
 """For each row, its method and the largest number of entries that get pairs."""
 
@@ -89,31 +89,33 @@ def task() -> lare_rl.TaskSpec:
 def beside_a_potential(run: lare_rl.Run) -> list[dict[str, float]]:
     """How far the proxy rewards of each seed are the true rewards plus the difference of a quadratic function of the state."""
     config, learner, _, _ = load_learner(run)
-    found = []
-    for place in range(len(run.seeds)):
-        one = of_seed(learner, place)
-        steps = replay.read(one.replay, replay.newest(one.replay, RECENT))
-        r_hat = np.asarray(rewards(steps, Paid(one.credit, one.scale), config))[0, :, 0]
-        before, after = (np.asarray(part["observation"])[0, :, 0] for part in (steps.before, steps.after))
-        true, inside = np.asarray(steps.before["reward"])[0, :, 0], ~np.asarray(steps.last)[0]
+    results = []
+    for seed_index in range(len(run.seeds)):
+        i = select_seed(learner, seed_index)
+        steps = replay.read(i.replay, replay.newest_steps(i.replay, RECENT_STEPS))
+        r_hat = np.asarray(rewards(steps, RewardState(i.credit, i.scale), config))[0, :, 0]
+        before, after = (
+            np.asarray(timestep["observation"])[0, :, 0] for timestep in (steps.columns, steps.next_columns)
+        )
+        true, inside = np.asarray(steps.columns["reward"])[0, :, 0], ~np.asarray(steps.last)[0]
         change = quadratic(after) - quadratic(before)
-        given = np.column_stack([true, change, np.ones(len(true))])[inside]
-        weight = np.linalg.lstsq(given, r_hat[inside], rcond=None)[0]
-        correlation = np.corrcoef(given @ weight, r_hat[inside])[0, 1]
-        found.append({"weight": round(float(weight[0]), 3), "correlation": round(float(correlation), 3)})
-    return found
+        regressors = np.column_stack([true, change, np.ones(len(true))])[inside]
+        weight = np.linalg.lstsq(regressors, r_hat[inside], rcond=None)[0]
+        correlation = np.corrcoef(regressors @ weight, r_hat[inside])[0, 1]
+        results.append({"weight": round(float(weight[0]), 3), "correlation": round(float(correlation), 3)})
+    return results
 
 
 def quadratic(state: np.ndarray) -> np.ndarray:
     """The entries of states, and all their squares and products."""
-    one, other = np.triu_indices(state.shape[1])
-    return np.column_stack([state, state[:, one] * state[:, other]])
+    i, j = np.triu_indices(state.shape[1])
+    return np.column_stack([state, state[:, i] * state[:, j]])
 
 
 def main(out: str) -> None:
     table = {}
     for name, (method, most) in ROWS.items():
-        basis.MOST_PAIRED = most
+        basis.MAX_PAIRED_RAW_FEATURES = most
         settings = lare_rl.Settings(
             method=method,
             algorithm="sac",
@@ -122,13 +124,17 @@ def main(out: str) -> None:
             evaluate_every=STEPS // 10,
             sac=SACSettings(warmup=WARMUP),
         )
-        place = Path(out) / name.replace(" ", "-")
-        run = lare_rl.open_run(place) if place.exists() else lare_rl.train(task(), settings, out=place, listeners=[])
+        seed_index = Path(out) / name.replace(" ", "-")
+        run = (
+            lare_rl.open_run(seed_index)
+            if seed_index.exists()
+            else lare_rl.train(task(), settings, out=seed_index, listeners=[])
+        )
         last = [line for line in run.metrics() if line["step"] == STEPS]
         table[name] = {key: [line[key] for line in last] for key in KEYS if key in last[0]}
-        for key, each in table[name].items():
-            print(f"{name:20s} {key:20s} {np.mean(each):8.3f} ± {np.std(each, ddof=1):.3f}", flush=True)
-    basis.MOST_PAIRED = ROWS["bayes"][1]
+        for key, values in table[name].items():
+            print(f"{name:20s} {key:20s} {np.mean(values):8.3f} ± {np.std(values, ddof=1):.3f}", flush=True)
+    basis.MAX_PAIRED_RAW_FEATURES = ROWS["bayes"][1]
     potential = beside_a_potential(lare_rl.open_run(Path(out) / "bayes"))
     print(potential)
     write("battery", {"steps": STEPS, "warmup": WARMUP, "algorithm": "sac", "rows": table, "potential": potential})

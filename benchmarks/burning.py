@@ -14,7 +14,7 @@ class Burns:
     def __init__(self, seconds: float):
         self.seconds = seconds
         self.spec = EnvSpec((Team("agent", 0, 3),), 18, 5, True, 10**9, 54)
-        self.shown = Timestep(
+        self.timestep = Timestep(
             observation=np.zeros((3, 18), np.float32),
             state=np.zeros(54, np.float32),
             available=np.ones((3, 5), bool),
@@ -26,13 +26,13 @@ class Burns:
         )
 
     def reset(self, seed: int) -> Timestep:
-        return self.shown
+        return self.timestep
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
         until = time.thread_time() + self.seconds  # processor time: two processes on one core take twice as long
         while time.thread_time() < until:
             pass
-        return self.shown
+        return self.timestep
 
     def render(self) -> None: ...
 

@@ -10,29 +10,29 @@ import sys
 
 import numpy as np
 
-from lare_rl.evaluation.episode_credit import correlations
-from lare_rl.evaluation.team_matches import sample
+from lare_rl.evaluation.team_samples import sample_steps
 from lare_rl.runs.directory import open_run
+from lare_rl.util.statistics import column_correlations
 from measure import write
 
 
 def main(directories: list[str]) -> None:
-    found = {}
+    results = {}
     for directory in directories:
         run = open_run(directory)
         for random in (True, False):
-            for role, taken in zip(run.config.task.roles, sample(run, random=random), strict=True):
-                of_each = {
-                    "observation": correlations(taken.observation, taken.reward),
-                    "factors": taken.correlations,
+            for role, sample in zip(run.config.task.roles, sample_steps(run, random=random), strict=True):
+                correlations = {
+                    "observation": column_correlations(sample.next_observation, sample.reward),
+                    "factors": sample.correlations,
                 }
-                figures = {name: round(float(np.nanmean(np.abs(values))), 3) for name, values in of_each.items()}
-                figures["best factor"] = round(float(np.nanmax(np.abs(of_each["factors"]))), 3)
+                figures = {name: round(float(np.nanmean(np.abs(values))), 3) for name, values in correlations.items()}
+                figures["best factor"] = round(float(np.nanmax(np.abs(correlations["factors"]))), 3)
                 policy = "random" if random else f"{run.config.settings.method}, trained"
                 settings = run.config.settings
-                found[f"{role.name}, {policy}, draw {settings.draw}"] = figures | {"steps": settings.steps}
+                results[f"{role.name}, {policy}, draw {settings.draw}"] = figures | {"steps": settings.steps}
                 print(f"{role.name:28s} {policy:20s} {figures}")
-    write("correlation", {"absolute correlation with the true reward": found})
+    write("correlation", {"absolute correlation with the true reward": results})
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.compare.statistics import REPETITIONS, interquartile_means
+from lare_rl.compare.bootstrap import REPETITIONS, interquartile_means
 from measure import write
 
 CASES = 5000
@@ -30,16 +30,18 @@ DISTRIBUTIONS: dict[str, tuple[Scores, float]] = {
 """How scores are drawn, and their interquartile mean."""
 
 
-def coverage(drawn: Scores, true: float, seeds: int, random: np.random.Generator) -> dict[str, float]:
-    of_one = of_two = 0
-    for scores, others in zip(drawn(random, (CASES, seeds)), drawn(random, (CASES, seeds)), strict=True):
-        means, of_others = (
-            interquartile_means(each[random.integers(0, seeds, (seeds, REPETITIONS))][:, None])
-            for each in (scores, others)
+def coverage(draw_scores: Scores, true: float, seeds: int, random: np.random.Generator) -> dict[str, float]:
+    mean_hits = difference_hits = 0
+    for scores, other_scores in zip(
+        draw_scores(random, (CASES, seeds)), draw_scores(random, (CASES, seeds)), strict=True
+    ):
+        means, other_means = (
+            interquartile_means(group[random.integers(0, seeds, (seeds, REPETITIONS))][:, None])
+            for group in (scores, other_scores)
         )
-        of_one += holds(means, true)
-        of_two += holds(means - of_others, 0.0)
-    return {"mean": of_one / CASES, "difference": of_two / CASES}
+        mean_hits += holds(means, true)
+        difference_hits += holds(means - other_means, 0.0)
+    return {"mean": mean_hits / CASES, "difference": difference_hits / CASES}
 
 
 def holds(samples: Float[np.ndarray, " samples"], true: float) -> bool:
@@ -49,12 +51,12 @@ def holds(samples: Float[np.ndarray, " samples"], true: float) -> bool:
 
 def main() -> None:
     random = np.random.default_rng(0)
-    found = {
+    results = {
         name: {str(seeds): coverage(*distribution, seeds, random) for seeds in SEEDS}
         for name, distribution in DISTRIBUTIONS.items()
     }
-    print(found)
-    write("coverage", {"coverage": found})
+    print(results)
+    write("coverage", {"coverage": results})
 
 
 if __name__ == "__main__":

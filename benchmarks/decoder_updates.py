@@ -13,92 +13,95 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare_rl.algorithms.table import ALGORITHMS
+from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.credit import arel
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.particles.particle_env import ParticleJaxEnv
-from lare_rl.envs.particles.task import STEPS
-from lare_rl.evaluation.watch import on_device, proxy_of
-from lare_rl.training import learner as common
-from lare_rl.training.compiled import module_of, new_learners
+from lare_rl.envs.particles.task import MAX_STEPS
+from lare_rl.evaluation.rollout import compute_proxy_rewards, unroll_policy
+from lare_rl.training import learner as learner_module
+from lare_rl.training.compiled import compile_functions, training_module
+from lare_rl.training.decoder_fits import fit_repeatedly
 from lare_rl.training.learner import Learner
-from lare_rl.training.seed_axis import of_seed
+from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from measure import apart, correlation, write
 
-ENV, STORED, JUDGED, AT_A_TIME = ParticleJaxEnv("CN-6"), 1600, 200, 100
+ENV, STORED, TEST_EPISODES, AT_A_TIME = ParticleJaxEnv("CN-6"), 1600, 200, 100
 CONTENDERS = {"rd": (None, 3200), "arel": (None, 3200), "arel without its penalty": (0.0, 800)}
 """The weight of AREL's penalty (None: the published one), and the number of updates."""
 
 
-def config_of(name: str) -> TrainConfig:
+def make_config(name: str) -> TrainConfig:
     """The configuration of a contender. Each episode is stored in its own environment."""
     ippo = ALGORITHMS["ippo"]
     return TrainConfig(
         env=ENV.spec,
-        judged_from="observation",
-        judges="after",
+        credit_scope="observation",
+        factor_inputs="after",
         method=find_method(name),
         algorithm=ippo,
         hyperparameters=ippo.settings,
-        credit=CreditSettings(steps=32 * STEPS),
+        credit=CreditSettings(steps=32 * MAX_STEPS),
         scale_rewards=False,
-        factors=(),
-        environments=STORED,
-        rollout_steps=STEPS,
-        capacity=3 * STEPS,
+        n_factors=(),
+        n_envs=STORED,
+        rollout_steps=MAX_STEPS,
+        capacity=3 * MAX_STEPS,
         steps=1,
         fit_updates=AT_A_TIME,
     )
 
 
 def no_factors(episodes: int) -> np.ndarray:
-    return np.zeros((STEPS, episodes, ENV.spec.agents, 0), np.float32)
+    return np.zeros((MAX_STEPS, episodes, ENV.spec.n_agents, 0), np.float32)
 
 
 def random_episodes(key: int, count: int, config: TrainConfig) -> Trajectory:
     """Episodes of random actions, by networks of zeros, which have no preference."""
-    actor = module_of(config).actor(new_learners(jax.random.key(0)[None], config), 0, config)
-    return on_device(ENV, config, jax.tree.map(jnp.zeros_like, actor), count, key)[0]
+    actor = training_module(config).get_actor(compile_functions(config).init(jax.random.key(0)[None]), 0, config)
+    return unroll_policy(ENV, config, jax.tree.map(jnp.zeros_like, actor), count, key).steps
 
 
-def judged(learner: Learner, steps: Trajectory, config: TrainConfig) -> tuple[float, float]:
+def correlations(learner: Learner, steps: Trajectory, config: TrainConfig) -> tuple[float, float]:
     """Correlation within an episode, and of returns."""
-    r_hat = proxy_of(learner, steps, no_factors(JUDGED), config)
-    one, other = (rewards.swapaxes(0, 1).mean(2) for rewards in (np.asarray(steps.after.reward), r_hat))
-    within = correlation(apart(one), apart(other))
-    return round(within, 3), round(correlation(one.sum(1), other.sum(1)), 3)
+    r_hat = compute_proxy_rewards(learner, steps, no_factors(TEST_EPISODES), config)
+    true_reward, proxy_reward = (
+        rewards.swapaxes(0, 1).mean(2) for rewards in (np.asarray(steps.next_timestep.reward), r_hat)
+    )
+    within = correlation(apart(true_reward), apart(proxy_reward))
+    return round(within, 3), round(correlation(true_reward.sum(1), proxy_reward.sum(1)), 3)
 
 
 def curve(name: str, updates: int) -> Iterator[tuple[int, tuple[float, float]]]:
-    config = config_of(name)
-    learner = of_seed(new_learners(jax.random.key(0)[None], config))
+    config = make_config(name)
+    learner = select_seed(compile_functions(config).init(jax.random.key(0)[None]))
     steps, factors = random_episodes(1, STORED, config), jnp.asarray(no_factors(STORED))
-    learner = common.store_with_factors(learner, steps, factors, config)
-    others = random_episodes(99, JUDGED, config)
-    fit = jax.jit(partial(common.fit_often, config=config))
+    learner = learner_module.store_with_factors(learner, steps, factors, config)
+    test_steps = random_episodes(99, TEST_EPISODES, config)
+    fit = jax.jit(partial(fit_repeatedly, config=config))
     for done in range(AT_A_TIME, updates + 1, AT_A_TIME):
         credit, _ = fit(learner, jax.random.key(done))
         learner = learner._replace(credit=credit)
         if (done // AT_A_TIME).bit_count() == 1:
-            yield done, judged(learner, others, config)
+            yield done, correlations(learner, test_steps, config)
 
 
 def main() -> None:
-    found: dict[str, dict[int, tuple[float, float]]] = {}
+    results: dict[str, dict[int, tuple[float, float]]] = {}
     published = arel.VARIANCE_PENALTY
     for name, (penalty, updates) in CONTENDERS.items():
         arel.VARIANCE_PENALTY = published if penalty is None else penalty
-        found[name] = {}
+        results[name] = {}
         for done, figures in curve(name.split()[0], updates):
-            found[name][done] = figures
+            results[name][done] = figures
             print(
                 f"{name:26s} {done:5d} updates: within an episode {figures[0]:.2f}, returns {figures[1]:.2f}",
                 flush=True,
             )
-    write("decoder_updates", {"task": "CN-6", "by contender and updates: within an episode, of returns": found})
+    write("decoder_updates", {"task": "CN-6", "by contender and updates: within an episode, of returns": results})
 
 
 if __name__ == "__main__":

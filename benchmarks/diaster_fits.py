@@ -16,14 +16,16 @@ import jax.numpy as jnp
 import tyro
 
 from lare_rl.credit import accuracy, decomposition
-from lare_rl.credit.decoder_settings import RECENT, CreditSettings
+from lare_rl.credit.decoder_settings import RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
 from lare_rl.runs.directory import open_run
-from lare_rl.training import learner as common
-from lare_rl.training.learner import Learner, Paid
-from lare_rl.training.seed_axis import of_seed
-from lare_rl.training.session import load_learner
+from lare_rl.training.decoder_fits import fit_repeatedly
+from lare_rl.training.decoder_inputs import decoder_inputs
+from lare_rl.training.learner import Learner, init_decoders
+from lare_rl.training.rewards import RewardState, proxy_rewards
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from measure import write
 
@@ -33,40 +35,40 @@ AT_A_TIME = 50
 
 def untrained(learner: Learner, config: TrainConfig, key: jax.Array) -> Learner:
     """The learner with a new decoder, which has the statistics of all stored steps."""
-    (credit,) = common.init_credit([key], config)
-    held = learner.replay
-    every = replay.read(held, replay.newest(held, int(replay.size(held)[0])))
-    credit = decomposition.observe_steps(credit, common.features(every, config, 0))
+    (credit,) = init_decoders([key], config)
+    stored_replay = learner.replay
+    valid = replay.read(stored_replay, replay.newest_steps(stored_replay, int(replay.n_transitions(stored_replay)[0])))
+    credit = decomposition.observe_steps(credit, decoder_inputs(valid, config, 0))
     return learner._replace(credit=(credit._replace(scale=learner.scale[0]),))
 
 
 def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: int) -> list[dict[str, float]]:
     """The accuracy of the decoder after each number of fits."""
-    learner, found, begin = untrained(learner, config, jax.random.key(seed)), [], time.perf_counter()
-    index = replay.newest(learner.replay, RECENT)
+    learner, accuracies, begin = untrained(learner, config, jax.random.key(seed)), [], time.perf_counter()
+    index = replay.newest_steps(learner.replay, RECENT_STEPS)
     recent = jax.tree.map(lambda rows: rows[0], replay.read(learner.replay, index))
     first = jnp.isin(index.number[0], learner.replay.first)
-    reward, every = recent.before["reward"][:, 0], jnp.ones(RECENT, bool)
-    some = jax.jit(common.fit_often, static_argnames="config")
+    reward, valid = recent.columns["reward"][:, 0], jnp.ones(RECENT_STEPS, bool)
+    fit_some = jax.jit(fit_repeatedly, static_argnames="config")
     done = 0
-    for wanted in fits:
-        while done < wanted:
-            credit, _ = some(learner, jax.random.key(1000 * seed + done), config=config)
+    for n_fits in fits:
+        while done < n_fits:
+            credit, _ = fit_some(learner, jax.random.key(1000 * seed + done), config=config)
             learner = learner._replace(credit=credit)
             done += AT_A_TIME
-        r_hat = common.proxy_rewards(recent, Paid(learner.credit, learner.scale), config, 0)[:, 0]
-        found.append(
+        r_hat = proxy_rewards(recent, RewardState(learner.credit, learner.scale), config, 0)[:, 0]
+        accuracies.append(
             {
                 "fits": done,
-                "correlation": float(accuracy.correlation(r_hat, reward, every)),
-                "error": float(accuracy.mean_error(r_hat, reward, every)),
+                "correlation": float(accuracy.correlation(r_hat, reward, valid)),
+                "error": float(accuracy.mean_absolute_error(r_hat, reward, valid)),
                 "r_hat of the first step": float(r_hat[first].mean()),
                 "r of the first step": float(reward[first].mean()),
                 "return": float(recent.mean_reward.mean() * config.env.max_steps),
                 "seconds": time.perf_counter() - begin,
             }
         )
-    return found
+    return accuracies
 
 
 def main(directory: tyro.conf.Positional[Path], fits: tuple[int, ...] = (100, 800, 3200), seeds: int = 3) -> None:
@@ -82,11 +84,11 @@ def main(directory: tyro.conf.Positional[Path], fits: tuple[int, ...] = (100, 80
     results = {}
     for name in ("diaster", "rd"):
         chosen = dataclasses.replace(config, method=METHODS[name], credit=CreditSettings(), fit_updates=AT_A_TIME)
-        results[name] = [curve(of_seed(everyone, seed), chosen, fits, seed) for seed in range(seeds)]
-        for of_one in results[name]:
+        results[name] = [curve(select_seed(everyone, seed), chosen, fits, seed) for seed in range(seeds)]
+        for seed_rows in results[name]:
             print(
                 name,
-                "  ".join(f"{at['fits']}: {at['correlation']:.2f} ({at['error']:.3g})" for at in of_one),
+                "  ".join(f"{at['fits']}: {at['correlation']:.2f} ({at['error']:.3g})" for at in seed_rows),
                 flush=True,
             )
     write(

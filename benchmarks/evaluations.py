@@ -16,8 +16,8 @@ def evaluate(model: Any, environment: gymnasium.Env, seed: int, episodes: int) -
         observation, _ = environment.reset(seed=1_000_000 + 1000 * seed + episode)
         ended = False
         while not ended:
-            seen = observation if normal is None else normal.normalize_obs(observation)
-            action, _ = model.predict(seen, deterministic=True)
+            normalised = observation if normal is None else normal.normalize_obs(observation)
+            action, _ = model.predict(normalised, deterministic=True)
             observation, reward, terminated, truncated, _ = environment.step(action)
             returns[episode] += float(reward)
             ended = terminated or truncated
@@ -27,12 +27,12 @@ def evaluate(model: Any, environment: gymnasium.Env, seed: int, episodes: int) -
 class Evaluations(BaseCallback):
     """Evaluates every so many steps, after the update that follows them."""
 
-    def __init__(self, every: int, report: Callable[[int], None]):
+    def __init__(self, interval: int, report: Callable[[int], None]):
         super().__init__()
-        self.every, self.report = every, report
+        self.interval, self.report = interval, report
 
     def _on_rollout_start(self) -> None:
-        if self.num_timesteps and self.num_timesteps % self.every == 0:
+        if self.num_timesteps and self.num_timesteps % self.interval == 0:
             self.report(self.num_timesteps)
 
     def _on_training_end(self) -> None:

@@ -16,8 +16,8 @@ import jax
 import numpy as np
 
 import lare_rl
-from lare_rl.config.resolve import decide
-from lare_rl.runs.directory import create
+from lare_rl.config.resolve import resolve
+from lare_rl.runs.directory import create_run
 from lare_rl.training import first_fit, session
 from lare_rl.training.streams import Stream, stream_keys
 from measure import write
@@ -27,25 +27,25 @@ WAYS = {"PP-15": ("published", "held-out"), "CN-6": ("published", "held-out", LA
 
 
 def main() -> None:
-    found = {}
+    results = {}
     for task, ways in WAYS.items():
         for way in ways:
-            found.setdefault(task, {})[way] = measured(task, way)
-            write("first_fit", {"seeds": [0, 1, 2], "of each task": found})
+            results.setdefault(task, {})[way] = measured(task, way)
+            write("first_fit", {"seeds": [0, 1, 2], "of each task": results})
 
 
 def measured(name: str, way: str) -> dict[str, Any]:
     task = lare_rl.load_task(name)
     settings = lare_rl.Settings(method="lare-rd", seeds=3, first_fit="published" if way == "published" else "held-out")
-    with tempfile.TemporaryDirectory() as there:
-        run = create(Path(there) / "run", task, decide(settings, task), [lare_rl.design(task)])
-        begun = session.start(run)
+    with tempfile.TemporaryDirectory() as folder:
+        run = create_run(Path(folder) / "run", task, resolve(settings, task), [lare_rl.design(task)])
+        begun = session.start_session(run)
         try:
             steps = begun.collector.collect(begun.actor, 0)
             begun.learner, _ = begun.functions.store(begun.learner, steps)
             jax.block_until_ready(begun.learner)
             start = time.process_time()
-            with mock.patch.object(first_fit, "SMALLER", 1 if way == LARGE else first_fit.SMALLER):
+            with mock.patch.object(first_fit, "BATCH_DIVISOR", 1 if way == LARGE else first_fit.BATCH_DIVISOR):
                 begun.fit(stream_keys(run.seeds, Stream.FIT, 0), lambda: False)
                 jax.block_until_ready(begun.learner)
             seconds = time.process_time() - start

@@ -18,12 +18,12 @@ import numpy as np
 from jax import Array
 
 import lare_rl
-from basis import ASKED, CHOSEN, fitted, scores, standardised
-from lare_rl.credit.basis import pairs
-from lare_rl.runs.directory import read_config
+from basis import CHOSEN, TEST_EPISODES, fitted, scores, standardised
+from lare_rl.credit.basis import pair_products
+from lare_rl.runs.config_file import read_config
 from measure import write
 from missing_factors import FACTORS, source
-from stored import of_each_seed
+from stored import stored_episodes
 
 TASK, SPEED = "HalfCheetah-v4", 8
 EPISODES = (15, 30, 55)
@@ -34,56 +34,61 @@ def functions() -> Iterator[tuple[str, lare_rl.LatentFunction]]:
     task = lare_rl.load_task(TASK)
     for draw in range(5):
         yield f"draw {draw}", lare_rl.design(task, draw=draw)
-    with TemporaryDirectory() as place:
+    with TemporaryDirectory() as folder:
         for name in (*(f"without-{factor}" for factor in FACTORS[TASK]), "irrelevant"):
-            path = Path(place) / f"{name}.py"
+            path = Path(folder) / f"{name}.py"
             path.write_text(source(TASK, name))
             yield name, lare_rl.load_function(path, task)
 
 
-def groups_of(z: Array | None, x: Array) -> Iterator[tuple[str, list[Array]]]:
+def feature_groups(z: Array | None, x: Array) -> Iterator[tuple[str, list[Array]]]:
     if z is None:
         yield "all", [x, CHOSEN(x)]
         return
     yield "factors alone", [z]
-    yield "all", [z, CHOSEN(z), pairs(z), x, CHOSEN(x)] if z.shape[1] > 1 else [z, CHOSEN(z), x, CHOSEN(x)]
+    yield "all", [z, CHOSEN(z), pair_products(z), x, CHOSEN(x)] if z.shape[1] > 1 else [z, CHOSEN(z), x, CHOSEN(x)]
 
 
 def main(directory: str) -> None:
     chosen: dict[str, lare_rl.LatentFunction | None] = {**dict(functions()), "none": None}
-    found: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for after, action, _, paid, ends in of_each_seed(directory):
-        truths = scores(after, action, paid, SPEED)
+    errors: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for after, action, _, true_reward, ends in stored_episodes(directory):
+        truths = scores(after, action, true_reward, SPEED)
         x = np.concatenate([after, action], axis=1)
         for name, function in chosen.items():
             z = None if function is None else np.asarray(function(after, action))
-            for count in (n for n in EPISODES if n + ASKED <= len(ends)):
-                known, until = ends[count - 1], ends[count + ASKED - 1]
+            for count in (n for n in EPISODES if n + TEST_EPISODES <= len(ends)):
+                n_train, end = ends[count - 1], ends[count + TEST_EPISODES - 1]
                 begins, length = np.append(0, ends[: count - 1]), np.diff(np.append(0, ends[:count]))
-                seen = None if z is None else standardised(z, known, until)
-                for kind, groups in groups_of(seen, standardised(x, known, until)):
+                factors = None if z is None else standardised(z, n_train, end)
+                for kind, groups in feature_groups(factors, standardised(x, n_train, end)):
                     features = np.asarray(jnp.concatenate(groups, axis=1), np.float64)
-                    group = tuple(np.repeat(np.arange(len(groups)), [part.shape[1] for part in groups]).tolist())
-                    means = np.add.reduceat(features[:known], begins) / length[:, None]
+                    group = tuple(np.repeat(np.arange(len(groups)), [columns.shape[1] for columns in groups]).tolist())
+                    means = np.add.reduceat(features[:n_train], begins) / length[:, None]
                     for score in ASKED_OF:
                         reward = truths[score]
                         with jax.enable_x64(True):
-                            weight, bias = fitted(means, np.add.reduceat(reward[:known], begins), length, group)
-                        r_hat, true = features[known:until] @ np.asarray(weight) + float(bias), reward[known:until]
+                            weight, bias = fitted(means, np.add.reduceat(reward[:n_train], begins), length, group)
+                        r_hat, true = features[n_train:end] @ np.asarray(weight) + float(bias), reward[n_train:end]
                         error = np.abs(r_hat - true).mean() / true.std()
-                        found.setdefault((name, kind), []).append((np.corrcoef(r_hat, true)[0, 1], error))
+                        errors.setdefault((name, kind), []).append((np.corrcoef(r_hat, true)[0, 1], error))
     table = {}
-    for (name, kind), each in found.items():
-        correlation, error = np.array(each).T
+    for (name, kind), fits in errors.items():
+        correlation, error = np.array(fits).T
         table[f"{name}, {kind}"] = {
             "correlation": round(float(np.nanmean(correlation)), 3),
             "median error": round(float(np.median(error)), 3),
-            "fits": len(each),
+            "fits": len(fits),
         }
         print(f"{name + ', ' + kind:44s} {table[f'{name}, {kind}']}")
     write(
         "functions",
-        {"task": read_config(Path(directory)).task.name, "episodes": EPISODES, "asked": ASKED, "functions": table},
+        {
+            "task": read_config(Path(directory)).task.name,
+            "episodes": EPISODES,
+            "asked": TEST_EPISODES,
+            "functions": table,
+        },
     )
 
 

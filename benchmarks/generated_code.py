@@ -23,19 +23,20 @@ import jax.numpy as jnp
 import numpy as np
 
 import lare_rl
-from lare_rl.algorithms.settings import TD3Settings
+from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.latent.factors import compute_factors
 from lare_rl.latent.verify import verify
 from lare_rl.phi.evaluate import evaluate
-from lare_rl.phi.graph import Graph, Refused
+from lare_rl.phi.graph import Graph
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.read import read
-from lare_rl.training.compiled import compiled
-from lare_rl.training.factors import compiles
+from lare_rl.training.compiled import compile_functions
+from lare_rl.training.factors import is_compilable
 from measure import interleave, new_session, write
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from helpers.attacks import ATTACKS
-from helpers.corpus import Program, benign, hostile, recorded, varied
+from helpers.phi_programs import Program, benign_programs, hostile_programs, recorded_programs, varied_programs
 
 SEED = 0
 
@@ -51,16 +52,21 @@ def quantiles(values: Iterable[float]) -> dict[str, float]:
 
 def corpora() -> dict[str, list[Program]]:
     """All programs, each once."""
-    distinct = {(p.source, p.sizes): p for p in recorded()}
-    return {"recorded replies": list(distinct.values()), "benign": benign(), "varied": varied(), "hostile": hostile()}
+    distinct = {(p.source, p.sizes): p for p in recorded_programs()}
+    return {
+        "recorded replies": list(distinct.values()),
+        "benign": benign_programs(),
+        "varied": varied_programs(),
+        "hostile": hostile_programs(),
+    }
 
 
-def graphs_of(programs: Iterable[Program]) -> list[Graph]:
+def read_graphs(programs: Iterable[Program]) -> list[Graph]:
     graphs = []
     for program in programs:
         try:
             graphs.append(read(program.source, *program.sizes))
-        except Refused:
+        except RefusedError:
             continue
     return graphs
 
@@ -81,7 +87,7 @@ def read_all(programs: Iterable[Program]) -> dict[str, Any]:
         try:
             sizes.append(read(program.source, *program.sizes))
             outcomes["accepted"] += 1
-        except Refused as refusal:
+        except RefusedError as refusal:
             outcomes[f"refused, {refusal.code}"] += 1
         seconds.append(1000 * (time.perf_counter() - start))
     row: dict[str, Any] = {"programs": len(seconds), **outcomes, "ms to read": quantiles(seconds)}
@@ -95,7 +101,7 @@ def read_all(programs: Iterable[Program]) -> dict[str, Any]:
 
 def programs() -> None:
     attacks = [Program(name, (17, 6), source) for name, source in ATTACKS.items()]
-    read_all(benign())  # what is loaded at first use
+    read_all(benign_programs())  # what is loaded at first use
     figures = {name: read_all(corpus) for name, corpus in (*corpora().items(), ("attacks", attacks))}
     task = lare_rl.load_task("HalfCheetah-v4")
     phi = lare_rl.design(task, candidates=1)
@@ -207,8 +213,8 @@ def garbage(choice: random.Random) -> str:
 
 def fuzz(budget: int = 3_000) -> None:
     choice = random.Random(SEED)
-    trusted = [program.source for program in (*benign(), *varied())]
-    mixed = trusted + [program.source for program in hostile()]
+    trusted = [program.source for program in (*benign_programs(), *varied_programs())]
+    mixed = trusted + [program.source for program in hostile_programs()]
     families: dict[str, Iterable[str]] = {
         "names and attributes": [in_function(expression) for expression in sweep()],
         "splices of hostile expressions": [spliced(choice.choice(trusted), choice) for _ in range(budget)],
@@ -222,7 +228,7 @@ def fuzz(budget: int = 3_000) -> None:
         if watching and event.startswith(FORBIDDEN):
             events[event] += 1
 
-    graphs_of(varied())  # what is loaded at first use
+    read_graphs(varied_programs())  # what is loaded at first use
     sys.addaudithook(watch)
     figures: dict[str, Any] = {"seed": SEED}
     steps = [np.random.default_rng(SEED).standard_normal((6, size)).astype(np.float32) for size in (64, 64)]
@@ -232,7 +238,7 @@ def fuzz(budget: int = 3_000) -> None:
             watching, start = True, time.perf_counter()
             try:
                 graph = read(source, 64, 64)
-            except Refused:
+            except RefusedError:
                 graph = None
             watching = False
             seconds.append(1000 * (time.perf_counter() - start))
@@ -275,7 +281,7 @@ def graph_costs(program: Program) -> dict[str, float]:
         "NumPy, 1 row": best_ms(lambda: evaluate(graph, row)),
         "NumPy, 1,000 rows": best_ms(lambda: evaluate(graph, inputs)),
     }
-    if compiles(graph):
+    if is_compilable(graph):
         start = time.perf_counter()
         lowered = jax.jit(lambda inputs: evaluate(graph, inputs, jnp)["factors"]).lower(inputs)
         traced = time.perf_counter()
@@ -292,7 +298,7 @@ def iteration_costs(task: str, settings: lare_rl.Settings, rounds: int = 5) -> d
         for _ in range(3):
             session.advance()
         steps = session.collector.collect(session.actor, session.step)
-        plain = compiled(session.config).store
+        plain = compile_functions(session.config).store
         copies = {name: jax.tree.map(jnp.copy, session.learner) for name in ("with phi", "without phi")}
 
         def store(name: str, function: Callable[..., Any]) -> None:
@@ -325,7 +331,7 @@ def cost() -> None:
     for program in distinct:
         try:
             costs = graph_costs(program)
-        except Refused:
+        except RefusedError:
             continue
         for name, value in costs.items():
             rows.setdefault(name, []).append(value)

@@ -41,55 +41,55 @@ HALF_CHEETAH = {
     "lare-rrdu-chunk-1": {"method": "lare-rrdu", "rollout_steps": 1},
     "lare-rrdu-chunk-1000": {"method": "lare-rrdu", "rollout_steps": 1000},
 }
-OTHERS = {name: HALF_CHEETAH[name] for name in ("lare-rrdu", "rrdu", "dense")}
+SINGLE_AGENT = {name: HALF_CHEETAH[name] for name in ("lare-rrdu", "rrdu", "dense")}
 EXPERIMENTS: dict[str, dict[str, dict[str, Any]]] = {
     "HalfCheetah-v4": HALF_CHEETAH,
-    "Reacher-v4": OTHERS,
-    "Walker2d-v4": OTHERS,
-    "HumanoidStandup-v4": OTHERS,
+    "Reacher-v4": SINGLE_AGENT,
+    "Walker2d-v4": SINGLE_AGENT,
+    "HumanoidStandup-v4": SINGLE_AGENT,
 }
 """The runs of each task, and the settings of each run."""
-COMMON: dict[str, Any] = {"steps": 100_000, "seeds": 3}
-KEPT = Path(__file__).parent / "results" / "learning"
-SWEPT = KEPT.parent / "sweeps" / "closed-form"
+DEFAULTS: dict[str, Any] = {"steps": 100_000, "seeds": 3}
+RESULTS = Path(__file__).parent / "results" / "learning"
+SWEPT = RESULTS.parent / "sweeps" / "closed-form"
 PICTURED = ("lare-bayes", "lare-rrdu", "rrdu", "dense", "episodic", "lare-rrdu-published")
 """Runs that all tasks have come first, so that a method has the same colour in all pictures."""
 
 
-def run(directory: Path, wanted: list[str]) -> None:
+def run(directory: Path, names_to_run: list[str]) -> None:
     names = [f"{task}/{label}" for task, labels in EXPERIMENTS.items() for label in labels]
-    for name in wanted or names:
+    for name in names_to_run or names:
         task, label = name.split("/")
         out = directory / name
         if out.exists():
             lare_rl.resume(out)
         else:
-            lare_rl.train(task, lare_rl.Settings(**COMMON, **EXPERIMENTS[task][label]), out=out)
+            lare_rl.train(task, lare_rl.Settings(**DEFAULTS, **EXPERIMENTS[task][label]), out=out)
 
 
 def keep(directory: Path) -> None:
     """Copy settings and metrics of every finished run."""
     for metrics in sorted(directory.glob("*/*/metrics.jsonl")):
-        place = KEPT / metrics.parent.relative_to(directory)
+        target = RESULTS / metrics.parent.relative_to(directory)
         config, lines = read(metrics.parent)
         settings = config["settings"]
         ended = {line["seed"] for line in lines if line["step"] == settings["steps"]}
         if len(ended) == settings["seeds"]:
-            place.mkdir(parents=True, exist_ok=True)
-            for path in (config_of(metrics.parent), metrics):
-                shutil.copyfile(path, place / path.name)
+            target.mkdir(parents=True, exist_ok=True)
+            for path in (config_path(metrics.parent), metrics):
+                shutil.copyfile(path, target / path.name)
 
 
-def config_of(directory: Path) -> Path:
+def config_path(directory: Path) -> Path:
     """The file with the configuration of a run: ours, or that of `sbx_learning.py`."""
-    ours = directory / "config.json"
-    return ours if ours.exists() else directory / "protocol.json"
+    lare_config = directory / "config.json"
+    return lare_config if lare_config.exists() else directory / "protocol.json"
 
 
 def read(directory: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Settings and metrics."""
     lines = (directory / "metrics.jsonl").read_text().splitlines()
-    return json.loads(config_of(directory).read_text()), [json.loads(line) for line in lines]
+    return json.loads(config_path(directory).read_text()), [json.loads(line) for line in lines]
 
 
 def row(directory: Path) -> dict[str, Any]:
@@ -100,12 +100,12 @@ def row(directory: Path) -> dict[str, Any]:
     late = [line for line in lines if line["step"] > 0.75 * last]
     seeds = sorted({line["seed"] for line in lines})
     by_seed = [np.mean([line["evaluation/return"] for line in late if line["seed"] == seed]) for seed in seeds]
-    found = {"steps": last, "seeds": seeds, "last quarter": mean_and_spread(by_seed)}
+    entries = {"steps": last, "seeds": seeds, "last quarter": mean_and_spread(by_seed)}
     for key in ("evaluation/return", "credit/error", "credit/correlation"):
         values = [line[key] for line in end if line.get(key) is not None]
         if values:
-            found[key] = mean_and_spread(values)
-    return {"machine": config["machine"], "versions": config["versions"], **found}
+            entries[key] = mean_and_spread(values)
+    return {"machine": config["machine"], "versions": config["versions"], **entries}
 
 
 def mean_and_spread(values: Sequence[Any]) -> list[float]:
@@ -123,33 +123,33 @@ def curve(directory: Path) -> figures.Curve:
 
 def pictured(task: str, label: str) -> figures.Curve | None:
     """The curves of all kept runs of a method, if there is one."""
-    places = [*(SWEPT / task / f"{label}-td3{ending}" for ending in ("", "-draw0")), KEPT / task / label]
-    found = [curve(place) for place in places if place.exists()]
-    return (found[0][0], np.concatenate([returns for _, returns in found])) if found else None
+    directories = [*(SWEPT / task / f"{label}-td3{ending}" for ending in ("", "-draw0")), RESULTS / task / label]
+    entries = [curve(target) for target in directories if target.exists()]
+    return (entries[0][0], np.concatenate([returns for _, returns in entries])) if entries else None
 
 
 def table() -> None:
-    found = {f"{directory.parent.name}/{directory.name}": row(directory) for directory in sorted(KEPT.glob("*/*"))}
-    (KEPT.parent / "learning.json").write_text(json.dumps(found, indent=1) + "\n")
+    entries = {f"{directory.parent.name}/{directory.name}": row(directory) for directory in sorted(RESULTS.glob("*/*"))}
+    (RESULTS.parent / "learning.json").write_text(json.dumps(entries, indent=1) + "\n")
     for task in EXPERIMENTS:
-        curves = {label: of_label for label in PICTURED if (of_label := pictured(task, label))}
+        curves = {label: curve_pair for label in PICTURED if (curve_pair := pictured(task, label))}
         if curves:
             picture = Path(__file__).parents[1] / "docs" / "pictures" / f"{task}.svg"
             picture.parent.mkdir(exist_ok=True)
-            picture.write_text(figures.on_white(figures.curves(curves, "true return")) + "\n")
-    for name, of_run in found.items():
-        parts = [
+            picture.write_text(figures.add_white_background(figures.draw_curves(curves, "true return")) + "\n")
+    for name, figures_of_run in entries.items():
+        cells = [
             f"{key.split('/')[-1]} {value[0]:.3g} ± {value[1]:.2g}"
-            for key, value in of_run.items()
+            for key, value in figures_of_run.items()
             if isinstance(value, list) and key != "seeds"
         ]
-        print(f"{name:36s} {of_run['steps']:>7d}  {', '.join(parts)}")
+        print(f"{name:36s} {figures_of_run['steps']:>7d}  {', '.join(cells)}")
 
 
 if __name__ == "__main__":
     match sys.argv[1:]:
-        case ["run", runs, *wanted]:
-            run(Path(runs), wanted)
+        case ["run", runs, *names_to_run]:
+            run(Path(runs), names_to_run)
         case ["keep", runs]:
             keep(Path(runs))
         case ["table"]:

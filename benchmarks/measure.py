@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float
 
 import lare_rl
-from lare_rl.config.resolve import decide
-from lare_rl.runs.directory import create
-from lare_rl.training.session import Session, start
-from lare_rl.training.train import chosen_functions
-from lare_rl.util.provenance import source
+from lare_rl.config.resolve import resolve
+from lare_rl.runs.directory import create_run
+from lare_rl.training.latent_functions import choose_functions
+from lare_rl.training.session import Session, start_session
+from lare_rl.util.provenance import code_version
 
 PACKAGES = (
     "lare-rl",
@@ -50,8 +50,8 @@ TD3 = {
 """Hyperparameters of the paper's TD3, as Stable-Baselines3 and SBX call them."""
 
 PPO = {
-    "learning_rate": lambda left: 3e-4 * left,
-    "clip_range": lambda left: 0.2 * left,
+    "learning_rate": lambda remaining: 3e-4 * remaining,
+    "clip_range": lambda remaining: 0.2 * remaining,
     "n_steps": 2000,
     "batch_size": 64,
     "n_epochs": 10,
@@ -67,9 +67,9 @@ def apart(rewards: Float[np.ndarray, "episodes steps *agents"]) -> Float[np.ndar
     return rewards - rewards.mean(1, keepdims=True)
 
 
-def correlation(one: np.ndarray, other: np.ndarray) -> float:
+def correlation(x: np.ndarray, y: np.ndarray) -> float:
     """Pearson's correlation over all entries."""
-    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
+    return float(np.corrcoef(x.ravel(), y.ravel())[0, 1])
 
 
 def interleave(
@@ -91,7 +91,7 @@ def interleave(
 
 def ratio(seconds: Sequence[float], reference: Sequence[float]) -> float:
     """Median over the rounds of the ratio within a round, so that a slowdown of a whole round cancels out."""
-    return median(one / other for one, other in zip(seconds, reference, strict=True))
+    return median(x / y for x, y in zip(seconds, reference, strict=True))
 
 
 def summary(seconds: Mapping[str, Sequence[float]], per: int, reference: str) -> dict[str, dict[str, Any]]:
@@ -103,7 +103,7 @@ def summary(seconds: Mapping[str, Sequence[float]], per: int, reference: str) ->
         table[name] = {
             **figures,
             "ratio": ratio(values, seconds[reference]),
-            "rounds ms": [round(one, 4) for one in ms],
+            "rounds ms": [round(x, 4) for x in ms],
         }
     return table
 
@@ -124,7 +124,7 @@ def write(name: str, figures: Mapping[str, Any]) -> None:
 
 def provenance() -> dict[str, Any]:
     """The command, the machine and the versions of all packages that figures depend on."""
-    versions = {"lare": source(), "python": platform.python_version()}
+    versions = {"lare": code_version(), "python": platform.python_version()}
     for package in PACKAGES:
         try:
             versions[package] = version(package)
@@ -147,8 +147,8 @@ def machine() -> dict[str, Any]:
 def new_session(directory: Path, task_name: str, settings: lare_rl.Settings) -> Session:
     """The session that `lare_rl.train` starts, without its loop."""
     task = lare_rl.load_task(task_name)
-    resolved = decide(settings, task)
-    return start(create(directory, task, resolved, chosen_functions(task, resolved, None)))
+    resolved = resolve(settings, task)
+    return start_session(create_run(directory, task, resolved, choose_functions(task, resolved, None)))
 
 
 def advance(session: Session, steps: int) -> None:

@@ -36,17 +36,17 @@ IRRELEVANT = {
     "PP-6": "[np.sin(5 * observation[:, 4:5]), np.square(observation[:, 5:6])]",
 }
 """Functions of an angle of the hind leg, and of the place of the nearest obstacle."""
-KEPT = Path(__file__).parent / "results" / "missing"
+RESULTS = Path(__file__).parent / "results" / "missing"
 
 
 def experiments() -> list[str]:
-    found = []
+    names = []
     for task, methods in METHODS.items():
         for method in methods:
             left_out = FACTORS[task] if method == "lare-bayes" else (NEEDED[task],)
             functions = ("all", *(f"without-{name}" for name in left_out), "irrelevant")
-            found += [f"{task}/{method}/{function}" for function in functions]
-    return found
+            names += [f"{task}/{method}/{function}" for function in functions]
+    return names
 
 
 def source(task: str, function: str) -> str:
@@ -56,15 +56,15 @@ def source(task: str, function: str) -> str:
     recorded = lare_rl.design(lare_rl.load_task(task)).source
     if function == "all":
         return recorded
-    left = [name for name in FACTORS[task] if name != function.removeprefix("without-")]
-    assert len(left) == len(FACTORS[task]) - 1
-    changed, times = re.subn(r"return \[.*\]", f"return [{', '.join(left)}]", recorded)
+    remaining = [name for name in FACTORS[task] if name != function.removeprefix("without-")]
+    assert len(remaining) == len(FACTORS[task]) - 1
+    changed, times = re.subn(r"return \[.*\]", f"return [{', '.join(remaining)}]", recorded)
     assert times == 1
     return changed
 
 
-def run(directory: Path, wanted: list[str]) -> None:
-    for name in wanted or experiments():
+def run(directory: Path, names_to_run: list[str]) -> None:
+    for name in names_to_run or experiments():
         task, method, function = name.split("/")
         out = directory / name
         if out.exists():
@@ -86,15 +86,15 @@ def keep(directory: Path) -> None:
             continue
         config, lines = read(directory / name)
         if lines[-1]["step"] == config["settings"]["steps"]:
-            (KEPT / name).mkdir(parents=True, exist_ok=True)
+            (RESULTS / name).mkdir(parents=True, exist_ok=True)
             for file in ("config.json", "metrics.jsonl"):
-                shutil.copyfile(directory / name / file, KEPT / name / file)
+                shutil.copyfile(directory / name / file, RESULTS / name / file)
 
 
 if __name__ == "__main__":
     match sys.argv[1:]:
-        case ["run", runs, *wanted]:
-            run(Path(runs), wanted)
+        case ["run", runs, *names_to_run]:
+            run(Path(runs), names_to_run)
         case ["keep", runs]:
             keep(Path(runs))
         case _:

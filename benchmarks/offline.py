@@ -17,9 +17,9 @@ import torch
 
 import lare_rl
 from lare_rl.data import replay
-from lare_rl.logs.source import open_logs
-from lare_rl.training.seed_axis import of_seed
-from lare_rl.training.session import load_learner
+from lare_rl.logs.log import open_log
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
 from measure import write
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
@@ -32,28 +32,30 @@ METHODS = ("lare-bayes", "bayes")
 def write_log(run: lare_rl.Run, out: Path) -> list[float]:
     """Write the training episodes of a run's first seed as .npz files with their scores. Returns the episodes' returns."""
     _, learner, host, _ = load_learner(run)
-    buffer = of_seed(learner).replay
-    steps = replay.read(buffer, replay.newest(buffer, host["step"]))
-    shown, led_to = (np.asarray(part["observation"])[0, :, 0] for part in (steps.before, steps.after))
-    action, reward = np.asarray(steps.before["action"])[0, :, 0], np.asarray(steps.before["reward"])[0, :, 0]
+    buffer = select_seed(learner).replay
+    steps = replay.read(buffer, replay.newest_steps(buffer, host["step"]))
+    observation, next_observation = (
+        np.asarray(timestep["observation"])[0, :, 0] for timestep in (steps.columns, steps.next_columns)
+    )
+    action, reward = np.asarray(steps.columns["action"])[0, :, 0], np.asarray(steps.columns["reward"])[0, :, 0]
     length = int(np.asarray(steps.length).max())
     out.mkdir()
-    for number, start in enumerate(range(0, len(shown), length)):
+    for number, start in enumerate(range(0, len(observation), length)):
         rows = slice(start, start + length)
         np.savez(
             out / f"{number:03d}.npz",
-            observations=np.concatenate([shown[rows], led_to[rows][-1:]]),
+            observations=np.concatenate([observation[rows], next_observation[rows][-1:]]),
             actions=action[rows],
             true_rewards=reward[rows],
             score=reward[rows].sum(dtype=np.float64),
         )
-    return [float(reward[start : start + length].sum()) for start in range(0, len(shown), length)]
+    return [float(reward[start : start + length].sum()) for start in range(0, len(observation), length)]
 
 
 def agreement(log: Path) -> float:
     """The correlation of r_hat with the true rewards, over all steps."""
-    kept = [episode.kept[1] for episode in open_logs(log).episodes()]
-    r_hat, true = (np.concatenate([one[key] for one in kept]) for key in ("rewards", "true_rewards"))
+    episodes = [episode.contents for episode in open_log(log).episodes()]
+    r_hat, true = (np.concatenate([episode[key] for episode in episodes]) for key in ("rewards", "true_rewards"))
     return float(np.corrcoef(r_hat, true)[0, 1])
 
 
@@ -68,20 +70,20 @@ def main(run: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "log"
         returns = write_log(opened, log)
-        found = {}
+        results = {}
         for method in METHODS:
             out = Path(folder) / method
             phi = lare_rl.design(task) if method.startswith("lare-") else None
-            told = lare_rl.relabel(log, out, method=method, phi=phi, task=task)
-            found[method] = {"held-out R^2": told.return_r2, "correlation with true rewards": agreement(out)}
-            found[method]["returns"] = scores(out, "rewards", task.environment)
-        found["return at the end"] = {"returns": scores(log, "end", task.environment)}
+            outcome = lare_rl.relabel(log, out, method=method, phi=phi, task=task)
+            results[method] = {"held-out R^2": outcome.return_r2, "correlation with true rewards": agreement(out)}
+            results[method]["returns"] = scores(out, "rewards", task.environment)
+        results["return at the end"] = {"returns": scores(log, "end", task.environment)}
         for file in log.glob("*.npz"):
             values = dict(np.load(file))
             np.savez(file, **{key: values[key] for key in ("observations", "actions")}, rewards=values["true_rewards"])
-        found["true rewards"] = {"returns": scores(log, "paid", task.environment)}
+        results["true rewards"] = {"returns": scores(log, "paid", task.environment)}
     figures = {"task": task.name, "seeds": list(SEEDS), "updates": UPDATES, "returns of the log": returns}
-    write("offline", {**figures, "rewards": found})
+    write("offline", {**figures, "rewards": results})
 
 
 if __name__ == "__main__":

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lare_rl.compare.mann_whitney import mann_whitney, mann_whitney_u
 from lare_rl.compare.scores import last_quarter
-from lare_rl.compare.statistics import mann_whitney, mann_whitney_u
 from learning import mean_and_spread, read
 
 
@@ -26,10 +26,10 @@ def curves(directory: Path, key: str) -> list[dict[int, float]]:
         if directory.is_file()
         else read(directory)[1]
     )
-    found: dict[int, dict[int, float]] = {}
+    curves_by_seed: dict[int, dict[int, float]] = {}
     for line in lines:
-        found.setdefault(line["seed"], {})[line["step"]] = line[key]
-    return list(found.values())
+        curves_by_seed.setdefault(line["seed"], {})[line["step"]] = line[key]
+    return list(curves_by_seed.values())
 
 
 def main() -> None:
@@ -38,20 +38,22 @@ def main() -> None:
     parser.add_argument("--over", type=Path, nargs="+", required=True)
     parser.add_argument("--key", default="evaluation/return")
     parser.add_argument("--late", action="store_true")
-    given = parser.parse_args()
-    groups = [[one for place in places for one in curves(place, given.key)] for places in (given.ours, given.over)]
-    shared = sorted(set.intersection(*(set(one) for group in groups for one in group)))
+    args = parser.parse_args()
+    groups = [
+        [curve for path in directories for curve in curves(path, args.key)] for directories in (args.ours, args.over)
+    ]
+    shared = sorted(set.intersection(*(set(curve) for group in groups for curve in group)))
     last = shared[-1]
-    steps = last_quarter(shared) if given.late else [last]
-    ours, theirs = (np.array([np.mean([one[step] for step in steps]) for one in group]) for group in groups)
-    for values in (ours, theirs):
+    steps = last_quarter(shared) if args.late else [last]
+    ours, reference = (np.array([np.mean([curve[step] for step in steps]) for curve in group]) for group in groups)
+    for values in (ours, reference):
         mean, spread = mean_and_spread(list(values))
         print(f"{mean:,.5g} ± {spread:,.3g} ({', '.join(f'{value:,.5g}' for value in values)})")
-    positive = min(np.mean(ours), np.mean(theirs)) > 0
-    print(f"ratio of the means {np.mean(ours) / np.mean(theirs) if positive else math.nan:.3g}, at step {last:,}")
-    more, fewer = mann_whitney([(ours, theirs)])
+    positive = min(np.mean(ours), np.mean(reference)) > 0
+    print(f"ratio of the means {np.mean(ours) / np.mean(reference) if positive else math.nan:.3g}, at step {last:,}")
+    more, fewer = mann_whitney([(ours, reference)])
     print(
-        f"{mann_whitney_u(ours, theirs):g} of {ours.size * theirs.size} pairs won; p of at least so many {more:.2g}, of at most so "
+        f"{mann_whitney_u(ours, reference):g} of {ours.size * reference.size} pairs won; p of at least so many {more:.2g}, of at most so "
         f"many {fewer:.2g}"
     )
 

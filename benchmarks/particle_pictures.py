@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lare_rl.envs.particles.catalogue import find_particle_task
-from lare_rl.envs.particles.drawing import draw
+from lare_rl.envs.particles.drawing import draw_state
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 
@@ -19,11 +19,11 @@ def main() -> None:
     for seed, name in enumerate(("CN-6", "PP-6", "CompetitivePP-6", "TriangleArea")):
         task = find_particle_task(name)
         # Some steps from the start, in which each agent keeps its direction.
-        action = 1 + jnp.arange(task.agents) % 4
+        action = 1 + jnp.arange(task.n_agents) % 4
         state = task.reset(jax.random.key(seed))
         for key in jax.random.split(jax.random.key(seed), 6):
             state = task.step(state, action, key)
-        draw(task, np.asarray(state.position)).savefig(PICTURES / f"{name}.png", dpi=60)
+        draw_state(task, np.asarray(state.position)).savefig(PICTURES / f"{name}.png", dpi=60)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import tyro
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.envs.particles.catalogue import find_particle_task
-from lare_rl.envs.particles.task import ACTIONS, STEPS, ParticleTask
+from lare_rl.envs.particles.task import MAX_STEPS, N_ACTIONS, ParticleTask
 from lare_rl.envs.particles.world import State
 from measure import interleave, show, summary, write
 
@@ -31,21 +31,21 @@ def episodes(task: ParticleTask, key: PRNGKeyArray, worlds: int) -> Float[Array,
 
     def step(state: State, key: PRNGKeyArray):
         action_key, key = jax.random.split(key)
-        state = task.step(state, jax.random.randint(action_key, (task.agents,), 0, ACTIONS), key)
+        state = task.step(state, jax.random.randint(action_key, (task.n_agents,), 0, N_ACTIONS), key)
         return state, jnp.sum(task.observe(state)) + jnp.sum(task.reward(state))
 
     def run(key: PRNGKeyArray) -> Float[Array, " steps"]:
         start_key, key = jax.random.split(key)
-        return jax.lax.scan(step, task.reset(start_key), jax.random.split(key, STEPS))[1]
+        return jax.lax.scan(step, task.reset(start_key), jax.random.split(key, MAX_STEPS))[1]
 
     return jax.vmap(run)(jax.random.split(key, worlds))
 
 
-def ours(task: ParticleTask, worlds: int) -> None:
+def step_particles(task: ParticleTask, worlds: int) -> None:
     jax.block_until_ready(episodes(task, jax.random.key(0), worlds))
 
 
-def theirs(environment) -> None:
+def step_mpe2(environment) -> None:
     environment.reset(seed=0)
     while environment.agents:
         environment.step({agent: environment.action_space(agent).sample() for agent in environment.agents})
@@ -61,14 +61,14 @@ def main(rounds: int = 7, batches: tuple[int, ...] = (64, 1024)) -> None:
     figures = {}
     for name in ("CN-6", "CN-30"):
         task = find_particle_task(name)
-        contenders = {f"{worlds} worlds": partial(ours, task, worlds) for worlds in batches}
-        contenders["mpe2"] = partial(theirs, simple_spread_v3.parallel_env(N=task.agents, max_cycles=STEPS))
-        steps = {**{f"{worlds} worlds": worlds * STEPS for worlds in batches}, "mpe2": STEPS}
+        contenders = {f"{worlds} worlds": partial(step_particles, task, worlds) for worlds in batches}
+        contenders["mpe2"] = partial(step_mpe2, simple_spread_v3.parallel_env(N=task.n_agents, max_cycles=MAX_STEPS))
+        steps = {**{f"{worlds} worlds": worlds * MAX_STEPS for worlds in batches}, "mpe2": MAX_STEPS}
         seconds = interleave(contenders, rounds)
-        each = {who: [value / steps[who] for value in values] for who, values in seconds.items()}
-        figures[name] = summary(each, 1, f"{batches[0]} worlds")
+        ms_per_step = {who: [value / steps[who] for value in values] for who, values in seconds.items()}
+        figures[name] = summary(ms_per_step, 1, f"{batches[0]} worlds")
         show(f"{name}, a step of a world", figures[name], f"{batches[0]} worlds")
-    write("particles", {"rounds": rounds, "steps in an episode": STEPS, "step of one world": figures})
+    write("particles", {"rounds": rounds, "steps in an episode": MAX_STEPS, "step of one world": figures})
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from lare_rl.integrations.gymnasium import Credit
 from lare_rl.integrations.pettingzoo import CreditParallel
 from lare_rl.integrations.torchrl import CreditTransform
 from measure import interleave, show, summary, write
-from plugs_sb3 import TASK, assigner, environment_of, ppo, sbx_sac
+from plugs_sb3 import TASK, assigner, make_environment, ppo, sbx_sac
 
 STEPS = 1000
 PLAIN, PLUG = "plain", "with the plug"
@@ -40,25 +40,25 @@ PLAIN, PLUG = "plain", "with the plug"
 Turns = Mapping[str, Callable[[], object]]
 
 
-def of_gymnasium(task: lare_rl.TaskSpec) -> Turns:
+def gymnasium_turns(task: lare_rl.TaskSpec) -> Turns:
     """An episode of random actions."""
-    plain = environment_of(task, dense=False)
+    plain = make_environment(task, dense=False)
 
     def play(environment: gymnasium.Env) -> None:
         environment.reset(seed=0)
         for _ in range(STEPS):
             environment.step(environment.action_space.sample())
 
-    plugged = Credit(environment_of(task, dense=False), assigner("lare-bayes", task, 0))
+    plugged = Credit(make_environment(task, dense=False), assigner("lare-bayes", task, 0))
     return {PLAIN: partial(play, plain), PLUG: partial(play, plugged)}
 
 
-def of_pettingzoo() -> Turns:
+def pettingzoo_turns() -> Turns:
     """Forty episodes of random actions of six agents."""
-    one = ParticleEnv("CN-6")
+    environment = ParticleEnv("CN-6")
     spaces: dict[str, Any] = {
-        "observation_space": one.observation_space("agent_0"),
-        "action_space": one.action_space("agent_0"),
+        "observation_space": environment.observation_space("agent_0"),
+        "action_space": environment.action_space("agent_0"),
     }
     credit = lare_rl.CreditAssigner("bayes", **spaces, agents=6, max_steps=25)
 
@@ -68,21 +68,21 @@ def of_pettingzoo() -> Turns:
             while environment.agents:
                 environment.step({agent: environment.action_space(agent).sample() for agent in environment.agents})
 
-    return {PLAIN: partial(play, one), PLUG: partial(play, CreditParallel(ParticleEnv("CN-6"), credit))}
+    return {PLAIN: partial(play, environment), PLUG: partial(play, CreditParallel(ParticleEnv("CN-6"), credit))}
 
 
-def of_torchrl(task: lare_rl.TaskSpec) -> Turns:
+def torchrl_turns(task: lare_rl.TaskSpec) -> Turns:
     """An episode goes into the buffer, and a batch is drawn for each of its steps."""
-    environment, rows = environment_of(task, dense=False), []
+    environment, rows = make_environment(task, dense=False), []
     observation, _ = environment.reset(seed=0)
     for _ in range(STEPS):
         action = environment.action_space.sample()
         after, reward, terminated, truncated, _ = environment.step(action)
         done = torch.tensor([terminated or truncated])
         ends = {"done": done, "terminated": torch.tensor([terminated]), "truncated": torch.tensor([truncated])}
-        led_to = {"observation": torch.tensor(after), "reward": torch.tensor([reward], dtype=torch.float32), **ends}
+        next_step = {"observation": torch.tensor(after), "reward": torch.tensor([reward], dtype=torch.float32), **ends}
         rows.append(
-            TensorDict({"observation": torch.tensor(observation), "action": torch.tensor(action), "next": led_to})
+            TensorDict({"observation": torch.tensor(observation), "action": torch.tensor(action), "next": next_step})
         )
         observation = after
     episode: Any = torch.stack(rows)
@@ -99,7 +99,7 @@ def of_torchrl(task: lare_rl.TaskSpec) -> Turns:
     return {PLAIN: partial(train, buffer()), PLUG: partial(train, plugged)}
 
 
-def of_ppo(task: lare_rl.TaskSpec) -> Turns:
+def ppo_turns(task: lare_rl.TaskSpec) -> Turns:
     """A rollout, and the updates on it."""
 
     def learning(rewards: str) -> Callable[[], object]:
@@ -109,7 +109,7 @@ def of_ppo(task: lare_rl.TaskSpec) -> Turns:
     return {PLAIN: learning("episodic"), PLUG: learning("lare-bayes")}
 
 
-def of_sbx(task: lare_rl.TaskSpec) -> Turns:
+def sbx_turns(task: lare_rl.TaskSpec) -> Turns:
     """A step and an update."""
 
     def learning(rewards: str) -> Callable[[], object]:
@@ -129,13 +129,13 @@ def main(rounds: int = 5, sbx: bool = False) -> None:
     """
     task = lare_rl.load_task(TASK)
     contenders = {
-        "Gymnasium": (partial(of_gymnasium, task), STEPS),
-        "PettingZoo": (of_pettingzoo, STEPS),
-        "TorchRL": (partial(of_torchrl, task), STEPS),
-        "Stable-Baselines3, PPO": (partial(of_ppo, task), 2000),  # PPO always finishes its rollout of 2,000 steps
+        "Gymnasium": (partial(gymnasium_turns, task), STEPS),
+        "PettingZoo": (pettingzoo_turns, STEPS),
+        "TorchRL": (partial(torchrl_turns, task), STEPS),
+        "Stable-Baselines3, PPO": (partial(ppo_turns, task), 2000),  # PPO always finishes its rollout of 2,000 steps
     }
     if sbx:
-        contenders = {"SBX, SAC": (partial(of_sbx, task), STEPS)}
+        contenders = {"SBX, SAC": (partial(sbx_turns, task), STEPS)}
     tables = {}
     for name, (turns, steps) in contenders.items():
         tables[name] = summary(interleave(turns(), rounds, time.process_time), steps, PLAIN)

@@ -43,13 +43,13 @@ def assigner(method: str, task: lare_rl.TaskSpec, seed: int, **more: Any) -> lar
     return lare_rl.CreditAssigner(method, phi, task=task, seed=seed, **more)
 
 
-def environment_of(task: lare_rl.TaskSpec, dense: bool) -> gymnasium.Env:
+def make_environment(task: lare_rl.TaskSpec, dense: bool) -> gymnasium.Env:
     """The environment with a true reward at every step, or with the return at the end."""
-    made = gymnasium.make(task.environment)
-    return made if dense else lare_rl.EpisodicReward(made)
+    environment = gymnasium.make(task.environment)
+    return environment if dense else lare_rl.EpisodicReward(environment)
 
 
-def plug_of(task: lare_rl.TaskSpec, rewards: str, seed: int) -> dict[str, Any]:
+def plug_arguments(task: lare_rl.TaskSpec, rewards: str, seed: int) -> dict[str, Any]:
     """The plug's arguments for an algorithm with a replay buffer; empty if it learns from its environment's rewards."""
     if rewards in ("dense", "episodic"):
         return {}
@@ -59,7 +59,7 @@ def plug_of(task: lare_rl.TaskSpec, rewards: str, seed: int) -> dict[str, Any]:
 
 def td3(task: lare_rl.TaskSpec, rewards: str, seed: int, warmup: int) -> TD3:
     """TD3 on the true rewards (`dense`), on the return (`episodic`), or on those of a method."""
-    environment, plug = environment_of(task, rewards == "dense"), plug_of(task, rewards, seed)
+    environment, plug = make_environment(task, rewards == "dense"), plug_arguments(task, rewards, seed)
     noise = NormalActionNoise(np.zeros(task.action_size), 0.1 * np.ones(task.action_size))
     settings: Any = TD3_SETTINGS | {"policy_kwargs": dict(TD3_SETTINGS["policy_kwargs"])}  # SB3 writes into it
     return TD3(
@@ -80,13 +80,13 @@ def sbx_sac(task: lare_rl.TaskSpec, rewards: str, seed: int, warmup: int) -> Any
 
     from sbx_learning import OFF_POLICY
 
-    settings = {"learning_starts": warmup, "seed": seed, **OFF_POLICY, **plug_of(task, rewards, seed)}
-    return SAC("MlpPolicy", environment_of(task, rewards == "dense"), **settings)
+    settings = {"learning_starts": warmup, "seed": seed, **OFF_POLICY, **plug_arguments(task, rewards, seed)}
+    return SAC("MlpPolicy", make_environment(task, rewards == "dense"), **settings)
 
 
 def ppo(task: lare_rl.TaskSpec, rewards: str, seed: int) -> tuple[PPO, list[CreditCallback]]:
     """PPO, normalised by VecNormalize, and the callback with which it learns from a method."""
-    environment = VecNormalize(DummyVecEnv([partial(environment_of, task, rewards == "dense")]))
+    environment = VecNormalize(DummyVecEnv([partial(make_environment, task, rewards == "dense")]))
     settings: Any = PPO_SETTINGS | {"policy_kwargs": dict(PPO_SETTINGS["policy_kwargs"])}
     model = PPO("MlpPolicy", environment, seed=seed, device="cpu", **settings)
     if rewards in ("dense", "episodic"):

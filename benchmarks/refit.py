@@ -16,17 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from lare_rl.credit import accuracy, decomposition, descent
-from lare_rl.credit.decoder_settings import RECENT
-from lare_rl.credit.decomposition import Decomposition, Episodes
+from lare_rl.credit.decoder_settings import RECENT_STEPS
+from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.methods import Fit
 from lare_rl.data import replay
-from lare_rl.data.sampling import CreditSample, sample_parts
+from lare_rl.data.sampling import CreditSample, sample_drawn
 from lare_rl.nn.normalise import Scale
 from lare_rl.runs.directory import open_run
-from lare_rl.training import learner as common
-from lare_rl.training.learner import Learner
-from lare_rl.training.seed_axis import of_seed
-from lare_rl.training.session import load_learner
+from lare_rl.training.decoder_inputs import decoder_inputs
+from lare_rl.training.learner import Learner, init_decoders
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from measure import write
 
@@ -34,45 +34,49 @@ UPDATES, STRETCH = 20_000, 5_000
 
 
 @partial(jax.jit, static_argnames=("fit", "config"))
-def updates(credit: Decomposition, held: replay.Replay, key: jax.Array, fit: Fit, config: TrainConfig) -> Decomposition:
-    def one(credit: Decomposition, drawn: CreditSample) -> tuple[Decomposition, None]:
-        features = common.features(replay.read(held, drawn.steps), config, 0)
-        chosen = drawn.episodes
-        episodes = Episodes(features, drawn.episode, chosen.length, chosen.mean_reward[..., 0], chosen.mask)
+def updates(
+    credit: Decomposition, stored_replay: replay.Replay, key: jax.Array, fit: Fit, config: TrainConfig
+) -> Decomposition:
+    def update(credit: Decomposition, sample: CreditSample) -> tuple[Decomposition, None]:
+        features = decoder_inputs(replay.read(stored_replay, sample.steps), config, 0)
+        chosen = sample.episodes
+        episodes = CreditBatch(features, sample.episode, chosen.length, chosen.mean_reward[..., 0], chosen.mask)
         return descent.update(credit, episodes, key, fit, config.credit)[0], None
 
-    drawn_steps = min(config.credit.drawn_steps, config.env.max_steps)
-    return jax.lax.scan(one, credit, sample_parts(held, key, STRETCH, common.parts_count(config), drawn_steps))[0]
+    n_steps = min(config.credit.drawn_steps, config.env.max_steps)
+    n_episodes = max(1, config.credit.steps // config.credit.drawn_steps)
+    samples = sample_drawn(stored_replay, key, STRETCH, n_episodes, n_steps)
+    return jax.lax.scan(update, credit, samples)[0]
 
 
 def newest(learner: Learner, config: TrainConfig) -> tuple[jax.Array, jax.Array]:
     """Features and true rewards of the last steps."""
-    recent = replay.read(learner.replay, replay.newest(learner.replay, RECENT))
-    return common.features(recent, config, 0)[0], recent.before["reward"][0, :, 0]
+    recent = replay.read(learner.replay, replay.newest_steps(learner.replay, RECENT_STEPS))
+    return decoder_inputs(recent, config, 0)[0], recent.columns["reward"][0, :, 0]
 
 
 def refit(learner: Learner, config: TrainConfig, fit: Fit, scale: Scale) -> list[dict[str, float]]:
-    (known,) = learner.credit
-    (features, reward), every = newest(learner, config), jnp.ones(RECENT, bool)
-    (credit,) = common.init_credit([jax.random.key(0)], config)
-    credit = credit._replace(statistics=known.statistics, scale=scale)
-    found = []
+    (decoder,) = learner.credit
+    (features, reward), valid = newest(learner, config), jnp.ones(RECENT_STEPS, bool)
+    (credit,) = init_decoders([jax.random.key(0)], config)
+    credit = credit._replace(statistics=decoder.statistics, scale=scale)
+    rows = []
     for number in range(UPDATES // STRETCH):
         credit = updates(credit, learner.replay, jax.random.key(number), fit, config)
         r_hat = decomposition.proxy_rewards(credit, features, config.credit)[:, 0]
-        found.append(
+        rows.append(
             {
                 "updates": (number + 1) * STRETCH,
-                "correlation": float(accuracy.correlation(r_hat, reward, every)),
-                "error": float(accuracy.mean_error(r_hat, reward, every)),
+                "correlation": float(accuracy.correlation(r_hat, reward, valid)),
+                "error": float(accuracy.mean_absolute_error(r_hat, reward, valid)),
             }
         )
-    return found
+    return rows
 
 
 def ceiling(learner: Learner, config: TrainConfig) -> float:
-    features, reward = (np.asarray(part) for part in newest(learner, config))
-    rows = np.c_[features[:, 0], np.ones(RECENT)]
+    features, reward = (np.asarray(array) for array in newest(learner, config))
+    rows = np.c_[features[:, 0], np.ones(RECENT_STEPS)]
     best = rows @ np.linalg.lstsq(rows, reward, rcond=None)[0]
     return float(np.corrcoef(best, reward)[0, 1])
 
@@ -82,20 +86,20 @@ def main(directories: list[str]) -> None:
     for directory in directories:
         run = open_run(directory)
         config, everyone, _, _ = load_learner(run)
-        learner = of_seed(everyone)
-        (own,) = learner.scale
-        unit = own._replace(mean_square=jnp.ones(()))
+        learner = select_seed(everyone)
+        (scale_state,) = learner.scale
+        unit = scale_state._replace(mean_square=jnp.ones(()))
         assert config.method.fit is not None
         cases = {
-            "as it is": (config.method.fit, own),
+            "as it is": (config.method.fit, scale_state),
             "targets as they are": (config.method.fit, unit),
-            "biased": (Fit.DRAWN_STEPS, own),
+            "biased": (Fit.SAMPLED_STEPS, scale_state),
         }
-        found = {name: refit(learner, config, *case) for name, case in cases.items()}
-        ceilings = [ceiling(of_seed(everyone, place), config) for place in range(len(run.seeds))]
-        results[f"{run.config.task.name} {run.config.settings.method}"] = {"ceiling of each seed": ceilings, **found}
+        rows = {name: refit(learner, config, *case) for name, case in cases.items()}
+        ceilings = [ceiling(select_seed(everyone, seed_index), config) for seed_index in range(len(run.seeds))]
+        results[f"{run.config.task.name} {run.config.settings.method}"] = {"ceiling of each seed": ceilings, **rows}
         print(f"{directory}: ceiling {', '.join(f'{value:.3f}' for value in ceilings)}")
-        for name, steps in found.items():
+        for name, steps in rows.items():
             print(f"  {name:20s}", "  ".join(f"{at['correlation']:.2f} (error {at['error']:.2f})" for at in steps))
     write("refit", {"results": results})
 

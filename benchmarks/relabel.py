@@ -42,7 +42,7 @@ class Log:
 def main(steps: int) -> None:
     began = {}
 
-    def told(stage: str, done: int, count: int | None) -> None:
+    def listener(stage: str, done: int, count: int | None) -> None:
         began.setdefault(stage, time.perf_counter())
 
     start = time.perf_counter()
@@ -51,18 +51,18 @@ def main(steps: int) -> None:
     making = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        found = lare_rl.relabel(Log(steps // LENGTH), Path(folder) / "new", told=told)
+        result = lare_rl.relabel(Log(steps // LENGTH), Path(folder) / "new", listener=listener)
         end = time.perf_counter()
     figures = {
-        "steps": found.steps,
-        "episodes": found.episodes,
+        "steps": result.steps,
+        "episodes": result.episodes,
         "seconds": end - start,
-        "steps a second": found.steps / (end - start),
+        "steps a second": result.steps / (end - start),
         "seconds of the pass that fits": began["write"] - start,
         "seconds of the pass that writes": end - began["write"],
         "seconds of making the episodes, in each pass": making,
         "peak memory, MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "held-out R^2": found.return_r2,
+        "held-out R^2": result.return_r2,
     }
     for name, value in figures.items():
         print(f"{name:46s} {value:,.2f}")

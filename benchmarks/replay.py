@@ -24,8 +24,8 @@ import psutil
 import tyro
 
 import lare_rl
-from lare_rl.algorithms.settings import TD3Settings
-from lare_rl.algorithms.table import ALGORITHMS
+from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.data import replay
@@ -33,7 +33,7 @@ from lare_rl.data.replay import Replay
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.training import off_policy
-from lare_rl.training.learner import features
+from lare_rl.training.decoder_inputs import decoder_inputs
 from lare_rl.training.session import Session
 from lare_rl.training.static_config import TrainConfig
 from measure import advance, interleave, new_session, show, summary, write
@@ -42,15 +42,15 @@ SEED, EPISODE, UPDATES = 0, 1000, 50
 STORED = (10_000, 100_000, 1_000_000)
 CONFIG = TrainConfig(
     env=EnvSpec((Team("agent", 0, 1),), observation_size=17, action_size=6, discrete=False, max_steps=EPISODE),
-    judged_from="observation",
-    judges="after",
+    credit_scope="observation",
+    factor_inputs="after",
     method=find_method("lare-rrdu"),
     algorithm=ALGORITHMS["td3"],
     hyperparameters=TD3Settings(),
     credit=CreditSettings(),
     scale_rewards=False,
-    factors=(6,),
-    environments=1,
+    n_factors=(6,),
+    n_envs=1,
     rollout_steps=UPDATES,
     capacity=1_010_000,
     steps=1_000_000,
@@ -62,47 +62,47 @@ CONFIG = TrainConfig(
 def filled(transitions: int) -> Replay:
     """A replay of whole episodes of 1000 random steps, with a leading seed axis of 1."""
     random, number = np.random.default_rng(SEED), np.arange(transitions)
-    episodes, held = transitions // EPISODE, replay.empty(CONFIG.columns, 1, CONFIG.capacity, 1)
+    episodes, stored_replay = transitions // EPISODE, replay.init_replay(CONFIG.columns, 1, CONFIG.capacity, 1)
 
     def numbers(column: jax.Array) -> np.ndarray:
         return random.standard_normal(column.shape, np.float32).astype(column.dtype)
 
-    held = held._replace(
-        columns={name: numbers(column) for name, column in held.columns.items()},
-        row=np.asarray(held.row.at[0, :transitions].set(number + number // EPISODE)),
-        episode=np.asarray(held.episode.at[0, :transitions].set(number // EPISODE)),
-        first=np.asarray(held.first.at[0, :episodes].set(EPISODE * np.arange(episodes))),
-        episode_return=numbers(held.episode_return),
+    stored_replay = stored_replay._replace(
+        columns={name: numbers(column) for name, column in stored_replay.columns.items()},
+        row=np.asarray(stored_replay.row.at[0, :transitions].set(number + number // EPISODE)),
+        episode=np.asarray(stored_replay.episode.at[0, :transitions].set(number // EPISODE)),
+        first=np.asarray(stored_replay.first.at[0, :episodes].set(EPISODE * np.arange(episodes))),
+        episode_return=numbers(stored_replay.episode_return),
         next_row=jnp.asarray([episodes * (EPISODE + 1)]),
         transitions=jnp.asarray([transitions]),
         episodes=jnp.asarray([episodes]),
     )
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], held)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], stored_replay)
 
 
-def reads(held: Replay, key: jax.Array) -> Any:
+def reads(stored_replay: Replay, key: jax.Array) -> Any:
     """Read the data of 50 updates, one after the other; returns the data of the last one."""
-    draws = off_policy.sample(held, key, UPDATES, CONFIG)
+    draws = off_policy._sample(stored_replay, key, UPDATES, CONFIG)
 
-    def one(draw: off_policy.UpdateSample) -> Any:
+    def use(draw: off_policy.UpdateSample) -> Any:
         assert draw.credit is not None
-        drawn, batch = replay.read(held, draw.credit.steps), replay.read(held, draw.batch)
-        credit = features(drawn, CONFIG, 0), draw.credit.episodes
-        before, after = batch.before, batch.after
+        credit_steps, batch = replay.read(stored_replay, draw.credit.steps), replay.read(stored_replay, draw.batch)
+        credit = decoder_inputs(credit_steps, CONFIG, 0), draw.credit.episodes
+        before, after = batch.columns, batch.next_columns
         read = before["observation"], before["action"], after["observation"], before["terminated"]
-        return credit, features(batch, CONFIG, 0), read
+        return credit, decoder_inputs(batch, CONFIG, 0), read
 
-    start = jax.tree.map(jnp.zeros_like, one(jax.tree.map(lambda leaf: leaf[0], draws)))
-    return jax.lax.scan(lambda _, draw: (one(draw), None), start, draws)[0]
+    start = jax.tree.map(jnp.zeros_like, use(jax.tree.map(lambda leaf: leaf[0], draws)))
+    return jax.lax.scan(lambda _, draw: (use(draw), None), start, draws)[0]
 
 
 def draws(rounds: int, calls: int) -> None:
     """Measure the time of draws."""
     compiled = jax.jit(jax.vmap(reads))
 
-    def work(held: Replay) -> None:
+    def work(stored_replay: Replay) -> None:
         for call in range(calls):
-            jax.block_until_ready(compiled(held, jax.random.split(jax.random.key(call), 1)))
+            jax.block_until_ready(compiled(stored_replay, jax.random.split(jax.random.key(call), 1)))
 
     contenders: dict[str, Callable[[], object]] = {f"{stored:,}": partial(work, filled(stored)) for stored in STORED}
     table = summary(interleave(contenders, rounds), calls * UPDATES, f"{STORED[0]:,}")
@@ -114,7 +114,7 @@ def fill(session: Session, transitions: int) -> None:
     """Put random steps into a session's replay, by its own compiled `store`."""
     config, random = session.config, np.random.default_rng(SEED)
     env, rollout = config.env, config.rollout_steps
-    every = {
+    zeros = {
         "available": np.ones((1, rollout, 1, 1, env.action_size), bool),
         "alive": np.ones((1, rollout, 1, 1), bool),
     }
@@ -122,7 +122,7 @@ def fill(session: Session, transitions: int) -> None:
     def numbers(*shape: int) -> np.ndarray:
         return random.standard_normal((1, rollout, 1, *shape), np.float32)
 
-    def shown(ended: np.ndarray) -> Timestep:
+    def timestep(ended: np.ndarray) -> Timestep:
         return Timestep(
             observation=numbers(1, env.observation_size),
             state=numbers(0),
@@ -130,13 +130,13 @@ def fill(session: Session, transitions: int) -> None:
             terminated=np.zeros_like(ended),
             truncated=ended,
             measures={},
-            **every,
+            **zeros,
         )
 
     for start in range(0, transitions, rollout):
         ended = ((start + 1 + np.arange(rollout)) % EPISODE == 0)[None, :, None]
         action = numbers(1, env.action_size)
-        steps = Trajectory(shown(np.zeros_like(ended)), action, action, shown(ended))
+        steps = Trajectory(timestep(np.zeros_like(ended)), action, action, timestep(ended))
         session.learner, _ = session.functions.store(session.learner, steps)
     session.step = transitions
 
@@ -150,9 +150,9 @@ def used() -> dict[str, int]:
 def memory(transitions: int) -> None:
     """Fill a replay, continue training, and measure the memory."""
     stages = {"packages imported": used()}
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory() as folder:
         settings = lare_rl.Settings(method="lare-rrdu", seed=SEED)
-        session = new_session(Path(place) / "run", "HumanoidStandup-v4", settings)
+        session = new_session(Path(folder) / "run", "HumanoidStandup-v4", settings)
         jax.block_until_ready(session.learner)
         stages["session begun"] = used()
         fill(session, transitions)
@@ -162,8 +162,8 @@ def memory(transitions: int) -> None:
         stages["1000 training steps later"] = used()
         session.close()
     arrays = sum(leaf.nbytes for leaf in jax.tree.leaves(session.learner.replay))
-    held = session.learner.replay
-    stored = int(jax.vmap(replay.size)(held)[0, 0])
+    stored_replay = session.learner.replay
+    stored = int(jax.vmap(replay.n_transitions)(stored_replay)[0, 0])
     print(f"{stored:,} transitions stored; the arrays of the replay: {arrays / 1e9:.3f} GB")
     for stage, bytes_used in stages.items():
         print(f"{stage:28s} resident {bytes_used['resident'] / 1e9:.3f} GB, peak {bytes_used['peak'] / 1e9:.3f} GB")

@@ -29,20 +29,22 @@ OFF_POLICY = {name: value for name, value in TD3.items() if name != "policy_dela
 PPO = {**PPO_COMMON, "policy_kwargs": {"net_arch": [256, 256], "activation_fn": nn.tanh}}
 
 
-def model_of(algorithm: str, environment: gymnasium.Env, warmup: int, seed: int) -> Any:
+def make_model(algorithm: str, environment: gymnasium.Env, warmup: int, seed: int) -> Any:
     """One of SBX's models, with our hyperparameters."""
     assert isinstance(environment.action_space, gymnasium.spaces.Box)
     actions = environment.action_space.shape
     noise = NormalActionNoise(np.zeros(actions), 0.1 * np.ones(actions))
-    usual = {"learning_starts": warmup, "seed": seed}
+    defaults = {"learning_starts": warmup, "seed": seed}
     match algorithm:
         case "td3":
             smooth = {"target_policy_noise": 0.2, "target_noise_clip": 0.5}
-            return sbx.TD3("MlpPolicy", environment, action_noise=noise, **usual, **smooth, **TD3)
+            return sbx.TD3("MlpPolicy", environment, action_noise=noise, **defaults, **smooth, **TD3)
         case "ddpg":
-            return sbx.DDPG("MlpPolicy", environment, action_noise=noise, qf_learning_rate=3e-4, **usual, **OFF_POLICY)
+            return sbx.DDPG(
+                "MlpPolicy", environment, action_noise=noise, qf_learning_rate=3e-4, **defaults, **OFF_POLICY
+            )
         case "sac":
-            return sbx.SAC("MlpPolicy", environment, **usual, **OFF_POLICY)
+            return sbx.SAC("MlpPolicy", environment, **defaults, **OFF_POLICY)
         case _:
             return sbx.PPO("MlpPolicy", VecNormalize(DummyVecEnv([lambda: environment])), seed=seed, **PPO)
 
@@ -69,11 +71,11 @@ def main(
         episodes: episodes in one evaluation.
         warmup: random steps before the first update; ppo has none.
     """
-    every = evaluate_every or (10_000 if algorithm == "ppo" else 5000)
+    interval = evaluate_every or (10_000 if algorithm == "ppo" else 5000)
     turn = int(PPO["n_steps"]) if algorithm == "ppo" else 1
-    if every % turn or steps % every:
+    if interval % turn or steps % interval:
         raise SystemExit(
-            f"steps = {steps} must be a multiple of evaluate-every = {every}, which must be a multiple of {turn}"
+            f"steps = {steps} must be a multiple of evaluate-every = {interval}, which must be a multiple of {turn}"
         )
     out.mkdir(parents=True)
     settings = {"steps": steps, "seeds": seeds}
@@ -83,7 +85,7 @@ def main(
     )
     environment = gymnasium.make(task)
     for seed in range(seeds):
-        model = model_of(algorithm, gymnasium.make(task), warmup, seed)
+        model = make_model(algorithm, gymnasium.make(task), warmup, seed)
 
         def report(step: int, model: Any = model, seed: int = seed) -> None:
             line = {"step": step, "seed": seed, "evaluation/return": evaluate(model, environment, seed, episodes)}
@@ -91,7 +93,7 @@ def main(
                 file.write(json.dumps(line) + "\n")
             print(f"seed {seed}  step {step:>7d}  return {line['evaluation/return']:10.1f}", flush=True)
 
-        model.learn(steps, log_interval=1_000_000, callback=Evaluations(every, report))
+        model.learn(steps, log_interval=1_000_000, callback=Evaluations(interval, report))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from pathlib import Path
 import tyro
 
 import lare_rl
-from lare_rl.algorithms.settings import TD3Settings
+from lare_rl.algorithms.td3 import TD3Settings
 from measure import advance, interleave, new_session, show, summary, write
 
 TASK, BEFORE = "HalfCheetah-v4", 2000
@@ -28,12 +28,12 @@ def main(rounds: int = 7, steps: int = 1000, seeds: int = 5, method: str = "lare
         method: how credit is assigned.
     """
     contenders = {}
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory() as folder:
         for number in (1, seeds):
             settings = lare_rl.Settings(
                 method=method, seeds=number, evaluation_episodes=1, td3=TD3Settings(warmup=BEFORE)
             )
-            session = new_session(Path(place) / str(number), TASK, settings)
+            session = new_session(Path(folder) / str(number), TASK, settings)
             advance(session, BEFORE)
             contenders[f"seeds: {number}"] = partial(advance, session, steps)
         seconds = interleave(contenders, rounds)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import tyro
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.envs.smax import NAMES
+from lare_rl.envs.smax import SCENARIO_NAMES
 from lare_rl.envs.smax.smax_env import SMAX
 from measure import interleave, show, summary, write
 
@@ -26,12 +26,12 @@ def battles(env: SMAX, key: PRNGKeyArray, worlds: int) -> Float[Array, "worlds s
     """Play a batch of battles. The sums keep the compiler from leaving anything out."""
 
     def step(carry, key: PRNGKeyArray):
-        state, seen = carry
+        state, timestep = carry
         choice_key, key = jax.random.split(key)
-        chance = jax.random.uniform(choice_key, seen.available.shape)
-        choice = jnp.argmax(jnp.where(seen.available, chance, -1), axis=1)
-        state, seen = env.step(state, jax.nn.one_hot(choice, env.spec.action_size), key)
-        return (state, seen), jnp.sum(seen.observation) + jnp.sum(seen.state) + jnp.sum(seen.reward)
+        chance = jax.random.uniform(choice_key, timestep.available.shape)
+        choice = jnp.argmax(jnp.where(timestep.available, chance, -1), axis=1)
+        state, timestep = env.step(state, jax.nn.one_hot(choice, env.spec.action_size), key)
+        return (state, timestep), jnp.sum(timestep.observation) + jnp.sum(timestep.state) + jnp.sum(timestep.reward)
 
     def run(key: PRNGKeyArray) -> Float[Array, " steps"]:
         start_key, key = jax.random.split(key)
@@ -49,7 +49,7 @@ def main(rounds: int = 7, batches: tuple[int, ...] = (1, 32, 256), calls: int = 
         calls: about how many battles in a turn.
     """
     figures, compiling = {}, {}
-    for name in NAMES:
+    for name in SCENARIO_NAMES:
         env = SMAX(name)
 
         def turn(worlds: int, env: SMAX = env) -> None:
@@ -62,11 +62,11 @@ def main(rounds: int = 7, batches: tuple[int, ...] = (1, 32, 256), calls: int = 
             compiling[f"{name}, {worlds}"] = time.process_time() - start
         contenders = {str(worlds): partial(turn, worlds) for worlds in batches}
         seconds = interleave(contenders, rounds)
-        each = {
+        ms_by_battle = {
             who: [value / (STEPS * int(who) * max(1, calls // int(who))) for value in values]
             for who, values in seconds.items()
         }
-        figures[name] = summary(each, 1, str(batches[0]))
+        figures[name] = summary(ms_by_battle, 1, str(batches[0]))
         for row in figures[name].values():
             row["steps a second"] = round(1000 / row["median ms"])
         show(f"{name}, a step of a battle", figures[name], str(batches[0]))

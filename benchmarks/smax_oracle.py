@@ -24,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from lare_rl.envs.smax import NAMES, battle, enemy, observation
+from lare_rl.envs.smax import SCENARIO_NAMES, battle, enemy, observation
 from lare_rl.envs.smax.scenarios import UNIT_TYPES, Scenario, find_scenario
-from lare_rl.envs.smax.smax_env import MOST, reward
+from lare_rl.envs.smax.smax_env import WIN_RETURN, reward
 from measure import write
 
 streams = sys.stdout, sys.stderr
@@ -56,7 +56,7 @@ PINNED = {"2s3z": "won", "3s_vs_5z": "lost", "1c3s5z": "lost"}
 
 def theirs(scenario: Scenario) -> HeuristicEnemySMAX:
     """JaxMARL's environment, with the colossus appended to its unit types if the battle has one."""
-    table = list(UNIT_TYPES.values())[: scenario.unit_types]
+    table = list(UNIT_TYPES.values())[: scenario.n_unit_types]
     figures = {
         "unit_type_velocities": [kind.speed for kind in table],
         "unit_type_attacks": [kind.damage for kind in table],
@@ -68,17 +68,17 @@ def theirs(scenario: Scenario) -> HeuristicEnemySMAX:
     }
     # Its own unit types keep their own figures, so that our figures are compared, too.
     arguments: dict[str, Any] = {}
-    if scenario.unit_types > 6:
+    if scenario.n_unit_types > 6:
         defaults = HeuristicEnemySMAX()._env
         arguments = {
             name: jnp.concatenate([getattr(defaults, name), jnp.array(values[6:], jnp.float32)])
             for name, values in figures.items()
         }
-        arguments["unit_type_names"] = [*defaults.unit_type_names, *list(UNIT_TYPES)[6 : scenario.unit_types]]
+        arguments["unit_type_names"] = [*defaults.unit_type_names, *list(UNIT_TYPES)[6 : scenario.n_unit_types]]
         arguments["unit_type_shorthands"] = [*defaults.unit_type_shorthands, "c"]
     kinds = jnp.asarray(scenario.unit_type, jnp.uint8)
-    their = Theirs(kinds, scenario.allies, scenario.enemies, False, False)
-    return HeuristicEnemySMAX(scenario=their, attack_mode="closest", max_steps=scenario.limit - 1, **arguments)
+    their = Theirs(kinds, scenario.n_allies, scenario.n_enemies, False, False)
+    return HeuristicEnemySMAX(scenario=their, attack_mode="closest", max_steps=scenario.max_steps - 1, **arguments)
 
 
 @dataclass
@@ -126,15 +126,15 @@ class Match:
         self.env = self.whole._env
         self.policy = create_heuristic_policy(self.env, 0, attack_mode="closest")
         self.choose, self.their_step, self.our_step = map(jax.jit, (self._choose, self._their_step, self._our_step))
-        self.drawn = jax.jit(partial(drawn, units=self.scenario.units))
+        self.drawn = jax.jit(partial(drawn, units=self.scenario.n_units))
 
     def rows(self, of: dict, side: str) -> jax.Array:
-        count = self.scenario.allies if side == "ally" else self.scenario.enemies
+        count = self.scenario.n_allies if side == "ally" else self.scenario.n_enemies
         return jnp.stack([of[f"{side}_{i}"] for i in range(count)])
 
     def _choose(self, key, state, memories, style):
         """The actions of both sides; the enemy always follows JaxMARL's heuristic."""
-        allies = self.scenario.allies
+        allies = self.scenario.n_allies
         seen = self.env.get_obs(state)
         keys = jax.random.split(key, 4)
         ours, first = jax.vmap(self.policy)(jax.random.split(keys[0], allies), memories[0], self.rows(seen, "ally"))
@@ -149,7 +149,7 @@ class Match:
 
     def _retreat(self, state):
         """The directions away from the enemies, mostly from near ones, and from the border."""
-        allies, position = self.scenario.allies, state.unit_positions
+        allies, position = self.scenario.n_allies, state.unit_positions
         offset = position[:allies, None] - position[allies:]
         nearness = state.unit_alive[allies:, None] / (jnp.sum(offset**2, axis=-1, keepdims=True) + 1)
         inwards = (battle.FIELD / 2 - position[:allies]) / battle.FIELD
@@ -158,19 +158,26 @@ class Match:
     def _their_step(self, key, state, action):
         seen, state, paid, over, _ = self.env.step_env(key, state, dict(zip(self.env.agents, action, strict=True)))
         legal = self.rows(self.env.get_avail_actions(state), "ally")
-        return state, self.rows(seen, "ally"), seen["world_state"], MOST / 2 * paid["ally_0"], over["__all__"], legal
+        return (
+            state,
+            self.rows(seen, "ally"),
+            seen["world_state"],
+            WIN_RETURN / 2 * paid["ally_0"],
+            over["__all__"],
+            legal,
+        )
 
     def _our_step(self, key, state, memory, action, longer):
         scenario = self.scenario
-        choice, memory = enemy.act(scenario, state, memory, key)
-        sight = jnp.asarray(scenario.each("sight"))[:, None]
+        choice, memory = enemy.choose_actions(scenario, state, memory, key)
+        sight = jnp.asarray(scenario.unit_stats("sight"))[:, None]
         near = (battle.distances(state.position) < sight) & battle.alive(state)
-        sees = jnp.sum(near[scenario.allies :, : scenario.allies], axis=1)
+        sees = jnp.sum(near[scenario.n_allies :, : scenario.n_allies], axis=1)
         after = battle.advance(scenario, state, action, longer)
         ours, theirs = battle.defeated(scenario, after)
-        over = ours | theirs | (after.step >= scenario.limit)
-        seen, field = observation.observe(scenario, after), observation.field(scenario, after)
-        shown = seen, field, reward(scenario, state, after), over, battle.legal(scenario, after)
+        over = ours | theirs | (after.step >= scenario.max_steps)
+        seen, field = observation.observe(scenario, after), observation.global_state(scenario, after)
+        shown = seen, field, reward(scenario, state, after), over, battle.available_actions(scenario, after)
         return after, memory, choice, sees, shown
 
     def begin(self, key: jax.Array, worst: Worst):
@@ -178,25 +185,27 @@ class Match:
         scenario = self.scenario
         _, state = self.env.reset(key)
         _, *keys = jax.random.split(key, 3)
-        sides = zip(keys, (scenario.allies, scenario.enemies), strict=True)
+        sides = zip(keys, (scenario.n_allies, scenario.n_enemies), strict=True)
         noise = [jax.random.uniform(one, (count, 2), minval=-2, maxval=2) for one, count in sides]
-        middle = np.repeat(np.array([battle.OURS, battle.THEIRS]), [scenario.allies, scenario.enemies], axis=0)
-        placed = battle.push(scenario, jnp.concatenate(noise) + middle, jnp.ones(scenario.units, bool))
+        middle = np.repeat(
+            np.array([battle.ALLY_START, battle.ENEMY_START]), [scenario.n_allies, scenario.n_enemies], axis=0
+        )
+        placed = battle.separate_units(scenario, jnp.concatenate(noise) + middle, jnp.ones(scenario.n_units, bool))
         worst.close("position at the start", placed, state.unit_positions)
-        mine = battle.start(scenario, key)._replace(position=state.unit_positions)
+        mine = battle.start_battle(scenario, key)._replace(position=state.unit_positions)
         worst.same("health", mine.health, state.unit_health)
         return state, mine
 
     def play(self, seed: int, style: Style, worst: Worst, alone: Worst) -> tuple[str, dict[str, np.ndarray]]:
         """Play one battle to its end; returns how it ended, and all of JaxMARL's data."""
-        scenario, allies = self.scenario, self.scenario.allies
+        scenario, allies = self.scenario, self.scenario.n_allies
         start, key = jax.random.split(jax.random.key(seed))
         state, mine = self.begin(start, worst)
-        memory = enemy.remember(scenario, mine)
+        memory = enemy.init_memory(scenario, mine)
         one = jax.tree.map(lambda leaf: leaf[0], self.whole.get_enemy_policy_initial_state(start))
         memories = tuple(
             jax.tree.map(lambda leaf, count=count: jnp.stack([leaf] * count), one)
-            for count in (allies, scenario.enemies)
+            for count in (allies, scenario.n_enemies)
         )
         kept: dict[str, list] = defaultdict(list)
         free, over = mine, False
@@ -245,7 +254,7 @@ def used(scenario: Scenario, longer: jax.Array, cooldown: jax.Array) -> np.ndarr
     step.
     """
     left = battle.TICK * (battle.TICKS - 1 - np.arange(battle.TICKS))[:, None]
-    off = np.abs(scenario.each("cooldown") + np.asarray(longer) - left - np.asarray(cooldown))
+    off = np.abs(scenario.unit_stats("cooldown") + np.asarray(longer) - left - np.asarray(cooldown))
     chosen = np.take_along_axis(np.asarray(longer), off.argmin(0)[None], axis=0)[0]
     return np.where(off.min(0) < 1e-5, chosen, 0).astype(np.float32)
 
@@ -261,7 +270,7 @@ def pinned(kept: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {"step": some, "few": few} | {name.replace(" ", "_"): row for name, row in rows.items()}
 
 
-def main(battles: int = 12, tasks: tuple[str, ...] = NAMES, pin: Path | None = None) -> None:
+def main(battles: int = 12, tasks: tuple[str, ...] = SCENARIO_NAMES, pin: Path | None = None) -> None:
     """Play and compare.
 
     Args:

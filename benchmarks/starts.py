@@ -22,28 +22,30 @@ from jaxtyping import Array
 from basis import SPEED, scores
 from lare_rl.credit import evidence
 from lare_rl.credit.basis import Basis, expand
-from lare_rl.credit.closed_form import ROUNDS
-from lare_rl.credit.evidence import Posterior, Sums
-from lare_rl.credit.factor_fit import r2_and_error
+from lare_rl.credit.closed_form import MAX_ROUNDS
+from lare_rl.credit.evidence import Posterior, SufficientStatistics
+from lare_rl.credit.score_type import ScoreType
+from lare_rl.util.statistics import r_squared
 from measure import write
-from stored import of_each_seed
+from stored import stored_episodes
 
 RANGES = ((10, 20), (20, 40), (40, 60))
 EPISODES = 60
 """Later ones, if the run has them, are left out."""
 
 
-def from_fewer(count: int, sums: Sums, basis: Basis, start: Posterior) -> Posterior:
+def from_fewer(count: int, sums: SufficientStatistics, basis: Basis, start: Posterior) -> Posterior:
     """A fit from the first one or two of the three starts."""
-    given = evidence.problem(sums, 0, basis.group)
-    alpha, beta = evidence.starts(given, start)
-    first = alpha[:count], beta[:count]
-    of_each = jax.lax.map(lambda one: evidence.fixed_point(given, one[0], one[1], ROUNDS), first)
-    return evidence.in_return_units(sums, 0, given, evidence.most_likely(of_each), otherwise=start)
+    problem = evidence.regression(sums, ScoreType.SUM, basis.group_index)
+    alpha, beta = evidence.starting_precisions(problem, start)
+    candidates = jax.lax.map(
+        lambda args: evidence.fixed_point(problem, args[0], args[1], MAX_ROUNDS), (alpha[:count], beta[:count])
+    )
+    return evidence.to_return_units(sums, problem, evidence.most_likely(candidates), fallback=start)
 
 
-def from_three(sums: Sums, basis: Basis, start: Posterior) -> Posterior:
-    return evidence.fit(sums, 0, basis.group, start, ROUNDS)
+def from_three(sums: SufficientStatistics, basis: Basis, start: Posterior) -> Posterior:
+    return evidence.fit(sums, ScoreType.SUM, basis.group_index, start, MAX_ROUNDS)
 
 
 WAYS = {"one start": partial(from_fewer, 1), "two starts": partial(from_fewer, 2), "three starts": from_three}
@@ -51,27 +53,30 @@ WAYS = {"one start": partial(from_fewer, 1), "two starts": partial(from_fewer, 2
 
 @partial(jax.jit, static_argnames=("way", "basis"))
 def learn(
-    sums: Sums, known: Posterior, mean: Array, total: Array, length: Array, way: str, basis: Basis
-) -> tuple[Sums, Posterior]:
+    sums: SufficientStatistics, posterior: Posterior, mean: Array, total: Array, length: Array, way: str, basis: Basis
+) -> tuple[SufficientStatistics, Posterior]:
     sums = evidence.add_episodes(sums, mean[None], total[None], length[None])
-    return sums, WAYS[way](sums, basis, known)
+    return sums, WAYS[way](sums, basis, posterior)
 
 
 def predicted(means: np.ndarray, returns: np.ndarray, length: np.ndarray, way: str, basis: Basis) -> list[Any]:
     """Of each episode: its prediction, and the log evidence of the fit that follows it."""
-    state = evidence.no_sums(basis.size), evidence.unknown(basis.size, len(basis.sizes))
-    sums, known = jax.tree.map(lambda leaf: leaf.astype(float), state)
-    found = []
+    state = (
+        evidence.empty_statistics(basis.n_features),
+        evidence.init_posterior(basis.n_features, len(basis.group_sizes)),
+    )
+    sums, posterior = jax.tree.map(lambda leaf: leaf.astype(float), state)
+    predictions = []
     for mean, total, steps in zip(means, returns, length, strict=True):
-        guess = float(steps * (mean @ known.weight + known.bias))
-        sums, known = learn(sums, known, jnp.asarray(mean), jnp.asarray(total), jnp.asarray(steps), way, basis)
-        found.append((guess, float(known.log_evidence)))
-    return found
+        guess = float(steps * (mean @ posterior.weight + posterior.bias))
+        sums, posterior = learn(sums, posterior, jnp.asarray(mean), jnp.asarray(total), jnp.asarray(steps), way, basis)
+        predictions.append((guess, float(posterior.log_evidence)))
+    return predictions
 
 
 def episodes(directory: str) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray], np.ndarray, Basis]]:
     """For each seed: mean features of the episodes, the returns of each score, the lengths, and the basis."""
-    for after, action, z, paid, ends in of_each_seed(directory):
+    for after, action, z, true_reward, ends in stored_episodes(directory):
         inputs = np.concatenate([z, after, action], axis=1)[: ends[-1]]
         basis = Basis(z.shape[1], inputs.shape[1] - z.shape[1], True)
         # The first ten episodes are random, and standardise all of them here; in training the statistics follow the policy.
@@ -80,8 +85,13 @@ def episodes(directory: str) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]
         begins, length = np.append(0, ends[:-1]), np.diff(np.append(0, ends))
         means = np.add.reduceat(features, begins) / length[:, None]
         last = ends[-1]
-        truths = scores(after[:last], action[:last], paid[:last], SPEED["HalfCheetah-v4"])
-        yield means, {name: np.add.reduceat(one, begins) for name, one in truths.items()}, length, basis
+        truths = scores(after[:last], action[:last], true_reward[:last], SPEED["HalfCheetah-v4"])
+        yield (
+            means,
+            {name: np.add.reduceat(score_values, begins) for name, score_values in truths.items()},
+            length,
+            basis,
+        )
 
 
 def main(directory: str) -> None:
@@ -94,19 +104,19 @@ def main(directory: str) -> None:
         for means, totals, length, basis in seeds:
             for score, returns in totals.items():
                 returns = returns[:EPISODES]
-                of_way = {way: np.array(predicted(means, returns, length, way, basis)) for way in WAYS}
+                predictions_by_way = {way: np.array(predicted(means, returns, length, way, basis)) for way in WAYS}
                 fewer = list(WAYS)[:2]
                 row = table.setdefault(score, {way: [] for way in WAYS} | {"caught": dict.fromkeys(fewer, 0)})
-                for way, found in of_way.items():
-                    row[way].append([r2_and_error(returns[a:b], found[a:b, 0])[0] for a, b in RANGES])
-                evidences = {way: found[10:, 1] for way, found in of_way.items()}
+                for way, predictions in predictions_by_way.items():
+                    row[way].append([r_squared(returns[a:b], predictions[a:b, 0])[0] for a, b in RANGES])
+                evidences = {way: predictions[10:, 1] for way, predictions in predictions_by_way.items()}
                 for way in fewer:
                     row["caught"][way] += int(np.sum(evidences["three starts"] - evidences[way] > 1))
                 fits += len(evidences["three starts"])
     print(f"R^2 of returns {', '.join(f'{a + 1} to {b}' for a, b in RANGES)}, mean over seeds")
     for score, row in table.items():
-        shown = "; ".join(f"{way}: {np.round(np.mean(row[way], axis=0), 3).tolist()}" for way in WAYS)
-        print(f"{score:28} {shown}; caught in {row['caught']} fits")
+        text = "; ".join(f"{way}: {np.round(np.mean(row[way], axis=0), 3).tolist()}" for way in WAYS)
+        print(f"{score:28} {text}; caught in {row['caught']} fits")
     write("starts", {"ranges": RANGES, "fits": fits, "scores": table})
 
 

@@ -16,14 +16,14 @@ import jax
 import tyro
 
 import lare_rl
-from lare_rl.algorithms.table import ALGORITHMS, Consumes
+from lare_rl.algorithms.registry import ALGORITHMS, Consumes
 from lare_rl.credit.methods import METHODS
 from lare_rl.training.session import Session
 from measure import advance, interleave, new_session, show, summary, write
 
 TASK, SEED, BEFORE, ROLLOUT = "HalfCheetah-v4", 0, 2000, 2000
-ONE_AGENT = [row.name for row in ALGORITHMS.values() if row.one_agent and row.continuous]
-FITTING = [row.name for row in METHODS.values() if not row.for_many_only]
+ONE_AGENT = [row.name for row in ALGORITHMS.values() if row.single_agent and row.continuous]
+FITTING = [row.name for row in METHODS.values() if not row.multi_agent_only]
 
 
 def session(directory: Path, algorithm: str, method: str) -> Session:
@@ -49,13 +49,13 @@ def main(rounds: int = 3, steps: int = 500, algorithms: tuple[str, ...] = tuple(
     """
     tables = {}
     for algorithm in algorithms:
-        of_turn = ROLLOUT if ALGORITHMS[algorithm].consumes is Consumes.ROLLOUTS else steps
-        with tempfile.TemporaryDirectory() as place:
-            sessions = {method: session(Path(place), algorithm, method) for method in FITTING}
-            turns = {method: partial(advance, one, of_turn) for method, one in sessions.items()}
-            tables[algorithm] = summary(interleave(turns, rounds), of_turn, "dense")
-            for one in sessions.values():
-                one.close()
+        steps_per_turn = ROLLOUT if ALGORITHMS[algorithm].consumes is Consumes.ROLLOUTS else steps
+        with tempfile.TemporaryDirectory() as folder:
+            sessions = {method: session(Path(folder), algorithm, method) for method in FITTING}
+            turns = {method: partial(advance, item, steps_per_turn) for method, item in sessions.items()}
+            tables[algorithm] = summary(interleave(turns, rounds), steps_per_turn, "dense")
+            for item in sessions.values():
+                item.close()
         show(algorithm, tables[algorithm], "dense")
     figures = {
         "task": TASK,

@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 
 from lare_rl.data import replay
 from lare_rl.runs.directory import open_run
-from lare_rl.training.seed_axis import of_seed
-from lare_rl.training.session import load_learner
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
 
 
 class Stored(NamedTuple):
@@ -24,15 +24,18 @@ class Stored(NamedTuple):
     """The number of steps up to the end of each episode."""
 
 
-def of_each_seed(directory: str) -> Iterator[Stored]:
+def stored_episodes(directory: str) -> Iterator[Stored]:
     """The stored steps of each seed of a run whose method has a `phi`."""
     run = open_run(directory)
     learner = load_learner(run)[1]
-    for place in range(len(run.seeds)):
-        held = of_seed(learner, place).replay
-        steps = replay.read(held, replay.newest(held, int(held.transitions[0])))
+    for seed_index in range(len(run.seeds)):
+        stored_replay = select_seed(learner, seed_index).replay
+        steps = replay.read(stored_replay, replay.newest_steps(stored_replay, int(stored_replay.transitions[0])))
         after, action, factors, reward = (
-            np.asarray(part)[0, :, 0]
-            for part in (steps.after["observation"], *(steps.before[name] for name in ("action", "factors", "reward")))
+            np.asarray(array)[0, :, 0]
+            for array in (
+                steps.next_columns["observation"],
+                *(steps.columns[name] for name in ("action", "factors", "reward")),
+            )
         )
         yield Stored(after, np.clip(action, -1, 1), factors, reward, np.flatnonzero(np.asarray(steps.last)[0]) + 1)

@@ -59,17 +59,17 @@ def main() -> None:
     parser.add_argument("--at", type=int)
     parser.add_argument("--key")
     parser.add_argument("directories", type=Path, nargs="+")
-    given = parser.parse_args()
+    args = parser.parse_args()
     print(
         "| task | method | steps | return at the end | over the last quarter | correlation | mean error | R² of returns |"
     )
     print("|---|---|---|---|---|---|---|---|")
-    for directory in given.directories:
+    for directory in args.directories:
         runs = sorted(metrics.parent for metrics in directory.rglob("metrics.jsonl"))
         if not runs:
             parser.error(f"there is no run in {directory}")
         for run in runs:
-            print(row(run, given.at, given.key))
+            print(row(run, args.at, args.key))
 
 
 if __name__ == "__main__":

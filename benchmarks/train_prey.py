@@ -28,16 +28,16 @@ from lare_rl.envs.particles.predator_prey import (
     Size,
     chase,
     flee,
+    make_world,
     observe_preys,
     reset,
     reward_predators,
     reward_preys,
-    world,
 )
 from lare_rl.envs.particles.prey import Layers, shipped_prey
-from lare_rl.envs.particles.task import ACTIONS, STEPS
+from lare_rl.envs.particles.task import MAX_STEPS, N_ACTIONS
 from lare_rl.envs.particles.world import State, move, push
-from lare_rl.nn.networks import MLP, descend, start_adam
+from lare_rl.nn.networks import MLP, adam_step, init_adam
 from measure import write
 
 TARGET = 29.5
@@ -80,7 +80,7 @@ def out_of_bounds(position: Float[Array, "*lead 2"]) -> Float[Array, "*lead"]:
 def act_all(size: Size, state: State, preys: Int[Array, " preys"]) -> State:
     """A step in which the predators are greedy."""
     action = jnp.concatenate([chase(size, state), preys])
-    return move(world(size), state, push(world(size), action))
+    return move(make_world(size), state, push(make_world(size), action))
 
 
 def advantages(
@@ -105,13 +105,13 @@ def episode(size: Size, networks: Networks, key: PRNGKeyArray) -> tuple[Samples,
         log = jax.nn.log_softmax(networks.actor(observation))
         action = jax.random.categorical(key, log)
         state = act_all(size, state, action)
-        reward = reward_preys(size, state) - out_of_bounds(state.position[size.hunted.start : size.hunted.stop])
+        reward = reward_preys(size, state) - out_of_bounds(state.position[size.preys.start : size.preys.stop])
         chosen = jnp.take_along_axis(log, action[:, None], axis=1)[:, 0]
         return state, (observation, action, chosen, REWARD_SCALE * reward, jnp.sum(reward_predators(size, state)))
 
     start_key, key = jax.random.split(key)
     state, (observation, action, log, reward, earned) = jax.lax.scan(
-        step, reset(size, start_key), jax.random.split(key, STEPS)
+        step, reset(size, start_key), jax.random.split(key, MAX_STEPS)
     )
     value = networks.critic(observation)[..., 0]
     advantage = advantages(reward, value, networks.critic(observe_preys(size, state))[..., 0])
@@ -120,12 +120,12 @@ def episode(size: Size, networks: Networks, key: PRNGKeyArray) -> tuple[Samples,
 
 def loss(networks: Networks, batch: Samples) -> Float[Array, ""]:
     """PPO's clipped objective, with entropy bonus and squared value error (Schulman et al., 2017)."""
-    every = jax.nn.log_softmax(networks.actor(batch.observation))
-    log = jnp.take_along_axis(every, batch.action[:, None], axis=1)[:, 0]
+    log_probabilities = jax.nn.log_softmax(networks.actor(batch.observation))
+    log = jnp.take_along_axis(log_probabilities, batch.action[:, None], axis=1)[:, 0]
     ratio = jnp.exp(log - batch.log_probability)
     advantage = (batch.advantage - jnp.mean(batch.advantage)) / (jnp.std(batch.advantage) + 1e-8)
     gain = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - CLIP, 1 + CLIP) * advantage)
-    entropy = -jnp.sum(jnp.exp(every) * every, axis=1)
+    entropy = -jnp.sum(jnp.exp(log_probabilities) * log_probabilities, axis=1)
     error = (networks.critic(batch.observation)[:, 0] - batch.value_target) ** 2
     return jnp.mean(-gain - ENTROPY * entropy + 0.5 * error)
 
@@ -144,7 +144,7 @@ def iterate(
     def learn(carry: tuple[Networks, optax.OptState], rows: Int[Array, " batch"]):
         networks, optimizer = carry
         gradient = jax.grad(loss)(networks, jax.tree.map(lambda leaf: leaf[rows], samples))
-        return descend(networks, gradient, optimizer, RATE), None
+        return adam_step(networks, gradient, optimizer, RATE), None
 
     (networks, optimizer), _ = jax.lax.scan(learn, (networks, optimizer), orders.reshape(PASSES * MINIBATCHES, -1))
     return networks, optimizer, jnp.mean(earned)
@@ -158,10 +158,10 @@ def train(seed: int = 0, longest: int = 400) -> None:
         longest: the most iterations.
     """
     key = jax.random.key(seed)
-    sees = SIZES["PP-6"].prey_sees.observation_size
+    sees = SIZES["PP-6"].prey_view.observation_size
     actor_key, critic_key, key = jax.random.split(key, 3)
-    networks = Networks(MLP(sees, (64, 64), ACTIONS, key=actor_key), MLP(sees, (64, 64), 1, key=critic_key))
-    optimizer = start_adam(networks, RATE)
+    networks = Networks(MLP(sees, (64, 64), N_ACTIONS, key=actor_key), MLP(sees, (64, 64), 1, key=critic_key))
+    optimizer = init_adam(networks, RATE)
     course: list[float] = []
     while len(course) < longest:
         key, now = jax.random.split(key)
@@ -187,7 +187,7 @@ def shipped(size: Size, state: State, key: PRNGKeyArray) -> Int[Array, " preys"]
 
 
 def at_random(size: Size, state: State, key: PRNGKeyArray) -> Int[Array, " preys"]:
-    return jax.random.randint(key, (size.preys,), 0, ACTIONS)
+    return jax.random.randint(key, (size.n_preys,), 0, N_ACTIONS)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 3))
@@ -200,7 +200,7 @@ def earnings(size: Size, policy: Policy, key: PRNGKeyArray, episodes: int) -> Fl
 
     def run(key: PRNGKeyArray) -> Float[Array, ""]:
         start_key, key = jax.random.split(key)
-        return jnp.sum(jax.lax.scan(step, reset(size, start_key), jax.random.split(key, STEPS))[1])
+        return jnp.sum(jax.lax.scan(step, reset(size, start_key), jax.random.split(key, MAX_STEPS))[1])
 
     return jax.vmap(run)(jax.random.split(key, episodes))
 

@@ -25,7 +25,7 @@ from jax import Array
 from stable_baselines3.common.noise import NormalActionNoise
 
 import lare_rl
-from lare_rl.algorithms.settings import TD3Settings
+from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.training.session import Session
 from measure import TD3, advance, interleave, new_session, ratio, show, summary, write
 
@@ -35,7 +35,7 @@ WARMUP = 2000
 ROLLOUTS = (1, 10, 50, 200, 1000)
 
 
-def ours(directory: Path, method: str, warmup: int = WARMUP, rollout: int = 50) -> Session:
+def open_session(directory: Path, method: str, warmup: int = WARMUP, rollout: int = 50) -> Session:
     settings = lare_rl.Settings(
         method=method, seed=SEED, rollout_steps=rollout, evaluation_episodes=1, td3=TD3Settings(warmup=warmup)
     )
@@ -44,7 +44,7 @@ def ours(directory: Path, method: str, warmup: int = WARMUP, rollout: int = 50) 
     return session
 
 
-def theirs(algorithm: Callable[..., Any], warmup: int) -> Any:
+def make_model(algorithm: Callable[..., Any], warmup: int) -> Any:
     model = algorithm(
         "MlpPolicy",
         TASK,
@@ -66,24 +66,24 @@ Weights = list[Array]
 
 def forward(weights: Weights, x: Array) -> tuple[list[Array], Array]:
     """One product for each layer; returns each layer's input, and the output."""
-    given = []
+    inputs = []
     for weight in weights:
-        given.append(x)
+        inputs.append(x)
         x = x @ weight
-    return given, x
+    return inputs, x
 
 
 def backward(
-    weights: Weights, given: list[Array], gradient: Array, *, to_weights: bool = True, to_input: bool = False
+    weights: Weights, inputs: list[Array], gradient: Array, *, to_weights: bool = True, to_input: bool = False
 ) -> Weights:
     """Two products for each layer; the one to the first layer's input only if `to_input`."""
-    found = []
+    gradients = []
     for layer in reversed(range(len(weights))):
         if to_weights:
-            found.append(given[layer].T @ gradient)
+            gradients.append(inputs[layer].T @ gradient)
         if layer or to_input:
             gradient = gradient @ weights[layer].T
-    return [*found, gradient] if to_input else found
+    return [*gradients, gradient] if to_input else gradients
 
 
 def matrix_products(factors: int, observation: int, action: int, updates: int = 50) -> Callable[[], object]:
@@ -124,31 +124,31 @@ def matrix_products(factors: int, observation: int, action: int, updates: int = 
     }
 
     def actor_update(networks: dict[str, Any], turn: dict[str, Array]) -> list[Array]:
-        given, taken = forward(networks["actor"], turn["observation"])
+        inputs, action = forward(networks["actor"], turn["observation"])
         critic = networks["critics"][0]
         through, value = forward(critic, turn["policy pair"])
         (to_pair,) = backward(critic, through, value, to_weights=False, to_input=True)
-        return [taken, *backward(networks["actor"], given, to_pair[:, observation:])]
+        return [action, *backward(networks["actor"], inputs, to_pair[:, observation:])]
 
-    def one(networks: dict[str, Any], before: Any, turn: dict[str, Array]) -> Any:
-        given, r_hat = forward(networks["decoder"], turn["drawn"])
-        found = backward(networks["decoder"], given, r_hat)
-        found.append(forward(networks["decoder"], turn["batch"])[1])
-        found.append(forward(networks["target actor"], turn["next"])[1])
-        found += [forward(critic, turn["next pair"])[1] for critic in networks["target critics"]]
+    def update(networks: dict[str, Any], before: Any, turn: dict[str, Array]) -> Any:
+        inputs, r_hat = forward(networks["decoder"], turn["drawn"])
+        gradients = backward(networks["decoder"], inputs, r_hat)
+        gradients.append(forward(networks["decoder"], turn["batch"])[1])
+        gradients.append(forward(networks["target actor"], turn["next"])[1])
+        gradients += [forward(critic, turn["next pair"])[1] for critic in networks["target critics"]]
         for critic in networks["critics"]:
-            given, value = forward(critic, turn["pair"])
-            found += backward(critic, given, value)
+            inputs, value = forward(critic, turn["pair"])
+            gradients += backward(critic, inputs, value)
         delayed = jax.lax.cond(turn["number"] % 2 == 1, lambda: actor_update(networks, turn), lambda: before["delayed"])
-        return {"found": found, "delayed": delayed}
+        return {"found": gradients, "delayed": delayed}
 
     @jax.jit
     def loop(networks: dict[str, Any], inputs: dict[str, Array]) -> Any:
         first = jax.tree.map(lambda x: x[0], inputs)
         delayed = jax.tree.map(jnp.zeros_like, jax.eval_shape(actor_update, networks, first))
-        shapes = jax.eval_shape(one, networks, {"delayed": delayed}, first)
+        shapes = jax.eval_shape(update, networks, {"delayed": delayed}, first)
         start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        return jax.lax.scan(lambda before, turn: (one(networks, before, turn), None), start, inputs)[0]
+        return jax.lax.scan(lambda before, turn: (update(networks, before, turn), None), start, inputs)[0]
 
     return lambda: jax.block_until_ready(loop(networks, inputs))
 
@@ -160,14 +160,14 @@ def repeat(work: Callable[[], object], times: int) -> None:
 
 def side_by_side(directory: Path, steps: int, warmup: int) -> Iterator[tuple[str, Callable[[], object]]]:
     for method in ("lare-bayes", "lare-rrdu", "rrdu", "dense"):
-        session = ours(directory, method, warmup)
+        session = open_session(directory, method, warmup)
         yield method, partial(advance, session, steps)
         if method == "lare-rrdu":
-            env, (factors,) = session.config.env, session.config.factors
+            env, (factors,) = session.config.env, session.config.n_factors
             products = matrix_products(factors, env.observation_size, env.action_size)
             yield "matrix products", partial(repeat, products, steps // 50)
-    yield "Stable-Baselines3 TD3", partial(go_on, theirs(stable_baselines3.TD3, warmup), steps)
-    yield "SBX TD3", partial(go_on, theirs(sbx.TD3, warmup), steps)
+    yield "Stable-Baselines3 TD3", partial(go_on, make_model(stable_baselines3.TD3, warmup), steps)
+    yield "SBX TD3", partial(go_on, make_model(sbx.TD3, warmup), steps)
 
 
 def main(rounds: int = 7, steps: int = 1000, warmup: int = WARMUP) -> None:
@@ -185,22 +185,26 @@ def main(rounds: int = 7, steps: int = 1000, warmup: int = WARMUP) -> None:
         "steps in a round": steps,
         "random steps before": warmup,
     }
-    with tempfile.TemporaryDirectory() as place:
-        seconds = interleave(dict(side_by_side(Path(place), steps, warmup)), rounds)
+    with tempfile.TemporaryDirectory() as folder:
+        seconds = interleave(dict(side_by_side(Path(folder), steps, warmup)), rounds)
         table = summary(seconds, steps, "SBX TD3")
         show("training step", table, "SBX TD3")
         if warmup != WARMUP:
             write(f"training_step_after_{warmup}", {**figures, "training step": table})
             return
-        wanted = [rollout for rollout in ROLLOUTS if rollout <= steps]
-        sessions = {rollout: ours(Path(place) / "rollouts", "lare-rrdu", rollout=rollout) for rollout in wanted}
-        taken = interleave({str(rollout): partial(advance, one, steps) for rollout, one in sessions.items()}, rounds)
-    by_rollout = summary(taken, steps, "50")
+        rollouts = [rollout for rollout in ROLLOUTS if rollout <= steps]
+        sessions = {
+            rollout: open_session(Path(folder) / "rollouts", "lare-rrdu", rollout=rollout) for rollout in rollouts
+        }
+        rollout_seconds = interleave(
+            {str(rollout): partial(advance, session, steps) for rollout, session in sessions.items()}, rounds
+        )
+    by_rollout = summary(rollout_seconds, steps, "50")
     share = ratio(seconds["matrix products"], seconds["lare-rrdu"])
     print(f"the matrix products alone: {share:.1%} of lare-rrdu")
     show("lare-rrdu, by rollout_steps", by_rollout, "50 steps")
-    share_of = {"matrix products, share of lare-rrdu": share}
-    write("training_step", {**figures, "training step": table, **share_of, "by rollout_steps": by_rollout})
+    share_row = {"matrix products, share of lare-rrdu": share}
+    write("training_step", {**figures, "training step": table, **share_row, "by rollout_steps": by_rollout})
 
 
 if __name__ == "__main__":

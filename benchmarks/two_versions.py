@@ -88,8 +88,8 @@ def measured(before: Path, after: Path, case: str, rounds: int, core: int) -> di
     assert all(version.answer() == "ready" for version in versions)
     turns: list[list[float]] = [[], []]
     for number in range(rounds):
-        for place in (0, 1) if number % 2 else (1, 0):  # they alternate in being first
-            turns[place].append(versions[place].turn())
+        for version_index in (0, 1) if number % 2 else (1, 0):  # they alternate in being first
+            turns[version_index].append(versions[version_index].turn())
     for version in versions:
         version.close()
     ratios = sorted(new / old for old, new in zip(*turns, strict=True))
@@ -120,13 +120,13 @@ def main(
         core: the core on which both run.
         out: the name of the file in benchmarks/results.
     """
-    found = {}
+    results = {}
     for case in cases:
-        found[case] = measured(before, after, case, rounds, core)
-        print(f"{case}: {json.dumps({name: round(found[case][name], 3) for name in ('ratio', 'least', 'most')})}")
+        results[case] = measured(before, after, case, rounds, core)
+        print(f"{case}: {json.dumps({name: round(results[case][name], 3) for name in ('ratio', 'least', 'most')})}")
     write(
         out,
-        {"before": commit(before), "after": commit(after), "rounds": rounds, "processor seconds of a turn": found},
+        {"before": commit(before), "after": commit(after), "rounds": rounds, "processor seconds of a turn": results},
     )
 
 

@@ -12,14 +12,14 @@ import numpy as np
 import tyro
 
 from burning import Burns
-from lare_rl.envs.workers import Envs, LocalEnvs, WorkerEnvs
+from lare_rl.envs.workers import LocalVecEnv, SubprocVecEnv, VecEnv
 from measure import interleave, show, summary, write
 
 REFERENCE = "one process"
 
 
-def turn(envs: Envs, steps: int) -> None:
-    action = np.zeros((len(envs.batch.alive), envs.spec.agents, envs.spec.action_size), np.float32)
+def turn(envs: VecEnv, steps: int) -> None:
+    action = np.zeros((len(envs.batch.alive), envs.spec.n_agents, envs.spec.action_size), np.float32)
     for _ in range(steps):
         envs.step(action)
 
@@ -34,16 +34,18 @@ def main(lanes: int = 4, processes: int = 2, burn_ms: float = 20, steps: int = 2
         steps: steps of every lane in a turn.
         rounds: number of turns of each contender.
     """
-    found = {}
+    tables = {}
     for title, seconds, many in ((f"{burn_ms:g} ms a step", burn_ms / 1000, steps), ("0 ms a step", 0.0, 40 * steps)):
         makers = [partial(Burns, seconds)] * lanes
-        with LocalEnvs(makers) as near, WorkerEnvs(makers, processes) as far:
+        with LocalVecEnv(makers) as near, SubprocVecEnv(makers, processes) as far:
             contenders = {REFERENCE: near, f"{processes} workers": far}
-            taken = interleave({name: partial(turn, envs, many) for name, envs in contenders.items()}, rounds)
-        found[title] = summary(taken, many, REFERENCE)
-        show(f"{lanes} lanes, {title}", found[title], REFERENCE)
-        print(f"{1 / found[title][f'{processes} workers']['ratio']:.2f} times as fast")
-    write("workers", {"lanes": lanes, "processes": processes, "steps": steps, "rounds": rounds, "a step of all": found})
+            turn_seconds = interleave({name: partial(turn, envs, many) for name, envs in contenders.items()}, rounds)
+        tables[title] = summary(turn_seconds, many, REFERENCE)
+        show(f"{lanes} lanes, {title}", tables[title], REFERENCE)
+        print(f"{1 / tables[title][f'{processes} workers']['ratio']:.2f} times as fast")
+    write(
+        "workers", {"lanes": lanes, "processes": processes, "steps": steps, "rounds": rounds, "a step of all": tables}
+    )
 
 
 if __name__ == "__main__":

@@ -19,13 +19,13 @@ LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages that are made."""
-    import lare
-    from lare.cli import COMMANDS
+    import lare_rl
+    from lare_rl.cli import COMMANDS
 
     made = {
         "index.md": moved_into_docs((ROOT / "README.md").read_text(encoding="utf-8")),
         "changelog.md": moved_into_docs((ROOT / "CHANGELOG.md").read_text(encoding="utf-8")),
-        "reference/python.md": python_reference(lare.HOMES),
+        "reference/python.md": python_reference(lare_rl.SOURCES),
         "reference/command-line.md": command_line_reference(COMMANDS),
     }
     for name, text in made.items():
@@ -68,21 +68,20 @@ def moved_into_docs(text: str) -> str:
     return LINK.sub(moved, text)
 
 
-def python_reference(homes: dict[str, str]) -> str:
+def python_reference(sources: dict[str, tuple[str, str]]) -> str:
     """Every public name, by its docstring; of a class, its settings, and the members that the page of the API speaks of."""
-    import lare
+    import lare_rl
 
     spoken_of = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     lines = ["# Every function", ""]
-    for name, home in sorted(homes.items(), key=lambda one: one[0].lower()):
-        module, _, attribute = home.partition(":")
-        public = getattr(lare, name)
+    for name, (module, source_name) in sorted(sources.items(), key=lambda item: item[0].lower()):
+        public = getattr(lare_rl, name)
         members = [one for one in vars(public) if re.search(rf"[`.]{re.escape(one)}\b", spoken_of)]
         shown = [*getattr(public, "model_fields", ()), *(one for one in members if not one.startswith("_"))]
         lines += [
-            f"::: {module}.{attribute or name}",
+            f"::: {module}.{source_name}",
             "    options:",
-            f"      heading: lare.{name}",
+            f"      heading: lare_rl.{name}",
             f"      toc_label: {name}",
         ]
         lines += [f"      members: {json.dumps(shown)}", ""]
@@ -93,7 +92,7 @@ def command_line_reference(commands: Any) -> str:
     """What `lare-rl COMMAND --help` prints."""
     lines = ["# Command line", ""]
     for name in commands:
-        call = [sys.executable, "-c", "from lare.cli import main; main()", name, "--help"]
+        call = [sys.executable, "-c", "from lare_rl.cli import main; main()", name, "--help"]
         environment = os.environ | {"COLUMNS": "110", "NO_COLOR": "1", "PYTHONPATH": str(ROOT / "src")}
         printed = subprocess.run(call, capture_output=True, text=True, check=True, env=environment).stdout
         lines += [f"## lare {name}", "", "```text", printed.replace("usage: -c", "usage: lare").strip(), "```", ""]

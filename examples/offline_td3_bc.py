@@ -17,7 +17,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from lare_rl.logs.source import open_logs
+from lare_rl.logs.log import open_log
 
 BATCH, GAMMA, TAU, ALPHA, NOISE, CLIP, DELAY = 256, 0.99, 0.005, 2.5, 0.2, 0.5, 2
 
@@ -28,19 +28,23 @@ def network(inputs: int, outputs: int) -> nn.Module:
 
 def transitions(dataset: str, rewards: str) -> dict[str, torch.Tensor]:
     """All steps of a data set, in memory: before, action, after, reward, terminated."""
-    parts: dict[str, list[np.ndarray]] = {key: [] for key in ("before", "action", "after", "reward", "over")}
-    for episode in open_logs(dataset).episodes():
-        steps, kept = len(episode), episode.kept[1] if isinstance(episode.kept, tuple) else episode.kept
+    columns: dict[str, list[np.ndarray]] = {key: [] for key in ("before", "action", "after", "reward", "over")}
+    for episode in open_log(dataset).episodes():
+        steps, contents = len(episode), episode.contents
         if rewards == "end":
-            reward = np.append(np.zeros(steps - 1), episode.paid.sum())
+            reward = np.append(np.zeros(steps - 1), episode.reward.sum())
         else:
-            reward = episode.paid if rewards == "paid" else np.asarray(kept["rewards"], np.float32)
+            reward = episode.reward if rewards == "paid" else np.asarray(contents["rewards"], np.float32)
         over = np.arange(steps) == steps - 1
-        if "terminations" in kept:
-            over &= np.asarray(kept["terminations"], bool)
-        for key, values in zip(parts, (episode.before, episode.action, episode.after, reward, over), strict=True):
-            parts[key].append(values)
-    return {key: torch.as_tensor(np.concatenate(one), dtype=torch.float32) for key, one in parts.items()}
+        if "terminations" in contents:
+            over &= np.asarray(contents["terminations"], bool)
+        for key, values in zip(
+            columns, (episode.observation, episode.action, episode.next_observation, reward, over), strict=True
+        ):
+            columns[key].append(values)
+    return {
+        key: torch.as_tensor(np.concatenate(values_list), dtype=torch.float32) for key, values_list in columns.items()
+    }
 
 
 class TD3BC:
@@ -67,7 +71,9 @@ class TD3BC:
             action = (self.act(batch["after"], old=True) + noise).clamp(-self.largest, self.largest)
             value = torch.minimum(*self.values(batch["after"], action, old=True))
             target = batch["reward"] + GAMMA * (1 - batch["over"]) * value
-        loss = sum(functional.mse_loss(one, target) for one in self.values(batch["before"], batch["action"]))
+        loss = sum(
+            functional.mse_loss(values_list, target) for values_list in self.values(batch["before"], batch["action"])
+        )
         step(self.critic_optimizer, loss)  # pyright: ignore[reportArgumentType] - a sum of tensors
         if number % DELAY:
             return
@@ -76,8 +82,8 @@ class TD3BC:
         weight = ALPHA / value.abs().mean().detach()
         step(self.actor_optimizer, -weight * value.mean() + functional.mse_loss(action, batch["action"]))
         for new, old in ((self.actor, self.old_actor), (self.critics, self.old_critics)):
-            for one, other in zip(new.parameters(), old.parameters(), strict=True):
-                other.data.lerp_(one.data, TAU)
+            for values_list, other in zip(new.parameters(), old.parameters(), strict=True):
+                other.data.lerp_(values_list.data, TAU)
 
 
 def step(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
@@ -113,8 +119,8 @@ def main(
     agent = TD3BC(data["before"].shape[1], data["action"].shape[1], float(data["action"].abs().max()))
     played, returns = None if environment is None else gymnasium.make(environment), []
     for number in range(steps):
-        places = torch.randint(len(data["reward"]), (BATCH,))
-        agent.update({key: values[places] for key, values in data.items()}, number)
+        indices = torch.randint(len(data["reward"]), (BATCH,))
+        agent.update({key: values[indices] for key, values in data.items()}, number)
         if played is not None and (number + 1) % max(1, steps // 5) == 0:
             returns.append(evaluate(agent, played, mean, deviation))
             print(f"{number + 1} updates: return {returns[-1]:.1f}")

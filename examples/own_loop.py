@@ -27,8 +27,8 @@ def main(episodes: int = 40) -> float:
         steps, true, over = [], [], False
         while not over:
             action = environment.action_space.sample()
-            after, paid, terminated, truncated, info = environment.step(action)
-            steps += credit.add([before], [action], [after], [paid], [terminated], [truncated]).tolist()
+            after, reward, terminated, truncated, info = environment.step(action)
+            steps += credit.add([before], [action], [after], [reward], [terminated], [truncated]).tolist()
             true.append(info["true_reward"])  # used only by the last line of this function
             before, over = after, terminated or truncated
         r_hat = credit.rewards_at(steps)  # your algorithm trains on these; ask again whenever it samples

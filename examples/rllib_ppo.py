@@ -54,7 +54,7 @@ class PayCredit(ConnectorV2):
         super().__init__()
         self.credit = credit
 
-    def __call__(self, *, batch, episodes, **others):
+    def __call__(self, *, batch, episodes, **kwargs):
         self.credit.fit()
         for episode in self.single_agent_episode_iterator(episodes, agents_that_stepped_only=False):
             rows = len(episode)  # its steps and one more: PPO has added a last row, which is not a step
@@ -68,8 +68,10 @@ def main(iterations: int = 40, seed: int = 0) -> list[float]:
     """Train. Gives the mean return of each iteration (sums of the rewards of the environment)."""
     # Before the assigner: Ray forks, and JAX warns about forks once it runs.
     ray.init(include_dashboard=False)
-    one = gymnasium.make("Pendulum-v1")
-    credit = lare_rl.CreditAssigner("bayes", observation_space=one.observation_space, action_space=one.action_space)
+    environment = gymnasium.make("Pendulum-v1")
+    credit = lare_rl.CreditAssigner(
+        "bayes", observation_space=environment.observation_space, action_space=environment.action_space
+    )
 
     def make(**settings):
         env = lare_rl.EpisodicReward(gymnasium.make("Pendulum-v1", **settings))

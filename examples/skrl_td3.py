@@ -66,12 +66,12 @@ class CreditMemory(RandomMemory):
 class CreditTD3(TD3):
     """Stores the last observation of an episode, where skrl stores the first observation of the next one."""
 
-    def record_transition(self, *, next_observations, infos, **others):
+    def record_transition(self, *, next_observations, infos, **kwargs):
         if "final_obs" in infos:
             ended = infos["_final_obs"]
             next_observations = next_observations.clone()  # skrl's trainer continues from the original
             next_observations[ended] = torch.as_tensor(np.stack(infos["final_obs"][ended]))
-        super().record_transition(next_observations=next_observations, infos=infos, **others)
+        super().record_transition(next_observations=next_observations, infos=infos, **kwargs)
 
 
 class Network(DeterministicMixin, Model):

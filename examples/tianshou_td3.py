@@ -113,9 +113,9 @@ def main(steps: int = 10_000, seed: int = 0) -> list[float]:
     )
     returns.append(float(tester.collect(n_episode=10).returns.mean()))
     print(f"mean return after training: {returns[-1]:.0f}")
-    known = buffer.steps >= 0
-    found = np.corrcoef(credit.rewards_at(buffer.steps[known]), buffer.info["true_reward"][known])[0, 1]
-    print(f"correlation of r_hat with the true rewards, which were not used: {found:.2f}")
+    valid = buffer.steps >= 0
+    correlation = np.corrcoef(credit.rewards_at(buffer.steps[valid]), buffer.info["true_reward"][valid])[0, 1]
+    print(f"correlation of r_hat with the true rewards, which were not used: {correlation:.2f}")
     print(credit.metrics())
     return returns
 

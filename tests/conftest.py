@@ -1,7 +1,6 @@
 """Fixtures for all tests."""
 
 import gc
-import hashlib
 import itertools
 import json
 import os
@@ -10,27 +9,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
-import numpy as np
 import pytest
 
-from helpers.jax_toys import Echo, echo_spec
-from helpers.toys import PHI, REWARD, Chase, toy_spec
-from helpers.untrained_runs import made
+from helpers.jax_toy_envs import echo_spec
+from helpers.toy_envs import PHI, REWARD, Chase, toy_spec
+from helpers.untrained_runs import make_run
 from lare_rl import cli
-from lare_rl.algorithms.settings import PPOSettings
-from lare_rl.algorithms.table import ALGORITHMS
-from lare_rl.compare import statistics
+from lare_rl.algorithms.ppo import PPOSettings
+from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.compare import bootstrap
 from lare_rl.config.settings import Settings
-from lare_rl.envs.families import FAMILIES, Family
-from lare_rl.evaluation import evaluate as evaluation
-from lare_rl.evaluation import policy, watch
-from lare_rl.export import export
-from lare_rl.latent.function import LatentFunction, verified
-from lare_rl.phi.graph import Gather, Graph
+from lare_rl.latent.function import LatentFunction, verify_function
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training import explain
-from lare_rl.training import session as sessions
-from lare_rl.training.compiled import compiled
+from lare_rl.training.compile_cache import clear_compile_cache
 
 # Most of a small run's time is compilation, and many tests compile the same. JAX may have been imported already, and
 # some tests start processes of their own.
@@ -58,7 +49,7 @@ for option, value in CACHE.items():
 collect_ignore_glob = ["helpers/*"]
 """No tests in there, and looking for doctests would import it, and register its environments, a second time."""
 
-__all__ = ["PHI", "Chase", "made", "toy_spec"]
+__all__ = ["PHI", "Chase", "make_run", "toy_spec"]
 
 
 def pytest_collection_finish():
@@ -78,52 +69,10 @@ def forget_what_was_compiled():
     Some modules share what is kept: hundreds of small programs that nearly all of them run.
     """
     yield
+    clear_compile_cache()
     if next(MODULES_UNTIL_FORGOTTEN):
         jax.clear_caches()
         gc.collect()
-
-
-def digest(graph: Graph) -> str:
-    """A hash of all operations of a graph, the same for one that is read again."""
-    hashed = hashlib.sha256(repr(graph.outputs).encode())
-    for node in graph.nodes:
-        option = node.option.positions if isinstance(node.option, Gather) else node.option
-        option = option.tobytes() if isinstance(option, np.ndarray) else option
-        hashed.update(repr((node.op, node.inputs, node.shape, node.kind, option)).encode())
-    return hashed.hexdigest()
-
-
-@pytest.fixture(autouse=True, scope="module")
-def compile_once():
-    """Functions that are compiled for a configuration serve every run of a module that has it: one that is resumed, evaluated,
-    explained, or trained again. `store`, which computes phi, serves those of the same phi.
-
-    A few of them are kept, until the module's last test.
-    """
-    kept, explaining, ahead = {}, explain.explaining, sessions.ahead
-
-    def once(key, make):
-        kept[key] = kept.pop(key) if key in kept else make()
-        if len(kept) > 40:
-            del kept[next(iter(kept))]
-        return kept[key]
-
-    def of_config(config, phi=()):
-        functions = once(repr(config), lambda: compiled(config))
-        if not phi:
-            return functions
-        key = repr(config), *map(digest, phi)
-        return functions._replace(store=once(key, lambda: compiled(config, phi).store))
-
-    def of_shapes(function, *shapes):
-        return once((function, str(jax.tree.map(jax.typeof, shapes))), lambda: ahead(function, *shapes))
-
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (sessions, export, evaluation, watch, policy):
-            patch.setattr(module, "compiled", of_config)
-        patch.setattr(sessions, "ahead", of_shapes)
-        patch.setattr(explain, "explaining", lambda config: once((repr(config), "explain"), lambda: explaining(config)))
-        yield
 
 
 @pytest.fixture
@@ -164,21 +113,20 @@ def command(monkeypatch, capsys, tmp_path):
 
 
 @pytest.fixture
-def echo(monkeypatch) -> TaskSpec:
+def echo() -> TaskSpec:
     """The toy of many agents in JAX, of a family of its own."""
-    monkeypatch.setitem(FAMILIES, "echo", Family(lambda task, **_: Echo()))
     return echo_spec()
 
 
 @pytest.fixture(scope="session")
 def phi() -> LatentFunction:
-    return verified(PHI, toy_spec())
+    return verify_function(PHI, toy_spec())
 
 
 @pytest.fixture(scope="session")
 def reward() -> LatentFunction:
     """What a language model might write for `--kind reward`."""
-    return verified(REWARD, toy_spec(), "reward")
+    return verify_function(REWARD, toy_spec(), "reward")
 
 
 @pytest.fixture(scope="session")
@@ -236,4 +184,4 @@ def small_many():
 @pytest.fixture(autouse=True)
 def few_bootstrap_samples(monkeypatch):
     """Two thousand of them take seconds; tests of the intervals themselves ask for more."""
-    monkeypatch.setattr(statistics, "REPETITIONS", 50)
+    monkeypatch.setattr(bootstrap, "REPETITIONS", 50)

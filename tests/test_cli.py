@@ -7,16 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from helpers.toys import PHI
+from helpers.toy_envs import PHI
 from lare_rl import cli
-from lare_rl.algorithms.table import ALGORITHMS
-from lare_rl.cli.runs import when_saved
+from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.llm.prompts import candidate
-from lare_rl.util.provenance import source
+from lare_rl.util.provenance import code_version
 
-DRAWING = "drawing, which takes up to a minute for each run\n"
 TINY = (
     "--steps 200 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1 "
     "--method lare-linear --td3.warmup 100 --td3.hidden 8 8"
@@ -29,7 +27,138 @@ def phi(tmp_path):
     return tmp_path / "phi.py"
 
 
-def test_tasks_are_listed(command):
+def first_column(table):
+    return [line.split()[0] for line in table.splitlines()[1:] if not line.startswith(" ")]
+
+
+# --- arguments -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ("train Task --steps 1e5", ["'1e5'", "whole number"]),
+        ("train Task --step 9", ["--step, 9", "'--steps'"]),
+        ("train Task --td3.gama 9", ["--td3.gama", "'--td3.gamma'"]),
+        ("train Task --td3.gamma high", ["'high'", "number"]),
+        ("train Task --td3.gamma 3", ["td3.gamma = 3.0"]),
+        ("train Task --credit.steps 0", ["credit.steps = 0"]),
+        ("train Task --judges left", ["'left'", "before, after, both"]),
+        ("train Task --algorithm dqn", ["'dqn'", *ALGORITHMS]),
+        ("train Task --seeds", ["--seeds"]),
+        ("", ["--help"]),
+        ("trian", ["'trian'", "'train'"]),
+        ("evaluate a b", ["b", "lare-rl evaluate --help"]),
+        ("evaluate a --seed 3", ["--seed, 3"]),
+        ("evaluate", ["RUN"]),
+        ("export a", ["--out DIR"]),
+        ("design Task --price 1", ["--price"]),
+        ("compare", ["run"]),
+        ("report", ["run"]),
+    ],
+)
+def test_parse_mistake(arguments, parts, command):
+    status, out, err = command(*arguments.split())
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert all(part in err for part in ["lare-rl: ", *parts])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("train", ["lare-rl train TASK", "--resume DIR"]),
+        ("train --resume runs/none", ["runs/none is not a run"]),
+        ("train Reacher-v4 --resume runs/none", ["--resume", "--steps"]),
+        ("train --resume runs/none --seed 1", ["--resume", "--steps"]),
+        ("train Reacher-v4 --function none.py", ["none.py does not exist"]),
+        ("train Reacher-v4 --steps 120", ["steps = 120", "rollout_steps = 50"]),
+        ("train Reacher-v4 --seed -1", ["seed = -1"]),
+        ("train Reacher-v4 --seed 2147483647 --seeds 2", ["seeds = 2", "2147483647"]),
+        ("train Reacher-v4 --method magic", ["'magic'", *METHODS]),
+        ("train CN-6 --algorithm ppo", ["ppo", "CN-6"]),
+        ("train CN-6 --capacity 50", ["capacity = 50"]),
+        ("train CN-6 --ippo.hidden -1", ["hidden.0 = -1"]),
+        ("train CompetitivePP-6-prey", ["CompetitivePP-6-prey is one team"]),
+        ("train CompetitivePP-6 --function phi.py", ["CompetitivePP-6-predator, CompetitivePP-6-prey", "1 were given"]),
+        ("train CN-6 --method dense --credit.sum-form True", ["credit.sum_form", "dense"]),
+        ("train CN-6 --ppo.clip 0.1", ["ppo.clip", "ippo.clip"]),
+        ("train Reacher-v4 --method dense --judges both", ["judges", "dense"]),
+        ("train HalfCheetah-v4 --fit-every 2", ["fit_every", "lare-bayes"]),
+        ("train Reacher-v4 --draw 1 --function phi.py", ["draw", "function"]),
+        ("prompt Reacher", ["'Reacher-v4'", *shipped_tasks()]),
+        ("prompt CompetitivePP-6", ["CompetitivePP-6-predator, CompetitivePP-6-prey"]),
+        ("verify none.py --task Reacher-v4", ["none.py does not exist"]),
+        ("design CompetitivePP-6", ["CompetitivePP-6-predator, CompetitivePP-6-prey"]),
+        ("design Reacher-v4 --draw 7", ["draw 7", "0, 1, 2, 3, 4"]),
+        ("design Reacher-v4 --draw 1 --model m", ["--draw"]),
+        ("design Reacher-v4 --base-url http://x", ["--base-url", "--model"]),
+        ("design Reacher-v4 --budget 9", ["--budget", "--model"]),
+        ("design Reacher-v4 --model m --budget 0", ["budget = 0"]),
+        ("design Reacher-v4 --model m --minutes nan", ["minutes = nan"]),
+        ("design Reacher-v4 --model m --price 1 -1", ["price"]),
+        ("design Reacher-v4 --model m --temperature -1", ["temperature = -1"]),
+        ("design Reacher-v4 --policy run", ["--policy", "--reflect"]),
+        ("design Reacher-v4 --reflect -1", ["reflect = -1"]),
+        ("design Reacher-v4 --reflect 1 --data log", ["--reflect", "--data"]),
+        ("cross-play . runs/none", [". is not a run"]),
+        ("evaluate .", [". is not a run"]),
+        ("report", ["run"]),
+        ("report one two", ["one is not a run"]),
+    ],
+)
+def test_mistake_is_one_line_and_status_2(command, tmp_path, arguments, words):
+    status, out, err = command(*arguments.split())
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert all(word in err for word in ["lare-rl: ", *words])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [["--debug", "evaluate", "none"], ["evaluate", "none", "--debug"]])
+def test_debug(command, arguments):
+    status, out, err = command(*arguments)
+    assert (status, out) == (2, "")
+    assert err.startswith("Traceback (most recent call last):\n")
+    assert err.splitlines()[-1].startswith("lare-rl: none is not a run")
+
+
+def test_version(command):
+    assert command("--version") == (0, f"{code_version()}\n", "")
+
+
+def test_help_names_every_command(command):
+    status, out, _ = command("--help")
+    assert status == 0
+    assert all(name in out for name in cli.COMMANDS)
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_help_of_a_command(name, command):
+    status, out, _ = command(name, "--help")
+    assert status == 0
+    assert "None" not in out
+    assert "(default: )" not in out
+
+
+def test_help_of_options(command):
+    _, out, _ = command("train", "--help")
+    for option in (
+        "--steps INT",
+        "--out DIR",
+        "--judges {before,after,both}",
+        "--credit.hidden [INT [INT ...]]",
+        "--td3.gamma FLOAT",
+    ):
+        assert f" {option} " in out
+    # Lines of a docstring are joined: these two begin a line in the source.
+    lines = [line.strip(" |│") for line in out.splitlines()]
+    assert "one --function for each, in the order of the task. (repeatable)" not in lines
+    assert "qmix if there are a global state and action masks, else ippo." not in lines
+
+
+# --- lists, prompt, new-task -----------------------------------------------------------------------------------------
+
+
+def test_tasks(command):
     status, out, err = command("tasks")
     assert (status, err) == (0, "")
     head, *rows = [line.split() for line in out.splitlines()]
@@ -40,120 +169,76 @@ def test_tasks_are_listed(command):
     assert ["CompetitivePP-6-prey", "24", "5", "after", "of", "one", "team"] in rows
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        ("train Task --steps 1e5", "--steps 1e5: not a whole number, such as 10000; see lare-rl train --help"),
-        ("train Task --step 9", "unrecognized options: --step, 9 (did you mean '--steps'?); see lare-rl train --help"),
-        ("trian", "there is no command 'trian' (did you mean 'train'?); see lare-rl --help"),
-        ("check task.toml", "there is no command 'check'; see lare-rl --help"),
-        ("evaluate a b", "unrecognized options: b; see lare-rl evaluate --help"),
-        ("evaluate a --seed 3", "unrecognized options: --seed, 3; see lare-rl evaluate --help"),
-        ("evaluate", "lare-rl evaluate needs RUN (a run directory); see lare-rl evaluate --help"),
-        ("design Task --price 1", "--price 1: not of the kind {FLOAT FLOAT}; see lare-rl design --help"),
-        ("train Task --seeds", "--seeds needs a value; see lare-rl train --help"),
-        (
-            "export a",
-            "lare-rl export needs --out DIR (the directory to write, which must not exist); see lare-rl export --help",
-        ),
-        (
-            "train Task --td3.gamma high",
-            "Error parsing --td3.gamma: could not convert string to float: 'high'; see lare-rl train --help",
-        ),
-        ("compare", "say which runs: no run is given"),
-        ("report", "say which runs: no run is given"),
-    ],
-)
-def test_a_mistake_on_the_command_line_is_one_line(arguments, line, command):
-    assert command(*arguments.split()) == (2, "", f"lare-rl: {line}\n")
-
-
-def test_an_unknown_choice_lists_those_there_are(command):
-    status, _, err = command("train", "Task", "--algorithm", "dqn")
-    known = ", ".join(sorted(ALGORITHMS))
-    assert (status, err) == (2, f"lare-rl: --algorithm dqn: not one of {known}; see lare-rl train --help\n")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            "CN-6 --method dense --credit.sum-form True",
-            "credit.sum_form makes no difference to dense: leave the setting out",
-        ),
-        (
-            "CN-6 --ppo.clip 0.1",
-            "ppo.clip makes no difference to ippo on CN-6; it has ippo.clip: leave the setting out",
-        ),
-        ("Reacher-v4 --method dense --judges both", "judges makes no difference to dense: leave the setting out"),
-        ("CN-6 --scale-rewards", "scale_rewards makes no difference to ippo on CN-6: leave the setting out"),
-        ("CN-6 --method dense --capacity 1000", "capacity makes no difference to dense: leave the setting out"),
-        ("HalfCheetah-v4 --fit-every 2", "fit_every makes no difference to lare-bayes: leave the setting out"),
-        (
-            "Reacher-v4 --sac.learning-rate 1",
-            "sac.learning_rate makes no difference to td3 on Reacher-v4; it has td3.learning_rate: leave the setting out",
-        ),
-        (
-            "Reacher-v4 --draw 1 --function phi.py",
-            "draw and candidates choose a recorded function, and a function is given: leave either out",
-        ),
-        ("Reacher-v4 --seed 2147483647 --seeds 2", "seed = 2147483647 with seeds = 2: the largest seed is 2147483647"),
-    ],
-)
-def test_settings_that_make_no_difference_are_refused(arguments, message, command, tmp_path):
-    assert command("train", *arguments.split()) == (2, "", f"lare-rl: {message}\n")
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_version_names_the_commit(command):
-    assert command("--version") == (0, f"{source()}\n", "")
-
-
-def test_methods_are_listed(command):
-    status, out, err = command("methods")
+@pytest.mark.parametrize(("name", "registered"), [("methods", METHODS), ("algorithms", ALGORITHMS)])
+def test_methods_and_algorithms(command, name, registered):
+    status, out, err = command(name)
     assert (status, err) == (0, "")
-    assert [line.split()[0] for line in out.splitlines()[1:] if not line.startswith(" ")] == list(METHODS)
-
-
-def test_algorithms_are_listed(command):
-    status, out, err = command("algorithms")
-    assert (status, err) == (0, "")
-    assert [line.split()[0] for line in out.splitlines()[1:] if not line.startswith(" ")] == list(ALGORITHMS)
+    assert first_column(out) == list(registered)
 
 
 @pytest.mark.parametrize("kind", ["factors", "reward"])
-def test_prompt_prints_the_request(command, kind):
+def test_prompt(command, kind):
     system, user = candidate(read_task("Reacher-v4"), kind)
-    printed = f"--- system ---\n{system['content']}\n\n--- user ---\n{user['content']}\n\n"
-    assert command("prompt", "Reacher-v4", "--kind", kind) == (0, printed, "")
+    text = f"--- system ---\n{system['content']}\n\n--- user ---\n{user['content']}\n\n"
+    assert command("prompt", "Reacher-v4", "--kind", kind) == (0, text, "")
 
 
-def test_prompt_of_a_task_of_ones_own(command, spec_file):
-    status, out, _ = command("prompt", spec_file(description="Catch the {first} entry."))
+def test_new_task(command, tmp_path):
+    status, out, err = command("new-task", "Pendulum-v1")
+    assert (status, err) == (0, "")
+    assert out.splitlines()[0] == "wrote Pendulum-v1.toml"
+    content = (tmp_path / "Pendulum-v1.toml").read_bytes()
+    status, out, err = command("new-task", "Pendulum-v1")
+    assert (status, out) == (2, "")
+    assert "not overwritten; choose another --out" in err
+    assert (tmp_path / "Pendulum-v1.toml").read_bytes() == content
+    status, out, _ = command("prompt", "Pendulum-v1.toml")
     assert status == 0
-    assert "# Task\nCatch the {first} entry.\n" in out
+    assert "# Task\nThe inverted pendulum swingup problem" in out
 
 
-def test_design_prints_the_function(command):
+def test_new_task_of_two_teams(command, tmp_path):
+    status, out, err = command("new-task", "pettingzoo/mpe2.simple_adversary_v3:parallel_env")
+    assert (status, err) == (0, "")
+    files = [f"simple_adversary_v3{team}.toml" for team in ("", "-adversary", "-agent")]
+    first, heading, sentence, *_ = out.splitlines()
+    assert first == f"wrote {', '.join(files)}"
+    assert "rewards" in heading
+    assert "reward" in sentence
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(files)
+
+
+def test_new_task_without_documentation(command):
+    status, out, _ = command("new-task", "Hopper-v4", "--out", "hopper.toml")
+    assert status == 0
+    missing = re.findall(r"fill in: (\w+) ", out)
+    assert missing == ["description", "observation", "action"]
+
+
+# --- design, verify --------------------------------------------------------------------------------------------------
+
+
+def test_design(command):
     status, out, err = command("design", "Reacher-v4", "--kind", "reward")
     assert (status, err) == (0, "".join(f"candidate {n}: passes\n" for n in range(1, 6)) + "attempt 1: passes\n")
     assert "def evaluation_func(observation, action):\n" in out
+    status, out, err = command("design", "Reacher-v4", "--candidates", 1, "--no-pre-verification")
+    assert (status, err) == (0, "")
+    assert "def evaluation_func" in out
 
 
-def test_design_writes_the_function_once(command, tmp_path):
+def test_design_to_a_file(command, tmp_path):
     status, out, _ = command("design", "Reacher-v4", "--out", "phi.py")
     assert status == 0
     assert out.startswith("wrote phi.py: ")
-    written = {name: (tmp_path / name).read_bytes() for name in ("phi.py", "phi.json")}
-    assert command("design", "Reacher-v4", "--draw", 1, "--out", "phi") == (
-        2,
-        "",
-        "lare-rl: phi.py exists, and is not overwritten; choose another --out\n",
-    )
-    assert {name: (tmp_path / name).read_bytes() for name in written} == written
+    content = {name: (tmp_path / name).read_bytes() for name in ("phi.py", "phi.json")}
+    status, out, err = command("design", "Reacher-v4", "--draw", 1, "--out", "phi")
+    assert (status, out) == (2, "")
+    assert "phi.py exists" in err
+    assert {name: (tmp_path / name).read_bytes() for name in content} == content
 
 
-def test_verify_prints_each_check(command, phi, spec_file):
+def test_verify(command, phi, spec_file):
     status, out, err = command("verify", phi, "--task", spec_file())
     assert (status, err) == (0, "")
     assert out.splitlines() == [
@@ -165,259 +250,63 @@ def test_verify_prints_each_check(command, phi, spec_file):
     ]
 
 
-def test_verify_says_how_much_of_the_score_the_factors_explain(command, phi, spec_file):
+def test_verify_with_returns(command, phi, spec_file):
     status, out, err = command("verify", phi, "--task", spec_file(), "--fit", "30")
     assert (status, err) == (0, "playing 30 episodes by random actions\n")
-    found = re.search(
-        r"^Returns of episodes not seen yet, predicted by the factors: R² = (\d\.\d+) .*, with a standard error of [\w ]*0\.0",
-        out,
-        re.MULTILINE,
-    )
-    assert found
-    assert float(found[1]) > 0.9
-    assert (
-        "\nFitted to all 30 episodes (such shares may be high where R² is low, because these returns were seen):\nThe f"
-        in out
-    )
+    r2 = re.search(r"R² = (\d\.\d+) .*standard error of (less than )?0\.0", out)
+    assert r2
+    assert float(r2[1]) > 0.9
+    assert "\nFitted to all 30 episodes" in out
     assert "(before)" not in out
     _, both, _ = command("verify", phi, "--task", spec_file(), "--fit", "30", "--judges", "both")
     assert "before" in both.partition("Fitted to all 30 episodes")[2]
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["--fit", "10"], "fit = 10: at least 20 episodes are needed"),
-        (["--policy", "run"], "--policy plays the episodes for --fit: give --fit a number of episodes, and no --data"),
-    ],
+    ("options", "words"), [(["--fit", "10"], "at least 20 episodes"), (["--policy", "run"], "--policy")]
 )
-def test_a_fit_that_says_nothing_is_refused_at_once(command, phi, spec_file, more, message):
-    assert command("verify", phi, "--task", spec_file(), *more) == (2, "", f"lare-rl: {message}\n")
+def test_verify_with_too_few_returns(command, phi, spec_file, options, words):
+    status, out, err = command("verify", phi, "--task", spec_file(), *options)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert words in err
 
 
 def test_verify_prints_every_error(command, spec_file, tmp_path):
     (tmp_path / "bad.py").write_text("import os\ndef evaluation_func(o, a):\n    return [np.clamp(a), open('x')]\n")
     status, out, err = command("verify", "bad.py", "--task", spec_file())
     assert (status, err) == (1, "")
-    first, failed, *errors = out.splitlines()
-    assert first == "for Chase: observations of 2 numbers, actions of 1"
+    _, failed, *errors = out.splitlines()
     assert failed == "FAILED  read"
-    assert len(errors) == 2
-    assert errors[0].startswith("        E-IMPORT line 1: import os")
-    assert errors[1].startswith("        E-NUMPY line 3: np.clamp is not available")
+    assert [error.split(":")[0] for error in errors] == ["        E-IMPORT line 1", "        E-NUMPY line 3"]
     assert "np.clip" in errors[1]
 
 
-def test_verify_says_how_a_reply_from_a_chat_is_corrected(command, spec_file, tmp_path):
+def test_verify_reply_of_a_chat(command, spec_file, tmp_path):
     source = "def evaluation_func(o, a):\n    return [a[:, 0]]"
     (tmp_path / "reply.json").write_text(json.dumps({"Understand": "", "Analyze": "", "Functions": source}))
     status, out, err = command("verify", "reply.json", "--task", spec_file())
     assert (status, err) == (1, "")
-    assert "        E-FORM line 2: factor 1 must be an array of the shape (batch, 1)" in out
-    assert out.endswith(
-        "Paste the lines after FAILED into the same chat, and ask for the whole reply again, corrected.\n"
-    )
+    assert "        E-FORM line 2" in out
+    assert "into the same chat" in out.splitlines()[-1]
 
 
 def test_verify_gives_advice(command, spec_file, tmp_path):
     (tmp_path / "dull.py").write_text("def evaluation_func(o, a):\n    still = 0 * a\n    return [still, a]\n")
     status, out, _ = command("verify", "dull.py", "--task", spec_file())
     assert status == 0
-    assert "advice  factor 'still' never varies on the recorded steps\n" in out
+    assert "advice  factor 'still' never varies" in out
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("none.py --task Reacher-v4", "the function file none.py does not exist"),
-        ("phi.py --task Reacher", "no task 'Reacher' (did you mean 'Reacher-v4'?): "),
-    ],
-)
-def test_what_cannot_be_tried_is_status_2(command, phi, arguments, message):
-    status, out, err = command("verify", *arguments.split())
-    assert (status, out) == (2, "")
-    assert err.startswith(f"lare-rl: {message}")
+# --- runs ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_new_task_is_written_once(command, tmp_path):
-    status, out, err = command("new-task", "Pendulum-v1")
-    assert (status, err) == (0, "")
-    assert out.splitlines()[0] == "wrote Pendulum-v1.toml"
-    written = (tmp_path / "Pendulum-v1.toml").read_bytes()
-    again = "lare-rl: Pendulum-v1.toml exists, and is not overwritten; choose another --out\n"
-    assert command("new-task", "Pendulum-v1") == (2, "", again)
-    assert (tmp_path / "Pendulum-v1.toml").read_bytes() == written
-    status, out, _ = command("prompt", "Pendulum-v1.toml")
-    assert status == 0
-    assert "# Task\nThe inverted pendulum swingup problem" in out
-
-
-def test_a_new_task_of_two_teams_is_three_files(command, tmp_path):
-    status, out, err = command("new-task", "pettingzoo/mpe2.simple_adversary_v3:parallel_env")
-    assert (status, err) == (0, "")
-    files = [f"simple_adversary_v3{team}.toml" for team in ("", "-adversary", "-agent")]
-    first, heading, sentence, *_ = out.splitlines()
-    assert (first, heading) == (
-        f"wrote {', '.join(files)}",
-        "  left out or cut short, because it seems to speak of rewards:",
-    )
-    assert sentence.startswith("    ")
-    assert "reward" in sentence
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(files)
-
-
-def test_what_a_new_task_lacks_is_said(command):
-    status, out, _ = command("new-task", "Hopper-v4", "--out", "hopper.toml")
-    assert status == 0
-    assert [line for line in out.splitlines() if "fill in" in line] == [
-        f"  fill in: {key} (the environment does not document it)" for key in ("description", "observation", "action")
-    ]
-
-
-def test_the_ablation_without_pre_verification_keeps_what_can_be_read(command):
-    status, out, err = command("design", "Reacher-v4", "--candidates", 1, "--no-pre-verification")
-    assert (status, err) == (0, "")
-    assert "def evaluation_func" in out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            "prompt Reacher",
-            "no task 'Reacher' (did you mean 'Reacher-v4'?): neither a file nor one of the shipped tasks, "
-            f"{', '.join(shipped_tasks())}",
-        ),
-        ("design Reacher-v4 --draw 7", "no recording of factors has draw 7; the draws are 0, 1, 2, 3, 4"),
-        ("train", "say what to train on: lare-rl train TASK (lare-rl tasks lists them), or lare-rl train --resume DIR"),
-        ("train --resume runs/none", "runs/none is not a run: there is no config.json in it"),
-        (
-            "train Reacher-v4 --resume runs/none",
-            "--resume goes on with the run's own settings: give it no task and no other setting than --steps",
-        ),
-        (
-            "train --resume runs/none --seed 1",
-            "--resume goes on with the run's own settings: give it no task and no other setting than --steps",
-        ),
-        ("train Reacher-v4 --function none.py", "the function file none.py does not exist"),
-        ("train Reacher-v4 --steps 120", "steps = 120 is not a multiple of rollout_steps = 50: take 100"),
-        ("train Reacher-v4 --seed -1", "seed = -1: input should be greater than or equal to 0"),
-        (
-            "train Reacher-v4 --method magic",
-            f"no method 'magic'; the methods are {', '.join(METHODS)}",
-        ),
-        ("train CN-6 --algorithm ppo", "ppo is for a single agent, and CN-6 is a task of many"),
-        (
-            "train CN-6 --steps 1000",
-            "steps = 1000 is not a multiple of 2050 (rollout_steps = 25 of environments = 82): take 2050",
-        ),
-        ("train CN-6 --capacity 50", "capacity = 50 is too small: a rollout of CN-6 takes up to 6150"),
-        ("train CN-6 --ippo.hidden -1", "hidden.0 = -1: input should be greater than or equal to 1"),
-        (
-            "train CompetitivePP-6-prey",
-            "CompetitivePP-6-prey is one team of particles/CompetitivePP-6: train the task that has both",
-        ),
-        (
-            "train CompetitivePP-6 --function phi.py",
-            "CompetitivePP-6 needs one latent function for each of CompetitivePP-6-predator, CompetitivePP-6-prey; 1 were "
-            "given",
-        ),
-        (
-            "prompt CompetitivePP-6",
-            "CompetitivePP-6 has a latent function for each of its teams: name one of CompetitivePP-6-predator, "
-            "CompetitivePP-6-prey instead",
-        ),
-        (
-            "design CompetitivePP-6",
-            "CompetitivePP-6 has a latent function for each of its teams: name one of CompetitivePP-6-predator, "
-            "CompetitivePP-6-prey instead",
-        ),
-        ("cross-play . runs/none", ". is not a run: there is no config.json in it"),
-        ("evaluate .", ". is not a run: there is no config.json in it"),
-        ("report", "say which runs: no run is given"),
-        ("report one two", "one is not a run, and contains none"),
-    ],
-)
-def test_a_mistake_is_one_line_and_status_2(command, tmp_path, arguments, message):
-    assert command(*arguments.split()) == (2, "", f"lare-rl: {message}\n")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("arguments", [["--debug", "evaluate", "none"], ["evaluate", "none", "--debug"]])
-def test_debug_shows_where_it_came_from(command, arguments):
-    status, out, err = command(*arguments)
-    assert (status, out) == (2, "")
-    assert err.startswith("Traceback (most recent call last):\n")
-    assert err.endswith("\nlare-rl: none is not a run: there is no config.json in it\n")
-
-
-def test_an_error_of_many_lines_is_printed_in_one(command, spec_file, tmp_path):
+def test_error_of_many_lines(command, spec_file, tmp_path):
     (tmp_path / "bad.py").write_text("import os\ndef evaluation_func(o, a):\n    return [np.load(a)]\n")
     status, _, err = command("train", spec_file(), "--function", "bad.py")
-    assert status == 2
-    start = "lare-rl: bad.py: the function does not fit task 'Chase': E-IMPORT line 1: import os"
-    assert err.startswith(start)
-    assert " E-NUMPY line 3: np.load" in err
-    assert err.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "arguments", [[], ["dance"], ["train", "--colour", "red"], ["prompt", "Reacher-v4", "--kind", "x"]]
-)
-def test_an_unknown_option_is_status_2(command, arguments):
-    status, out, err = command(*arguments)
-    assert (status, out) == (2, "")
-    assert "Traceback" not in err
-    assert "--help" in err
-
-
-def test_help_names_every_command(command):
-    status, out, _ = command("--help")
-    assert status == 0
-    assert all(name in out for name in cli.COMMANDS)
-
-
-def test_help_breaks_no_line_where_the_source_does(command):
-    """The first of these lines would be that of a command's docstring, the second that of a setting's."""
-    status, out, _ = command("train", "--help")
-    assert status == 0
-    assert "--algorithm" in out
-    lines = [line.strip(" |│") for line in out.splitlines()]
-    assert "one --function for each, in the order of the task. (repeatable)" not in lines
-    assert "qmix if there are a global state and action masks, else ippo." not in lines
-
-
-@pytest.mark.parametrize("name", cli.COMMANDS)
-def test_help_says_in_words_what_happens_without_an_option(name, command):
-    status, out, _ = command(name, "--help")
-    assert status == 0
-    assert "None" not in out
-    assert "(default: )" not in out
-
-
-def test_help_names_the_type_of_an_option_that_may_be_left_out(command):
-    _, out, _ = command("train", "--help")
-    for option in (
-        "--steps INT",
-        "--model STR",
-        "--out DIR",
-        "--judges {before,after,both}",
-        "--credit.hidden [INT [INT ...]]",
-        "--td3.gamma FLOAT",
-    ):
-        assert f" {option} " in out
-
-
-@pytest.mark.parametrize(
-    ("step", "said"),
-    [
-        (5_000, "the policy of step 5,000, before its first update"),
-        (10_000, "the policy of step 10,000, before its first update"),
-        (15_000, "the policy of step 15,000"),
-    ],
-)
-def test_a_policy_that_was_saved_before_it_was_trained_is_named(step, said):
-    assert when_saved(step, warmup=10_000) == said
+    assert (status, err.count("\n")) == (2, 1)
+    assert "bad.py: " in err
+    assert "E-IMPORT line 1" in err
+    assert "E-NUMPY line 3" in err
 
 
 def test_from_training_to_report(command, spec_file, phi):
@@ -430,23 +319,22 @@ def test_from_training_to_report(command, spec_file, phi):
 
     status, out, err = command("evaluate", run, "--episodes", 2)
     assert (status, err) == (0, "")
-    evaluated, by_chance, difference = out.splitlines()
-    assert re.fullmatch(r"seed 0: return -\S+ ± \S+ over 2 episodes", evaluated)
-    assert re.fullmatch(r"random actions: return -\S+ ± \S+ over 10 episodes", by_chance)
+    policy, random, difference = out.splitlines()
+    assert re.fullmatch(r"seed 0: return -\S+ ± \S+ over 2 episodes", policy)
+    assert re.fullmatch(r"random actions: return -\S+ ± \S+ over 10 episodes", random)
     assert re.fullmatch(r"difference: \S+ ± \S+ \(± is its standard error\)", difference)
     _, out, _ = command("evaluate", run, "--episodes", 2, "--best")
-    assert re.match(r"seed 0: return -\S+ ± \S+ over 2 episodes \(the policy of step [12]00", out)
+    assert re.match(r"seed 0: return -\S+ ± \S+ over 2 episodes \(the policy of step ([12])00", out)
+    assert ("before its first update" in out) == ("step 100" in out)
 
-    assert command("report", run) == (0, f"wrote {run / 'report.html'}\n", DRAWING)
+    assert command("report", run)[:2] == (0, f"wrote {run / 'report.html'}\n")
     assert "f_near" in (run / "report.html").read_text(encoding="utf-8")
-    assert command("report", run, run, "--out", "both.html") == (0, "wrote both.html\n", DRAWING)
-    assert command("evaluate", run, "--video", "film.avi") == (
-        2,
-        "",
-        "lare-rl: film.avi is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]\n",
-    )
+    assert command("report", run, run, "--out", "both.html")[:2] == (0, "wrote both.html\n")
+    status, out, err = command("evaluate", run, "--video", "film.avi")
+    assert (status, out) == (2, "")
+    assert "film.avi" in err
 
-    # There is nothing left to do, and nothing is done again. A page that was watched is brought up to date.
+    # A finished run is not trained again. A page that was watched is updated.
     (run / "watch.html").write_text("stale")
     status, out, _ = command("train", "--resume", run)
     assert status == 0
@@ -454,15 +342,12 @@ def test_from_training_to_report(command, spec_file, phi):
     assert out.endswith(f"finished {run}; to see it: lare-rl report {run}\n")
     assert (run / "metrics.jsonl").read_bytes() == metrics
 
-    assert command("train", spec_file(), *TINY, "--function", phi, "--out", run) == (
-        2,
-        "",
-        f"lare-rl: {run} exists, and a run never overwrites another: choose another directory, or continue "
-        "the run with --resume (lare_rl.resume)\n",
-    )
+    status, out, err = command("train", spec_file(), *TINY, "--function", phi, "--out", run)
+    assert (status, out) == (2, "")
+    assert f"{run} exists" in err
     assert (run / "metrics.jsonl").read_bytes() == metrics
 
-    # What was measured can be drawn without the checkpoint.
+    # The report needs no checkpoint.
     shutil.rmtree(run / "checkpoint")
-    assert command("report", run, "--out", "without.html") == (0, "wrote without.html\n", DRAWING)
-    assert "Its checkpoint is not there any more" in Path("without.html").read_text(encoding="utf-8")
+    assert command("report", run, "--out", "without.html")[:2] == (0, "wrote without.html\n")
+    assert "checkpoint" in Path("without.html").read_text(encoding="utf-8")

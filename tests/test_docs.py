@@ -1,4 +1,4 @@
-"""What the documentation points at is there."""
+"""Links, Python and public names in the documentation."""
 
 import ast
 import re
@@ -16,27 +16,27 @@ PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 
 def anchors(page: Path) -> set[str]:
-    """Of its headings, as hosts of repositories make them."""
+    """Return the anchors of headings, as hosts of repositories make them."""
     headings = HEADING.findall(page.read_text(encoding="utf-8"))
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page):
-    lost = []
-    for place, anchor in LINK.findall(page.read_text(encoding="utf-8")):
-        target = page.parent / place if place else page
-        if "://" not in place and not (target.exists() and (not anchor or anchor in anchors(target))):
-            lost.append(f"{place}#{anchor}")
-    assert lost == []
+def test_links(page):
+    broken = []
+    for path, anchor in LINK.findall(page.read_text(encoding="utf-8")):
+        target = page.parent / path if path else page
+        if "://" not in path and not (target.exists() and (not anchor or anchor in anchors(target))):
+            broken.append(f"{path}#{anchor}")
+    assert broken == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_python_is_python(page):
+def test_python_blocks_parse(page):
     for block in PYTHON.findall(page.read_text(encoding="utf-8")):
         ast.parse(block)
 
 
-def test_every_public_name_is_in_the_page_of_the_api():
+def test_api_page_has_every_public_name():
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     assert [name for name in lare_rl.__all__ if name != "__version__" and f"`{name}" not in text] == []

@@ -11,17 +11,16 @@ import shlex
 import sys
 import tomllib
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
 
 import lare_rl
-from helpers.servers import Server, completion
-from lare_rl.compare import statistics
-from lare_rl.envs import interface as env
-from lare_rl.runs.directory import describe
+from helpers.chat_servers import Server, text_completion
+from lare_rl.compare import bootstrap
+from lare_rl.runs.config_file import make_config
 from lare_rl.sweep import processes
 from lare_rl.sweep.sweep import read_sweep
 from lare_rl.tasks import spec
@@ -54,7 +53,7 @@ CUTS = {
     r"--steps 20000 --td3.warmup 1000": "--steps 400 --td3.warmup 100 --evaluation-episodes 1",
     r"--steps 40000": "--steps 600",
     r"steps=(100|20)_000": "steps=400, evaluation_episodes=1",
-    r"--seeds 3|seeds=3": lambda found: found[0].replace("3", "2"),
+    r"--seeds 3|seeds=3": lambda match: match[0].replace("3", "2"),
     r"(lare-rl train (CN|PP|CompetitivePP|TriangleArea)-?6?.*)": r"\1 --steps 200 --environments 4 --evaluation-episodes 1",
     r"(lare-rl train spread.toml.*)": r"\1 --steps 2000 --evaluation-episodes 1",
     r"lare-rl train SMAX-\w+": "lare-rl train SMAX-2s3z",
@@ -63,8 +62,8 @@ CUTS = {
     r"(lare-rl train SMAX-.* --algorithm ippo.*)": r"\1 --steps 2050 --environments 2 --evaluation-episodes 1",
     r"(lare-rl train SMAX-\S+(?: --method \S+)?)(?: --steps \d+)? *$": r"\1 --steps 1200 --environments 2 --evaluation-episodes 1",
     r"(lare-rl train \S+ --method \w+-?\w*)$": r"\1 --steps 200 --td3.warmup 100 --evaluation-episodes 1",
-    r"--budget laptop|reproduce errors": lambda found: f"{found[0].split(' --')[0]} --budget smoke",
-    r"--episodes 20|episodes=20": lambda found: found[0].replace("20", "1"),
+    r"--budget laptop|reproduce errors": lambda match: f"{match[0].split(' --')[0]} --budget smoke",
+    r"--episodes 20|episodes=20": lambda match: match[0].replace("20", "1"),
     r"learn\(1_000_000": "learn(1100",
     r"http://localhost:5000": "file:mlruns",
     r"runs/\.\.\.": "runs/Reacher-v4-lare-bayes-td3-s0",
@@ -85,8 +84,8 @@ class Page:
         self.command, self.patch, self.directory = command, monkeypatch, directory
         self.names = {}
 
-    def given(self, code):
-        """Names that the page assumes."""
+    def define(self, code):
+        """Define names that the page assumes."""
         exec(code, self.names)
 
     def write(self, name, text):
@@ -96,7 +95,7 @@ class Page:
 
     def serve(self, source):
         """A language model that always writes the same function, wherever the page says that one is."""
-        server = Server(lambda handler: handler.send(200, json.dumps(completion(reply_of(source))).encode()))
+        server = Server(lambda handler: handler.send(200, json.dumps(text_completion(to_reply(source))).encode()))
         self.patch.setenv("OPENAI_BASE_URL", server.url)
         self.patch.setenv("OPENAI_API_KEY", "key")
         self.url = server.url
@@ -107,9 +106,9 @@ class Page:
         if not words:
             return
         match words:
-            case ["export", *given]:
-                for one in given:
-                    name, value = one.split("=", 1)
+            case ["export", *assignments]:
+                for assignment in assignments:
+                    name, value = assignment.split("=", 1)
                     if value != "...":
                         self.patch.setenv(name, value.replace("$PWD", os.getcwd()))
             case ["lare-rl", *arguments]:
@@ -146,7 +145,7 @@ class Page:
 def made_up(job, cores, running):
     """Instead of training a run of a sweep: metrics as it would have them."""
     job.directory.mkdir(parents=True)
-    (job.directory / "config.json").write_text(describe(job.task, job.resolved, ()).model_dump_json())
+    (job.directory / "config.json").write_text(make_config(job.task, job.resolved, ()).model_dump_json())
     lines = [
         {"step": job.resolved.steps, "seed": seed, **dict.fromkeys(MEANING, seed + 1.0)}
         for seed in job.resolved.all_seeds
@@ -154,26 +153,26 @@ def made_up(job, cores, running):
     (job.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
-def python_of(page, number):
+def to_python(page, number):
     """One of its blocks."""
     return [text for language, text in blocks(ROOT / page) if language == "python"][number]
 
 
-def toml_of(page, number):
+def to_toml(page, number):
     return [text for language, text in blocks(ROOT / page) if language == "toml"][number]
 
 
-PENDULUM = python_of("docs/bring-your-own-task.md", 0)
-STUDY = toml_of("docs/sweeps.md", 0).replace("processes = 2", "processes = 1")
+PENDULUM = to_python("docs/bring-your-own-task.md", 0)
+STUDY = to_toml("docs/sweeps.md", 0).replace("processes = 2", "processes = 1")
 
 
 def a_study(page):
     """The files that the study names; its runs are not trained."""
     page.write("study.toml", cut(STUDY))
-    page.write("my-task.toml", toml_of("docs/bring-your-own-task.md", 0).replace('"Pendulum"', '"MyTask"'))
+    page.write("my-task.toml", to_toml("docs/bring-your-own-task.md", 0).replace('"Pendulum"', '"MyTask"'))
     page.write("phi.py", PENDULUM)
-    page.patch.setattr(processes, "in_a_process", made_up)
-    page.patch.setattr(statistics, "REPETITIONS", 50)
+    page.patch.setattr(processes, "train_in_process", made_up)
+    page.patch.setattr(bootstrap, "REPETITIONS", 50)
 
 
 def logs(page):
@@ -225,8 +224,8 @@ def for_the_api(page):
     page.patch.setenv("WANDB_MODE", "offline")
     page.patch.setenv("WANDB_SILENT", "true")
     page.patch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
-    page.names["model"] = SimpleNamespace(name="says", reply=lambda messages, sample: reply_of(run.functions[0].source))
-    page.given(
+    page.names["model"] = SimpleNamespace(name="says", reply=lambda messages, sample: to_reply(run.functions[0].source))
+    page.define(
         "import gymnasium, numpy as np\n"
         "envs = gymnasium.make_vec('Reacher-v4', num_envs=4)\n"
         "observation, _ = envs.reset(seed=0)\n"
@@ -236,24 +235,26 @@ def for_the_api(page):
     )
 
 
-def reply_of(source):
+def to_reply(source):
     return json.dumps({"Understand": "", "Analyze": "", "Functions": source})
 
 
 def an_export(page):
     run = a_run(page)
-    lare_rl.export(run, page.directory / "exported")
+    lare_rl.export_run(run, page.directory / "exported")
     page.patch.chdir(page.directory / "exported")
     page.patch.syspath_prepend(page.directory / "exported")
-    page.given(
+    page.define(
         "import numpy as np\n"
         "observations = before = after = np.ones((5, 11), np.float32)\naction = np.ones((5, 2), np.float32)"
     )
 
 
-def for_the_architecture(page):
-    page.names |= {name: getattr(env, name) for name in ("EnvSpec", "Team", "Timestep")}
-    page.names |= {"TaskSpec": spec.TaskSpec, "my_game": SimpleNamespace(load=lambda name, **arguments: name)}
+def a_plugin(page):
+    """The snippets are one module, which can be imported by its name."""
+    module = ModuleType("my_plugin")
+    page.patch.setitem(sys.modules, module.__name__, module)
+    page.names = module.__dict__
 
 
 def a_function(page):
@@ -275,9 +276,9 @@ def for_the_readme(page):
 BEFORE = {
     "README.md": for_the_readme,
     "docs/api.md": for_the_api,
-    "docs/architecture.md": for_the_architecture,
     "docs/bring-your-own-task.md": a_user,
     "docs/export.md": an_export,
+    "docs/extending.md": a_plugin,
     "docs/logs.md": logs,
     "docs/plugs/sb3.md": a_function,
     "docs/reproduce.md": a_study,
@@ -294,7 +295,7 @@ EXCERPTS = {"docs/plugs/others.md": ("tianshou_td3.py", "skrl_td3.py", "rllib_pp
 @pytest.fixture
 def miniature(monkeypatch):
     """Every run that begins in this process is as it is asked for, but for small networks and little work for them."""
-    decide = training.decide
+    decide = training.resolve
 
     def smaller(settings, task):
         plan = decide(settings, task)
@@ -305,7 +306,7 @@ def miniature(monkeypatch):
         changes = {"credit": credit, "hyperparameters": algorithm.model_copy(update=less), "fit_updates": 1}
         return plan.model_copy(update=changes)
 
-    monkeypatch.setattr(training, "decide", smaller)
+    monkeypatch.setattr(training, "resolve", smaller)
 
 
 @pytest.mark.usefixtures("miniature")
@@ -330,7 +331,7 @@ def test_an_excerpt_is_in_its_example(name, examples):
 def test_task_files_are_task_files(tmp_path):
     """Those of one agent and of many; and of two teams, where the page leaves out the texts."""
     for number in range(4):
-        text = toml_of("docs/bring-your-own-task.md", number)
+        text = to_toml("docs/bring-your-own-task.md", number)
         if "description = " not in text:
             text += "".join(f'{key} = "what it is"\n' for key in ("description", "observation", "action"))
         name = tomllib.loads(text)["name"]
@@ -350,4 +351,4 @@ def test_a_study_can_be_trained(monkeypatch, tmp_path):
 
 
 def test_an_exhibit_of_ones_own():
-    assert list(Exhibit(**read_toml(toml_of("docs/reproduce.md", 0))).contenders) == ["64 units", "256 units"]
+    assert list(Exhibit(**read_toml(to_toml("docs/reproduce.md", 0))).contenders) == ["64 units", "256 units"]

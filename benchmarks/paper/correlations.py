@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs.load import load_task
-from lare_rl.envs.play import Episode, episodes_of
-from lare_rl.evaluation.episode_credit import correlations
-from lare_rl.latent.design import DesignFailed, design, examine
+from lare_rl.envs.play import Episode, play_episodes
+from lare_rl.latent.design import DesignError, design, examine_reply
 from lare_rl.latent.function import LatentFunction
 from lare_rl.llm.recording import shipped_recordings
-from lare_rl.tasks.spec import Judges, TaskSpec
+from lare_rl.tasks.spec import FactorInputs, TaskSpec
+from lare_rl.util.statistics import column_correlations
 from paper.exhibits import Budget
 from paper.pages import Page, items, table
 
@@ -45,14 +45,14 @@ class Steps(NamedTuple):
     """True rewards."""
 
 
-def page_of(budget: Budget, command: str) -> Page:
+def make_page(budget: Budget, command: str) -> Page:
     """Measure, and make a page with the results beside the paper's figures."""
     rows = []
     for task in map(load_task, PRINTED):
         functions = designed(task, budget.functions)
         passed = [function for function in functions if function is not None]
-        entries = of_entries(random_steps(task, budget.episodes), task.judges, passed)
-        alone = of_replies(task, budget.functions)
+        entries = entries_cells(random_steps(task, budget.episodes), task.judges, passed)
+        alone = replies_cell(task, budget.functions)
         rows.append([task.name, *entries, alone, f"{len(passed)} of {len(functions)}"])
     head = (
         "",
@@ -61,7 +61,7 @@ def page_of(budget: Budget, command: str) -> Page:
         "replies that pass as they come",
         "functions that pass after verification",
     )
-    parts = [
+    sections = [
         f"# {TITLE}",
         f"The paper's table 1, by `{command}`: {budget.episodes} episodes of random actions, {budget.functions} of the "
         "recorded draws of the language model. Absolute correlation (Pearson's) of an entry with the true reward of the same "
@@ -75,53 +75,57 @@ def page_of(budget: Budget, command: str) -> Page:
         "## What differs from the paper",
         items(DIFFERENCES),
     ]
-    return Page("table-1", "\n\n".join(parts))
+    return Page("table-1", "\n\n".join(sections))
 
 
 def designed(task: TaskSpec, draws: int) -> list[LatentFunction | None]:
     """The function of each draw; None if no attempt passed."""
-    found: list[LatentFunction | None] = []
+    functions: list[LatentFunction | None] = []
     for draw in range(draws):
         try:
-            found.append(design(task, draw=draw))
-        except DesignFailed:
-            found.append(None)
-    return found
+            functions.append(design(task, draw=draw))
+        except DesignError:
+            functions.append(None)
+    return functions
 
 
-def of_entries(steps: Steps, judges: Judges, functions: Sequence[LatentFunction]) -> tuple[str, str]:
+def entries_cells(steps: Steps, judges: FactorInputs, functions: Sequence[LatentFunction]) -> tuple[str, str]:
     """Correlations of states, and of the factors of each function."""
-    state = np.abs(correlations(steps.after, steps.reward))
-    of_states = f"{np.nanmean(state):.2f} ({len(state)}), {np.nanmax(state):.2f}"
+    state = np.abs(column_correlations(steps.after, steps.reward))
+    state_cell = f"{np.nanmean(state):.2f} ({len(state)}), {np.nanmax(state):.2f}"
     if not functions:
-        return of_states, "-"
-    found = [
-        np.abs(correlations(function.of_steps(steps.before, steps.action, steps.after, judges), steps.reward))
+        return state_cell, "-"
+    correlations = [
+        np.abs(
+            column_correlations(function.step_factors(steps.before, steps.action, steps.after, judges), steps.reward)
+        )
         for function in functions
     ]
-    mean, size, best = (np.mean([float(measure(one)) for one in found]) for measure in (np.nanmean, len, np.nanmax))
-    return of_states, f"{mean:.2f} ({size:.1f}), {best:.2f}"
+    mean, size, best = (
+        np.mean([float(measure(entry)) for entry in correlations]) for measure in (np.nanmean, len, np.nanmax)
+    )
+    return state_cell, f"{mean:.2f} ({size:.1f}), {best:.2f}"
 
 
-def of_replies(task: TaskSpec, draws: int) -> str:
+def replies_cell(task: TaskSpec, draws: int) -> str:
     """The share of single candidates that pass without correction."""
-    recordings = [one for draw in range(draws) for one in shipped_recordings("factors", draw)]
-    exchanges = [exchange for one in recordings if one.task == task.name for exchange in one.exchanges]
+    recordings = [entry for draw in range(draws) for entry in shipped_recordings("factors", draw)]
+    exchanges = [exchange for entry in recordings if entry.task == task.name for exchange in entry.exchanges]
     replies = [reply for exchange in exchanges if exchange.stage == "candidate" for reply in exchange.replies]
-    passed = [not examine(reply, task, "factors").errors for reply in replies]
+    passed = [not examine_reply(reply, task, "factors").errors for reply in replies]
     return f"{sum(passed)} of {len(passed)}"
 
 
 def random_steps(task: TaskSpec, episodes: int) -> Steps:
     """Whole episodes of uniformly random actions, with the rows of all agents one after the other."""
-    played = episodes_of(task, episodes)
+    played = play_episodes(task, episodes)
 
-    def rows(part: Callable[[Episode], np.ndarray]) -> np.ndarray:
-        return np.concatenate([part(one)[one.alive] for one in played])
+    def rows(read_values: Callable[[Episode], np.ndarray]) -> np.ndarray:
+        return np.concatenate([read_values(entry)[entry.alive] for entry in played])
 
     return Steps(
-        rows(lambda one: one.before),
-        rows(lambda one: one.action),
-        rows(lambda one: one.after),
-        rows(lambda one: one.reward),
+        rows(lambda entry: entry.observation),
+        rows(lambda entry: entry.env_action),
+        rows(lambda entry: entry.next_observation),
+        rows(lambda entry: entry.reward),
     )

@@ -12,28 +12,27 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from lare_rl.algorithms.table import Name
-from lare_rl.compare.scores import RETURN
-from lare_rl.config.defaults import algorithm_of
+from lare_rl.config.defaults import choose_algorithm
 from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import find_method
-from lare_rl.envs.families import env_spec
+from lare_rl.envs.families import load_env_spec
 from lare_rl.envs.load import load_task
-from lare_rl.errors import Checked, LareError
-from lare_rl.sweep.jobs import Job, job_of
-from lare_rl.util.safe_io import LARGEST_SETTINGS, read_text, read_toml
+from lare_rl.errors import CheckedModel, LareError
+from lare_rl.runs.metric_names import RETURN
+from lare_rl.sweep.jobs import Job, make_job
+from lare_rl.util.safe_io import MAX_SETTINGS_BYTES, read_text, read_toml
 
-PLACE = Path(__file__).parent
-OURS = "ours"
+FOLDER = Path(__file__).parent
+LARE_SOURCE = "ours"
 
 Names = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
-class Contender(Checked):
+class Contender(CheckedModel):
     """A method, as the paper's figure shows it. In the TOML file its key is its label; a string gives the method alone."""
 
     method: str
-    algorithm: Name | None = None
+    algorithm: str | None = None
     """The default is the task's own."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Settings that differ from the default ones."""
@@ -43,7 +42,7 @@ class Contender(Checked):
     """The ending of its runs' names, needed if another contender differs in settings alone."""
 
 
-class Claim(Checked):
+class Claim(CheckedModel):
     """A claim of the paper: on every task that is shown, one contender is better than the others."""
 
     better: str
@@ -52,7 +51,7 @@ class Claim(Checked):
     """Whether the paper only says that it is as good."""
 
 
-class Exhibit(Checked):
+class Exhibit(CheckedModel):
     """A figure or a table."""
 
     title: str
@@ -64,7 +63,7 @@ class Exhibit(Checked):
     """The tasks of the laptop budget; the default is all tasks."""
     contenders: dict[str, Contender]
     """Contenders by label."""
-    algorithms: tuple[Name, ...] = ()
+    algorithms: tuple[str, ...] = ()
     """Every contender is trained, and every claim is tested, with each of them; their labels end with the algorithm."""
     claims: tuple[Claim, ...]
     steps: int | None = None
@@ -79,17 +78,20 @@ class Exhibit(Checked):
     @field_validator("contenders", mode="before")
     @classmethod
     def method_alone(cls, contenders: dict[str, Any]) -> dict[str, Any]:
-        return {label: {"method": given} if isinstance(given, str) else given for label, given in contenders.items()}
+        return {
+            label: {"method": contender} if isinstance(contender, str) else contender
+            for label, contender in contenders.items()
+        }
 
 
-class Tabular(Checked):
+class Tabular(CheckedModel):
     """The size of the tabular problems."""
 
     episodes: int
     runs: int
 
 
-class Budget(Checked):
+class Budget(CheckedModel):
     """What all runs of an exhibit have in common."""
 
     seeds: int
@@ -113,7 +115,7 @@ class Budget(Checked):
 def read(path: Path) -> dict[str, Any]:
     """Read a TOML file. Raises `LareError` with its name if it is not one."""
     try:
-        return read_toml(read_text(path, LARGEST_SETTINGS))
+        return read_toml(read_text(path, MAX_SETTINGS_BYTES))
     except ValueError as error:
         raise LareError(f"{path}: {error}") from error
 
@@ -121,13 +123,13 @@ def read(path: Path) -> dict[str, Any]:
 @functools.cache
 def budgets() -> dict[str, Budget]:
     """The budgets by name: `smoke`, `laptop`, `paper`."""
-    return {name: Budget(**values) for name, values in read(PLACE / "budgets.toml").items()}
+    return {name: Budget(**values) for name, values in read(FOLDER / "budgets.toml").items()}
 
 
 @functools.cache
 def exhibits() -> dict[str, Exhibit]:
     """The exhibits by name, in alphabetical order."""
-    paths = sorted((PLACE / "exhibits").glob("*.toml"))
+    paths = sorted((FOLDER / "exhibits").glob("*.toml"))
     return {path.stem: with_algorithms(Exhibit(**read(path))) for path in paths}
 
 
@@ -136,19 +138,19 @@ def with_algorithms(exhibit: Exhibit) -> Exhibit:
     if not exhibit.algorithms:
         return exhibit
 
-    def named(label: str, algorithm: str) -> str:
+    def full_label(label: str, algorithm: str) -> str:
         return f"{label}, {algorithm}"
 
     contenders = {
-        named(label, algorithm): one.model_copy(update={"algorithm": algorithm})
+        full_label(label, algorithm): contender.model_copy(update={"algorithm": algorithm})
         for algorithm in exhibit.algorithms
-        for label, one in exhibit.contenders.items()
+        for label, contender in exhibit.contenders.items()
     }
     claims = tuple(
         claim.model_copy(
             update={
-                "better": named(claim.better, algorithm),
-                "than": tuple(named(other, algorithm) for other in claim.than),
+                "better": full_label(claim.better, algorithm),
+                "than": tuple(full_label(other, algorithm) for other in claim.than),
             }
         )
         for algorithm in exhibit.algorithms
@@ -161,29 +163,39 @@ Jobs = Mapping[str, Mapping[str, Sequence[Job]]]
 """Jobs by task and label, one for each draw."""
 
 
-def tasks_of(exhibit: Exhibit, budget: str) -> tuple[str, ...]:
+def exhibit_tasks(exhibit: Exhibit, budget: str) -> tuple[str, ...]:
     """The tasks of an exhibit for a budget."""
     return {"smoke": exhibit.tasks[:1], "laptop": exhibit.laptop or exhibit.tasks, "paper": exhibit.tasks}[budget]
 
 
-def jobs_of(exhibit: Exhibit, budget: str, root: Path) -> Jobs:
+def exhibit_jobs(exhibit: Exhibit, budget: str, root: Path) -> Jobs:
     """Every run that an exhibit needs. Exhibits that need the same run share it."""
-    common = budgets()[budget]
+    shared_settings = budgets()[budget]
     if exhibit.steps is not None and budget != "smoke":
-        common = common.model_copy(update={"steps": exhibit.steps})
+        shared_settings = shared_settings.model_copy(update={"steps": exhibit.steps})
     return {
-        name: {label: list(jobs_of_contender(one, common, name, root)) for label, one in exhibit.contenders.items()}
-        for name in tasks_of(exhibit, budget)
+        name: {
+            label: list(jobs_of_contender(contender, shared_settings, name, root))
+            for label, contender in exhibit.contenders.items()
+        }
+        for name in exhibit_tasks(exhibit, budget)
     }
 
 
-def jobs_of_contender(one: Contender, budget: Budget, name: str, root: Path) -> Iterator[Job]:
+def jobs_of_contender(contender: Contender, budget: Budget, name: str, root: Path) -> Iterator[Job]:
     """A run for each draw of the language model."""
     task = load_task(name)
-    steps = budget.steps_of_many if env_spec(task).agents > 1 else budget.steps
-    common = {"method": one.method, "algorithm": one.algorithm, "steps": steps, "seeds": budget.seeds}
-    common |= budget.algorithms.get(algorithm_of(one.algorithm, env_spec(task)), {})
-    latent = find_method(one.method).latent
-    for draw in range(min(budget.draws, one.draws) if latent else 1):
-        job = job_of(root, task, Settings(**{**one.settings, **budget.settings, **common, "draw": draw}))
-        yield replace(job, directory=job.directory.with_name(job.directory.name + one.ending))
+    steps = budget.steps_of_many if load_env_spec(task).n_agents > 1 else budget.steps
+    shared_settings = {
+        "method": contender.method,
+        "algorithm": contender.algorithm,
+        "steps": steps,
+        "seeds": budget.seeds,
+    }
+    shared_settings |= budget.algorithms.get(choose_algorithm(contender.algorithm, load_env_spec(task)), {})
+    latent = find_method(contender.method).needs_phi
+    for draw in range(min(budget.draws, contender.draws) if latent else 1):
+        job = make_job(
+            root, task, Settings(**{**contender.settings, **budget.settings, **shared_settings, "draw": draw})
+        )
+        yield replace(job, directory=job.directory.with_name(job.directory.name + contender.ending))

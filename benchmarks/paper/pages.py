@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lare_rl.errors import LareError
-from lare_rl.report.figures import on_white
+from lare_rl.report.figures import add_white_background
 from lare_rl.util.files import write_atomically
 
 REMARKS = "\n## Remarks\n"
@@ -33,7 +33,7 @@ def write_page(page: Page, directory: Path) -> Path:
         before = path.read_text(encoding="utf-8") if path.exists() else ""
         remarks = before[before.index(REMARKS) :] if REMARKS in before else ""
         for name, svg in page.pictures.items():
-            (directory / name).write_text(on_white(svg) + "\n", encoding="utf-8")
+            (directory / name).write_text(add_white_background(svg) + "\n", encoding="utf-8")
         text = page.text.rstrip() + "\n" + remarks
         write_atomically(path, lambda file: file.write(text.encode()))
     except UnicodeDecodeError as error:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lare_rl import theory
-from lare_rl.compare.statistics import Band, plus_minus
 from lare_rl.report import figures
+from lare_rl.util.statistics import Band, format_plus_minus
 from paper.exhibits import Budget
 from paper.pages import Page, items, table
 from paper.theory import History, Table
@@ -21,13 +21,13 @@ REDUNDANT = (1, 2, 4, 8, 16)
 PICTURE = "theory-regret.svg"
 
 
-def page_of(budget: Budget, command: str) -> Page:
+def make_page(budget: Budget, command: str) -> Page:
     """Play OFUL on random problems, with tables of more and more redundant entries."""
     episodes, runs = budget.tabular.episodes, budget.tabular.runs
-    found = {redundant: played(redundant, episodes, runs) for redundant in REDUNDANT}
-    latent = float(np.mean(last(found[1])))
-    rows = [row(redundant, history, latent) for redundant, history in found.items()]
-    parts = [
+    histories = {redundant: played(redundant, episodes, runs) for redundant in REDUNDANT}
+    latent = float(np.mean(last(histories[1])))
+    rows = [row(redundant, history, latent) for redundant, history in histories.items()]
+    sections = [
         f"# {TITLE}",
         f"Propositions 1 and 2 of the paper (section Analysis, appendix B), by `{command}`: OFUL with an episode's sum of "
         f"rewards for feedback, on {runs} random problems of {CORES} states that matter and {ACTIONS} actions, "
@@ -54,8 +54,8 @@ def page_of(budget: Budget, command: str) -> Page:
                 "Proposition 1, |r - r_hat_k| <= l_k at all k with probability 1 - delta/10: see above. The problems are the same "
                 "for every table.",
                 "Proposition 2, the regret with |D| entries is bounded lower than with |S||A|: the raw table's regret is "
-                f"{np.mean(last(found[REDUNDANT[-1]])) / latent:.1f} times the latent one's with {REDUNDANT[-1]} forms, and "
-                f"{growth(found)}. The latent one's does not change with the forms, because phi leaves them out.",
+                f"{np.mean(last(histories[REDUNDANT[-1]])) / latent:.1f} times the latent one's with {REDUNDANT[-1]} forms, and "
+                f"{growth(histories)}. The latent one's does not change with the forms, because phi leaves them out.",
             )
         ),
         "## What differs from the paper",
@@ -66,18 +66,18 @@ def page_of(budget: Budget, command: str) -> Page:
             )
         ),
     ]
-    lines = {label(redundant): band(history) for redundant, history in found.items()}
-    return Page("theory", "\n\n".join(parts), {PICTURE: figures.bands(lines, "episodes", "regret", steps=True)})
+    lines = {label(redundant): band(history) for redundant, history in histories.items()}
+    return Page("theory", "\n\n".join(sections), {PICTURE: figures.draw_bands(lines, "episodes", "regret", steps=True)})
 
 
 def played(redundant: int, episodes: int, runs: int) -> History:
     """One problem for each run, the same for every table."""
 
-    def one(key: PRNGKeyArray) -> History:
+    def simulate(key: PRNGKeyArray) -> History:
         problem, luck = jax.random.split(key)
         return theory.oful(luck, theory.random_mdp(problem, CORES, ACTIONS), redundant, HORIZON, episodes, DELTA)
 
-    return jax.vmap(one)(jax.random.split(jax.random.key(0), runs))
+    return jax.vmap(simulate)(jax.random.split(jax.random.key(0), runs))
 
 
 def last(history: History) -> Float[np.ndarray, " runs"]:
@@ -90,22 +90,22 @@ def row(redundant: int, history: History, latent: float) -> list[str]:
     return [
         label(redundant),
         str(Table(CORES, redundant, ACTIONS).size),
-        plus_minus(mean, deviation),
+        format_plus_minus(mean, deviation),
         f"{mean / latent:.2f}",
         f"{float(history.radius[0, -1]):.1f}",
         f"{float(np.max(np.asarray(history.error / history.radius))):.2f}",
-        held(history),
+        bound_holds(history),
     ]
 
 
-def held(history: History) -> str:
+def bound_holds(history: History) -> str:
     """In how many runs the bound held at every episode."""
-    always = np.asarray(theory.held(history))
+    always = np.asarray(theory.bound_holds(history))
     return f"{always.sum()} of {always.size}"
 
 
-def growth(found: Mapping[int, History]) -> str:
-    means = [float(np.mean(last(history))) for history in found.values()]
+def growth(histories: Mapping[int, History]) -> str:
+    means = [float(np.mean(last(history))) for history in histories.values()]
     grows = all(more > less for less, more in itertools.pairwise(means))
     return "it grows with every doubling" if grows else "it does not grow with every doubling at this budget"
 
@@ -117,7 +117,7 @@ def label(redundant: int) -> str:
 def band(history: History) -> Band:
     """Episodes, mean regret, and one standard deviation on both sides."""
     regret = np.asarray(history.regret)
-    every = max(1, regret.shape[1] // 200)
-    shown = regret[:, ::every]
-    mean, deviation = shown.mean(axis=0), shown.std(axis=0, ddof=1)
-    return Band(np.arange(1, regret.shape[1] + 1, every, dtype=float), mean, mean - deviation, mean + deviation)
+    stride = max(1, regret.shape[1] // 200)
+    thinned = regret[:, ::stride]
+    mean, deviation = thinned.mean(axis=0), thinned.std(axis=0, ddof=1)
+    return Band(np.arange(1, regret.shape[1] + 1, stride, dtype=float), mean, mean - deviation, mean + deviation)

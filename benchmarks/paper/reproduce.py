@@ -5,18 +5,18 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from lare_rl.compare.metric_tables import rows_of, write_table
-from lare_rl.compare.statistics import rliable
+from lare_rl.compare.bootstrap import load_rliable
+from lare_rl.compare.metric_tables import read_metric_rows, write_table
 from lare_rl.errors import LareError
-from lare_rl.sweep.jobs import Job, check
-from lare_rl.sweep.sweep import Share, run_sweep
+from lare_rl.sweep.jobs import Job, check_job
+from lare_rl.sweep.sweep import Resources, run_sweep
 from paper import correlations, regret, trained
-from paper.exhibits import Budget, budgets, exhibits, jobs_of
+from paper.exhibits import Budget, budgets, exhibit_jobs, exhibits
 from paper.pages import Page, write_page
 
 UNTRAINED: dict[str, tuple[str, str, Callable[[Budget, str], Page]]] = {
-    "table-1": ("table 1", correlations.TITLE, correlations.page_of),
-    "theory": ("propositions 1 and 2", regret.TITLE, regret.page_of),
+    "table-1": ("table 1", correlations.TITLE, correlations.make_page),
+    "theory": ("propositions 1 and 2", regret.TITLE, regret.make_page),
 }
 """Exhibits that need no training: place in the paper, title, and the page."""
 
@@ -38,7 +38,7 @@ def quiet(jobs: Sequence[Job]) -> AbstractContextManager[Callable[[str], None]]:
 def reproduce(
     name: str,
     budget: str,
-    share: Share,
+    share: Resources,
     root: Path,
     out: Path,
     ray: str | None = None,
@@ -55,29 +55,29 @@ def reproduce(
     Raises:
         LareError: there is no such exhibit, rliable is not installed, or one of the runs failed.
     """
-    common, command = budgets()[budget], f"lare-rl reproduce {name} --budget {budget}"
-    names = [one for one, _, _ in listed()]
+    shared_budget, command = budgets()[budget], f"lare-rl reproduce {name} --budget {budget}"
+    names = [exhibit_name for exhibit_name, _, _ in listed()]
     if name not in names:
         raise LareError(f"no exhibit {name!r}; the exhibits are {', '.join(names)}")
     # Checked before the first run is trained, because otherwise an error would come only after hours.
-    place = room_for(out / budget, name)
+    folder = room_for(out / budget, name)
     if name in UNTRAINED:
-        page_of = UNTRAINED[name][-1]
-        return write_page(page_of(common, command), place)
-    rliable()
+        make_page = UNTRAINED[name][-1]
+        return write_page(make_page(shared_budget, command), folder)
+    load_rliable()
     exhibit = exhibits()[name]
-    jobs = jobs_of(exhibit, budget, root / budget)
-    every = [job for of_task in jobs.values() for some in of_task.values() for job in some]
-    for job in every:
-        check(job)
-    with watching(every) as said:
-        failed = run_sweep(share, every, said, ray)
+    jobs = exhibit_jobs(exhibit, budget, root / budget)
+    all_jobs = [job for task_jobs in jobs.values() for contender_jobs in task_jobs.values() for job in contender_jobs]
+    for job in all_jobs:
+        check_job(job)
+    with watching(all_jobs) as listener:
+        failed = run_sweep(share, all_jobs, listener, ray)
     if failed:
-        named = ", ".join(job.name for job in failed)
-        raise LareError(f"{len(failed)} of {len(every)} runs failed, so there is no page: {named}")
-    page = trained.page_of(name, exhibit, common, jobs, command)
-    write_table(rows_of(job.directory for job in every), place / name)
-    return write_page(page, place)
+        failed_names = ", ".join(job.name for job in failed)
+        raise LareError(f"{len(failed)} of {len(all_jobs)} runs failed, so there is no page: {failed_names}")
+    page = trained.make_page(name, exhibit, shared_budget, jobs, command)
+    write_table(read_metric_rows(job.directory for job in all_jobs), folder / name)
+    return write_page(page, folder)
 
 
 def room_for(directory: Path, name: str) -> Path:

@@ -86,10 +86,10 @@ def visits(mdp: MDP, policy: Int[Array, " cores"], horizon: int) -> Float[Array,
     return jnp.sum(chances, axis=0)[:, None] * jax.nn.one_hot(policy, actions)
 
 
-def shared_out(of_core: Float[Array, "*batch cores actions"], table: Table) -> Float[Array, "*batch size"]:
+def shared_out(core_values: Float[Array, "*batch cores actions"], table: Table) -> Float[Array, "*batch size"]:
     """A table of the core's entries, each shared out evenly over the redundant ones."""
-    share = jnp.repeat(of_core[..., :, None, :] / table.redundant, table.redundant, axis=-2)
-    return share.reshape(*of_core.shape[:-2], table.size)
+    share = jnp.repeat(core_values[..., :, None, :] / table.redundant, table.redundant, axis=-2)
+    return share.reshape(*core_values.shape[:-2], table.size)
 
 
 def nothing_seen(size: int, ridge: float) -> Estimator:
@@ -130,11 +130,11 @@ def play(
         action = policy[core]
         redundant = jax.random.randint(redundant_key, (), 0, table.redundant)
         entry = (core * table.redundant + redundant) * table.actions + action
-        paid = jax.random.bernoulli(reward_key, mdp.reward[core, action]).astype(jnp.float32)
-        return jax.random.categorical(move_key, jnp.log(mdp.transition[core, action])), (entry, paid)
+        reward = jax.random.bernoulli(reward_key, mdp.reward[core, action]).astype(jnp.float32)
+        return jax.random.categorical(move_key, jnp.log(mdp.transition[core, action])), (entry, reward)
 
-    _, (entries, paid) = jax.lax.scan(step, jnp.zeros((), jnp.int32), jax.random.split(key, horizon))
-    return jnp.zeros(table.size).at[entries].add(1.0), jnp.sum(paid)
+    _, (entries, reward) = jax.lax.scan(step, jnp.zeros((), jnp.int32), jax.random.split(key, horizon))
+    return jnp.zeros(table.size).at[entries].add(1.0), jnp.sum(reward)
 
 
 @partial(jax.jit, static_argnames=("redundant", "horizon", "episodes", "delta"))
@@ -146,12 +146,12 @@ def oful(key: PRNGKeyArray, mdp: MDP, redundant: int, horizon: int, episodes: in
     cores, actions = mdp.reward.shape
     table, ridge = Table(cores, redundant, actions), float(horizon)
     choices = policies(cores, actions)
-    of_core = jax.vmap(lambda policy: visits(mdp, policy, horizon))(choices)
-    expected = shared_out(of_core, table)
-    value = jnp.sum(of_core * mdp.reward, axis=(1, 2))
+    core_values = jax.vmap(lambda policy: visits(mdp, policy, horizon))(choices)
+    expected = shared_out(core_values, table)
+    value = jnp.sum(core_values * mdp.reward, axis=(1, 2))
     true = shared_out(mdp.reward * redundant, table)
 
-    def one(carry: tuple[Estimator, Float[Array, ""]], turn: tuple[PRNGKeyArray, Float[Array, ""]]):
+    def step_episode(carry: tuple[Estimator, Float[Array, ""]], turn: tuple[PRNGKeyArray, Float[Array, ""]]):
         (state, regret), (key, number) = carry, turn
         chosen = optimistic(state, expected, radius(number, horizon, table.size, ridge, delta))
         state = update(state, *play(key, mdp, choices[chosen], table, horizon))
@@ -161,9 +161,9 @@ def oful(key: PRNGKeyArray, mdp: MDP, redundant: int, horizon: int, episodes: in
         return (state, regret), History(regret, error, radius(number + 1, horizon, table.size, ridge, delta))
 
     turns = (jax.random.split(key, episodes), jnp.arange(episodes, dtype=jnp.float32))
-    return jax.lax.scan(one, (nothing_seen(table.size, ridge), jnp.zeros(())), turns)[1]
+    return jax.lax.scan(step_episode, (nothing_seen(table.size, ridge), jnp.zeros(())), turns)[1]
 
 
-def held(history: History) -> Bool[Array, "*runs"]:
+def bound_holds(history: History) -> Bool[Array, "*runs"]:
     """Whether |r - r_hat_k|_{A_k} <= l_k at every k, as Proposition 1 promises with probability 1 - delta / 10."""
     return jnp.all(history.error <= history.radius, axis=-1)

@@ -4,30 +4,26 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from lare_rl.algorithms.table import ALGORITHMS, Consumes
-from lare_rl.compare.scores import CORRELATION, ERROR, RETURN, SUMMED_RETURN, Group
-from lare_rl.compare.statistics import (
-    REPETITIONS,
-    Band,
-    Comparison,
-    compare,
-    in_words,
-    mann_whitney,
-    mann_whitney_u,
-    plus_minus,
-    too_few,
-)
-from lare_rl.envs.families import env_spec
+from lare_rl.algorithms.registry import ALGORITHMS, Consumes
+from lare_rl.compare.bootstrap import REPETITIONS
+from lare_rl.compare.comparison import Comparison, compare
+from lare_rl.compare.mann_whitney import mann_whitney, mann_whitney_u
+from lare_rl.compare.messages import find_small_samples, to_text
+from lare_rl.compare.results import read_run_results
+from lare_rl.compare.scores import Group
+from lare_rl.envs.families import load_env_spec
 from lare_rl.report import figures
-from lare_rl.runs.directory import Run, read_measured
-from paper.exhibits import OURS, Budget, Claim, Exhibit, Jobs
+from lare_rl.runs.directory import Run, open_without_functions
+from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, SUMMED_RETURN
+from lare_rl.util.statistics import Band, format_mean_std, format_plus_minus
+from paper.exhibits import LARE_SOURCE, Budget, Claim, Exhibit, Jobs
 from paper.pages import Page, items, table
 
 TRAVELLED, WON = "evaluation/x_position", "evaluation/won"
 MEANING = {
     RETURN: "true return",
     SUMMED_RETURN: "true return, sum over the agents",
-    ERROR: "error of the proxy reward",
+    CREDIT_ERROR: "error of the proxy reward",
     TRAVELLED: "metres travelled",
     WON: "share of battles won",
 }
@@ -38,7 +34,7 @@ SEEDS, STEPS, STEPS_OF_MANY, STEPS_OF_STARCRAFT = 5, 1_000_000, 2_050_000, 10_05
 
 LEVEL = 0.025
 """A claim is decided if the probability of as many pairs by chance is at most this."""
-JUDGED = (
+VERDICT_NOTE = (
     "A cell counts the pairs of runs, one run of each side, in which the claim holds. A run is a seed; where both sides "
     "have several draws of the language model, it is a draw, with the mean over its seeds. p is the probability of as many "
     "pairs or more by chance, over all tasks (Mann and Whitney's exact test). A claim, or its opposite, is decided at p up to "
@@ -57,37 +53,42 @@ ALWAYS = (
 """Differences from the paper's protocol."""
 
 
-def page_of(name: str, exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
+def make_page(name: str, exhibit: Exhibit, budget: Budget, jobs: Jobs, command: str) -> Page:
     """The results of the runs, beside those of the paper.
 
     Raises:
         LareError: the table of runs is incomplete.
     """
     runs = {
-        task: {label: [read_measured(job.directory) for job in some] for label, some in of_task.items()}
-        for task, of_task in jobs.items()
+        task: {
+            label: [open_without_functions(job.directory) for job in contender_runs]
+            for label, contender_runs in task_runs.items()
+        }
+        for task, task_runs in jobs.items()
     }
-    every = [run for of_task in runs.values() for some in of_task.values() for run in some]
-    found = {task: compare(of_task, exhibit.measure) for task, of_task in runs.items()}
-    pictures = {f"{name}-{task}.svg": picture(one, exhibit) for task, one in found.items()}
-    ours = exhibit.source == OURS
-    origin = "Not in the paper" if ours else f"The paper's {exhibit.source}"
-    claims = "What was expected" if ours else "What the paper says"
-    parts = [
+    all_runs = [run for task_runs in runs.values() for contender_runs in task_runs.values() for run in contender_runs]
+    comparison = {
+        task: compare(read_run_results(task_runs, exhibit.measure), exhibit.measure) for task, task_runs in runs.items()
+    }
+    pictures = {f"{name}-{task}.svg": picture(entry, exhibit) for task, entry in comparison.items()}
+    is_lare = exhibit.source == LARE_SOURCE
+    origin = "Not in the paper" if is_lare else f"The paper's {exhibit.source}"
+    claims = "What was expected" if is_lare else "What the paper says"
+    sections = [
         f"# {exhibit.title}",
         f"{origin}, by `{command}`.",
-        protocol(every),
-        *(part for task in jobs for part in of_one_task(name, exhibit, task, runs[task], found[task])),
+        protocol(all_runs),
+        *(section for task in jobs for section in task_sections(name, exhibit, task, runs[task], comparison[task])),
         f"## {claims}, and what came out",
         table(
-            ["expected" if ours else "the paper", *found, "p", "here"],
-            (claimed(claim, other, exhibit, found) for claim in exhibit.claims for other in claim.than),
+            ["expected" if is_lare else "the paper", *comparison, "p", "here"],
+            (claimed(claim, other, exhibit, comparison) for claim in exhibit.claims for other in claim.than),
         ),
-        JUDGED,
+        VERDICT_NOTE,
         "## What differs from the paper",
-        items(differences(exhibit, budget, len(runs), every)),
+        items(differences(exhibit, budget, len(runs), all_runs)),
     ]
-    return Page(name, "\n\n".join(parts), pictures)
+    return Page(name, "\n\n".join(sections), pictures)
 
 
 def differences(exhibit: Exhibit, budget: Budget, tasks: int, runs: Sequence[Run]) -> Iterator[str]:
@@ -97,29 +98,29 @@ def differences(exhibit: Exhibit, budget: Budget, tasks: int, runs: Sequence[Run
     if tasks < len(exhibit.tasks):
         yield f"Tasks: {tasks} of {len(exhibit.tasks)}."
     steps = max(run.config.settings.steps for run in runs)
-    one_agent = not any(env_spec(run.config.task).agents > 1 for run in runs)
+    one_agent = not any(load_env_spec(run.config.task).n_agents > 1 for run in runs)
     consumes = {ALGORITHMS[run.config.settings.algorithm].consumes for run in runs}
-    theirs = STEPS if one_agent else STEPS_OF_STARCRAFT if Consumes.SEQUENCES in consumes else STEPS_OF_MANY
-    if steps != theirs:
-        yield f"Environment steps: {steps:,} (the paper: {theirs:,})."
+    paper_steps = STEPS if one_agent else STEPS_OF_STARCRAFT if Consumes.SEQUENCES in consumes else STEPS_OF_MANY
+    if steps != paper_steps:
+        yield f"Environment steps: {steps:,} (the paper: {paper_steps:,})."
     if budget.settings:
         yield "**Networks of a few units, small batches, two episodes in an evaluation: it runs, and learns nothing.**"
     yield from exhibit.differences
     if one_agent:
-        yield from of_one_agent({run.config.task.name: run for run in runs})
+        yield from single_agent_notes({run.config.task.name: run for run in runs})
     yield from ALWAYS
 
 
-def of_one_agent(runs: Mapping[str, Run]) -> Iterator[str]:
+def single_agent_notes(runs: Mapping[str, Run]) -> Iterator[str]:
     """Differences from the paper's protocol for one agent; `runs` has one run of each task."""
     for task, run in runs.items():
-        credit, longest = run.config.settings.credit, env_spec(run.config.task).max_steps
-        drawn = credit.drawn_steps
-        if longest < drawn:
+        credit, longest = run.config.settings.credit, load_env_spec(run.config.task).max_steps
+        drawn_steps = credit.drawn_steps
+        if longest < drawn_steps:
             yield (
-                f"Episodes of fewer than {drawn} steps are taken whole (the paper: {drawn} steps with replacement). So RRD and "
+                f"Episodes of fewer than {drawn_steps} steps are taken whole (the paper: {drawn_steps} steps with replacement). So RRD and "
                 f"RRD-unbiased have the loss of RD on {task}, whose episodes have {longest} steps; an update reads "
-                f"{credit.steps // drawn} episodes, and {credit.steps // longest} for RD."
+                f"{credit.steps // drawn_steps} episodes, and {credit.steps // longest} for RD."
             )
     before = [task for task, run in runs.items() if run.config.task.judges == "before"]
     exception = (
@@ -133,9 +134,9 @@ def protocol(runs: Sequence[Run]) -> str:
     plans = [run.config.settings for run in runs]
     steps = sorted({plan.steps for plan in plans})
     seeds = sorted({seed for run in runs for seed in run.seeds})
-    versions = sorted({f"{name} {found}" for run in runs for name, found in run.config.versions.items()})
+    versions = sorted({f"{name} {comparison}" for run in runs for name, comparison in run.config.versions.items()})
     return (
-        f"{' and '.join(f'{one:,}' for one in steps)} environment steps, {span('seed', seeds)}, "
+        f"{' and '.join(f'{entry:,}' for entry in steps)} environment steps, {span('seed', seeds)}, "
         f"{span('draw', sorted({plan.draw for plan in plans}))} of the language model. "
         f"LaRe {', '.join(sorted({run.config.lare for run in runs}))}; {', '.join(versions)}; "
         f"{'; '.join(sorted({run.config.machine for run in runs}))}."
@@ -147,38 +148,42 @@ def span(name: str, numbers: Sequence[int]) -> str:
     return f"{name} {numbers[0]}" if len(numbers) == 1 else f"{name}s {numbers[0]} to {numbers[-1]}"
 
 
-def of_one_task(
-    name: str, exhibit: Exhibit, task: str, runs: Mapping[str, Sequence[Run]], found: Comparison
+def task_sections(
+    name: str, exhibit: Exhibit, task: str, runs: Mapping[str, Sequence[Run]], comparison: Comparison
 ) -> Iterator[str]:
     """A picture and a table."""
     key, printed = exhibit.measure, exhibit.printed.get(task, {})
     yield f"## {task}"
     yield f"![{task}]({name}-{task}.svg)"
     columns = {RETURN: "return"} if key == WON else {}
-    columns |= {} if key == ERROR else {ERROR: "error of the proxy reward", CORRELATION: "its correlation"}
+    columns |= (
+        {}
+        if key == CREDIT_ERROR
+        else {CREDIT_ERROR: "error of the proxy reward", CREDIT_CORRELATION: "its correlation"}
+    )
     beside = ["the paper"] if printed else list(columns.values())
-    several = max(len(some) for some in runs.values()) > 1
+    several = max(len(contender_runs) for contender_runs in runs.values()) > 1
     head = ["", f"{MEANING[key]}: IQM [95%]", "mean ± sd", *(["mean [95%] over draws"] if several else []), *beside]
-    step, rows = int(found.curves[found.rows[0].label].x[-1]), []
-    for row in found.rows:
+    step, rows = comparison.last_step, []
+    for row in comparison.rows:
         cells = [
             row.label,
             str(row.iqm),
-            plus_minus(row.mean, row.deviation),
+            format_plus_minus(row.mean, row.std),
         ]
         if several:
-            cells.append("-" if row.over_draws is None else str(row.over_draws))
+            cells.append("-" if row.draw_mean is None else str(row.draw_mean))
         if printed:
             cells.append(printed.get(row.label, "-"))
         else:
             cells += [mean_and_spread(runs[row.label], column, step) for column in columns]
         rows.append(cells)
     yield table(head, rows)
-    fewest = min(row.seeds for row in found.rows)
+    fewest = min(row.n_seeds for row in comparison.rows)
     few = " (of fewer than four it is the mean)" if fewest < 4 else ""
     yield (
         f"At step {step:,}. IQM: interquartile mean over the seeds{few}, its interval by {REPETITIONS:,} stratified bootstraps; "
-        f"sd: standard deviation over the seeds. {too_few(found)}".rstrip()
+        f"sd: standard deviation over the seeds. {to_text(find_small_samples(comparison))}".rstrip()
     )
 
 
@@ -190,31 +195,37 @@ def mean_and_spread(runs: Sequence[Run], key: str, step: int) -> str:
             by_seed.setdefault(line["seed"], []).append(line[key])
     if not by_seed:
         return "-"
-    return in_words(np.array([np.mean(values) for values in by_seed.values()]))
+    return format_mean_std(np.array([np.mean(values) for values in by_seed.values()]))
 
 
-def picture(found: Comparison, exhibit: Exhibit) -> str:
+def picture(comparison: Comparison, exhibit: Exhibit) -> str:
     """Learning curves, with a panel for each algorithm if there are several."""
     across, up = "environment steps", f"{MEANING[exhibit.measure]}, IQM"
     panels: dict[str, dict[str, Band]] = {}
-    for label, one in exhibit.contenders.items():
-        panel = panels.setdefault(one.algorithm or "", {})
-        panel[label.removesuffix(f", {one.algorithm}")] = found.curves[label]
+    for label, entry in exhibit.contenders.items():
+        panel = panels.setdefault(entry.algorithm or "", {})
+        panel[label.removesuffix(f", {entry.algorithm}")] = comparison.curves[label]
     if len(panels) > 1:
-        return figures.bands_side_by_side(panels, across, up)
-    return figures.bands(found.curves, across, up, steps=True, decades=exhibit.measure == ERROR)
+        return figures.draw_band_panels(panels, across, up)
+    return figures.draw_bands(comparison.curves, across, up, steps=True, log_scale=exhibit.measure == CREDIT_ERROR)
 
 
-def claimed(claim: Claim, other: str, exhibit: Exhibit, found: Mapping[str, Comparison]) -> list[str]:
+def claimed(claim: Claim, other: str, exhibit: Exhibit, comparison: Mapping[str, Comparison]) -> list[str]:
     """A table row: the claim, the number of pairs of runs in which it holds on each task, p, and the verdict over all tasks."""
-    pairs = [units(one.groups[claim.better], one.groups[other]) for one in found.values()]
-    if exhibit.measure == ERROR:
-        pairs = [(-ours, -theirs) for ours, theirs in pairs]
-    won = [mann_whitney_u(ours, theirs) for ours, theirs in pairs]
-    of = [len(ours) * len(theirs) for ours, theirs in pairs]
+    pairs = [units(entry.groups[claim.better], entry.groups[other]) for entry in comparison.values()]
+    if exhibit.measure == CREDIT_ERROR:
+        pairs = [(-is_lare, -paper_steps) for is_lare, paper_steps in pairs]
+    won = [mann_whitney_u(is_lare, paper_steps) for is_lare, paper_steps in pairs]
+    of = [len(is_lare) * len(paper_steps) for is_lare, paper_steps in pairs]
     chance, contrary = mann_whitney(pairs)
     everywhere = all(2 * count >= all_of_them for count, all_of_them in zip(won, of, strict=True))
-    says = "errs less than" if exhibit.measure == ERROR else "is at least as good as" if claim.at_least else "is above"
+    says = (
+        "errs less than"
+        if exhibit.measure == CREDIT_ERROR
+        else "is at least as good as"
+        if claim.at_least
+        else "is above"
+    )
     return [
         f"{claim.better} {says} {other}",
         *(f"{count:g} of {all_of_them}" for count, all_of_them in zip(won, of, strict=True)),
@@ -223,11 +234,11 @@ def claimed(claim: Claim, other: str, exhibit: Exhibit, found: Mapping[str, Comp
     ]
 
 
-def units(one: Group, other: Group) -> tuple[np.ndarray, np.ndarray]:
+def units(entry: Group, other: Group) -> tuple[np.ndarray, np.ndarray]:
     """The scores by which two labels are compared at the last step: by draw if both have several draws, else by seed."""
-    axis = 1 if min(len(one.draws), len(other.draws)) > 1 else 0
-    ours, theirs = (group.scores[..., 0, -1].mean(axis=axis) for group in (one, other))
-    return ours, theirs
+    axis = 1 if min(len(entry.draws), len(other.draws)) > 1 else 0
+    is_lare, paper_steps = (group.scores[..., 0, -1].mean(axis=axis) for group in (entry, other))
+    return is_lare, paper_steps
 
 
 def verdict(chance: float, contrary: float, everywhere: bool, at_least: bool) -> str:

@@ -1,145 +1,157 @@
 """Errors for the user, about input that cannot be used."""
 
 import difflib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from inspect import cleandoc
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from inspect import cleandoc, isclass
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import TYPE_CHECKING, Any, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import core_schema
 
-LONGEST_VALUE = 100
-"""The largest number of characters that a message quotes of a value."""
+__all__ = [
+    "CheckedModel",
+    "LareError",
+    "did_you_mean",
+    "install_command",
+    "missing_extra_error",
+    "model_keys",
+    "nested_model",
+    "short_repr",
+]
 
-MOST_PROBLEMS = 3
-"""The largest number of problems that a message lists."""
+MAX_REPR = 100
+"""Characters of a value that a message quotes."""
+
+MAX_PROBLEMS = 3
+"""Problems that a message lists."""
 
 
 class LareError(Exception):
     """An error that the user can correct.
 
-    The message is one line: what was wrong, where, and what would be right. The command line prints it without a
-    traceback.
+    The message is one line: what happened, where, and what to do. The command line prints it without a traceback.
     """
 
     status = 2
     """The exit status of the command line."""
 
 
-def pip_install(extra: str, package: Path = Path(__file__).parent) -> str:
-    """The command that installs an extra: of the checkout that this package is in, or of the package index."""
+def install_command(extra: str, package: Path = Path(__file__).parent) -> str:
+    """Return the command that installs an extra: of the checkout that this package is in, or of the package index."""
     checkout = package.parents[1]
     if package.parent.name == "src" and (checkout / "pyproject.toml").is_file():
         return f"pip install --editable '{checkout}[{extra}]'"
     return f"pip install 'lare-rl[{extra}]'"
 
 
-def needs_extra(what: str, extra: str) -> LareError:
-    """The error for an optional library that is not installed."""
-    return LareError(f"{what} needs an extra: {pip_install(extra)}")
+def missing_extra_error(feature: str, extra: str) -> LareError:
+    """Return the error for an optional library that is not installed."""
+    return LareError(f"{feature} needs an extra: {install_command(extra)}")
 
 
-class Checked(BaseModel):
-    """Validated values from outside. They are frozen, and an invalid one raises a `LareError` of one line."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
-
-    @classmethod
-    def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        for field in cls.model_fields.values():  # docstrings, without line breaks, which `--help` sets itself
-            field.description = " ".join((field.description or "").split()) or None
-        told = [f"{name}: {field.description}" for name, field in cls.model_fields.items() if field.description]
-        if cls.__doc__ and told:  # for help(), which knows no docstrings of fields
-            lines = [fill(line, 120, initial_indent=" " * 4, subsequent_indent=" " * 8) for line in told]
-            cls.__doc__ = "\n".join([cleandoc(cls.__doc__), "", "Attributes:", *lines])
-
-    @model_validator(mode="before")
-    @classmethod
-    def with_the_defaults_of_their_places(cls, values: Any) -> Any:
-        """Complete nested settings by the default of the field that holds them, which may differ from the class's own defaults."""
-        if not isinstance(values, Mapping):
-            return values
-        defaults = {name: cls.model_fields[name].default for name in values if name in cls.model_fields}
-        return {name: completed(defaults.get(name), value) for name, value in values.items()}
-
-    def __init__(self, /, **values: Any):
-        try:
-            super().__init__(**values)
-        except ValidationError as error:
-            raise LareError(problems_of(error, keys_of(type(self)))) from None
-
-    # Pydantic shall not call it for settings within settings: then the outermost settings report the error, with its whole place.
-    __init__.__pydantic_base_init__ = True  # pyright: ignore[reportFunctionMemberAccess]
-
-
-def keys_of(settings: type[Checked]) -> Iterator[str]:
-    """The keys of settings, and of the settings within them as `td3.gamma`."""
-    for name, field in settings.model_fields.items():
-        yield name
-        if isinstance(field.default, Checked):
-            yield from (f"{name}.{inner}" for inner in keys_of(type(field.default)))
-
-
-def completed(default: Any, given: Any) -> Any:
-    """The given value. If it is settings, or a mapping for settings, its missing keys are taken from the default."""
-    if isinstance(default, Checked) and isinstance(given, type(default)):
-        given = {name: getattr(given, name) for name in given.model_fields_set}
-    if not (isinstance(default, Checked) and isinstance(given, Mapping)):
-        return given
-    usual = {name: getattr(default, name) for name in type(default).model_fields}
-    return usual | {name: completed(usual.get(name), value) for name, value in given.items()}
-
-
-def shortened(value: Any) -> str:
-    """The repr of a value, cut to fit into a line."""
+def short_repr(value: Any) -> str:
+    """Return the repr of a value, cut to fit into a line."""
     try:
         text = " ".join(map(str.strip, repr(value).splitlines()))  # arrays have several lines
     except Exception:  # the value may be nested too deep, or of a class whose repr fails
         return f"a {type(value).__name__} that cannot be shown"
-    return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]}..."
+    return text if len(text) <= MAX_REPR else f"{text[:MAX_REPR]}..."
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """A hint at the closest known name, or at one that contains this name; empty if there is none."""
-    names = list(known)
-    ends = [one for one in names if one.endswith(f".{name.lstrip('-')}")]
-    within = [one for one in names if len(name) > 2 and name.lower() in one.lower()]
-    close = ends[:1] or difflib.get_close_matches(name, names, n=1) or within[:1]
+def did_you_mean(name: str, known_names: Iterable[str]) -> str:
+    """Return a hint at the closest known name, or at one that contains this name; empty if no name is close."""
+    names = list(known_names)
+    suffixed = [other for other in names if other.endswith(f".{name.lstrip('-')}")]
+    containing = [other for other in names if len(name) > 2 and name.lower() in other.lower()]
+    close = suffixed[:1] or difflib.get_close_matches(name, names, n=1) or containing[:1]
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-def problems_of(error: ValidationError, known: Iterable[str] = ()) -> str:
-    """The first problems that pydantic found, in one line, and the number of others. Unknown keys get a hint at `known` ones."""
-    names = tuple(known)
+class CheckedModel(BaseModel):
+    """Validated values from outside. They are frozen, and invalid values raise a `LareError` of one line."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    if TYPE_CHECKING:  # values are checked at run time, because most of them come from files
+
+        def __init__(self, /, **values: Any) -> None: ...
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Add the fields' docstrings to the docstring of the class, for `help()`."""
+        docs = {name: field.description for name, field in cls.model_fields.items() if field.description}
+        if cls.__doc__ and docs:
+            lines = [
+                fill(f"{name}: {' '.join(doc.split())}", 120, initial_indent=" " * 4, subsequent_indent=" " * 8)
+                for name, doc in docs.items()
+            ]
+            cls.__doc__ = "\n".join([cleandoc(cls.__doc__), "", "Attributes:", *lines])
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        """Add `_validate` around all other validators."""
+        return core_schema.no_info_wrap_validator_function(cls._validate, handler(source))
+
+    @classmethod
+    def _validate(cls, values: Any, handler: Callable[[Any], Any]) -> Any:
+        if _is_nested.get():  # the outermost model reports the error, with the whole path of its key
+            return handler(values)
+        token = _is_nested.set(True)
+        try:
+            return handler(values)
+        except ValidationError as error:
+            raise LareError(_describe(error, tuple(model_keys(cls)))) from None
+        finally:
+            _is_nested.reset(token)
+
+
+_is_nested: ContextVar[bool] = ContextVar("is_nested", default=False)
+
+
+def nested_model(field: FieldInfo) -> type[CheckedModel] | None:
+    """Return the model that is the value of a field, if it is not None."""
+    kinds = (field.annotation, *get_args(field.annotation))
+    return next((kind for kind in kinds if isclass(kind) and issubclass(kind, CheckedModel)), None)
+
+
+def model_keys(model: type[CheckedModel]) -> Iterator[str]:
+    """Yield the keys of a model, and those of models directly in it as `td3.gamma`."""
+    for name, field in model.model_fields.items():
+        yield name
+        if nested := nested_model(field):
+            yield from (f"{name}.{key}" for key in nested.model_fields)
+
+
+def _describe(error: ValidationError, keys: Sequence[str]) -> str:
+    """Describe the first problems in one line, and count the others."""
     # Unknown keys come first, because a misspelt key is also a missing one.
     problems = sorted(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
-    missing = [place_of(problem) for problem in problems if problem["type"] == "missing"]
-    said = [in_words(problem, names) for problem in problems if problem["type"] != "missing"]
+    texts = [_describe_problem(problem, keys) for problem in problems if problem["type"] != "missing"]
+    missing = ", ".join(repr(_path(problem)) for problem in problems if problem["type"] == "missing")
     if missing:
-        listed = ", ".join(map(repr, missing))
-        said.append(f"the key {listed} is missing" if len(missing) == 1 else f"the keys {listed} are missing")
-    more = f" (and {len(said) - MOST_PROBLEMS} more)" if len(said) > MOST_PROBLEMS else ""
-    return "; ".join(said[:MOST_PROBLEMS]) + more
+        texts.append(f"the keys {missing} are missing" if "," in missing else f"the key {missing} is missing")
+    more = f" (and {len(texts) - MAX_PROBLEMS} more)" if len(texts) > MAX_PROBLEMS else ""
+    return "; ".join(texts[:MAX_PROBLEMS]) + more
 
 
-def place_of(problem: Mapping[str, Any]) -> str:
-    """The key of a problem, such as `td3.gamma`."""
-    return ".".join(str(part) for part in problem["loc"])
+def _path(problem: Mapping[str, Any]) -> str:
+    """Return the key of a problem, such as `td3.gamma`."""
+    return ".".join(map(str, problem["loc"]))
 
 
-def in_words(problem: Mapping[str, Any], names: Sequence[str]) -> str:
-    """A problem that pydantic found."""
-    where, said = place_of(problem), problem["msg"].removeprefix("Value error, ")
-    table, _, key = where.rpartition(".")
-    if problem["type"] == "extra_forbidden" and where in names:
-        return f"there is no key {where!r}: write {table}={{{key!r}: ...}}"
+def _describe_problem(problem: Mapping[str, Any], keys: Sequence[str]) -> str:
+    path = _path(problem)
     if problem["type"] == "extra_forbidden":
-        beside = [name.removeprefix(f"{table}.") for name in names if table and name.startswith(f"{table}.")]
-        others = f"; the keys of {table} are {', '.join(beside)}" if beside else ""
-        return f"there is no key {where!r}{did_you_mean(key, beside or names) or others}"
-    if problem["type"] == "model_type":
-        said = "should be a table of settings, such as {'KEY': VALUE}"
-    if problem["type"] == "tuple_type":
-        said = "should be a list"
-    return f"{where} = {shortened(problem['input'])}: {said[0].lower()}{said[1:]}" if where else said
+        table, _, key = path.rpartition(".")
+        if path in keys:  # "td3.gamma" is no key of Python's
+            return f"there is no key {path!r}: write {table}={{{key!r}: ...}}"
+        siblings = [name.removeprefix(f"{table}.") for name in keys if table and name.startswith(f"{table}.")]
+        all_keys = f"; the keys of {table} are {', '.join(siblings)}" if siblings else ""
+        return f"there is no key {path!r}{did_you_mean(key, siblings or keys) or all_keys}"
+    messages = {"model_type": "should be a table of settings, such as {'KEY': VALUE}", "tuple_type": "should be a list"}
+    message: str = messages.get(problem["type"]) or problem["msg"].removeprefix("Value error, ")
+    return f"{path} = {short_repr(problem['input'])}: {message[0].lower()}{message[1:]}" if path else message

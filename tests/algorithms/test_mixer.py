@@ -1,4 +1,4 @@
-"""The mixer against the worked example, and what makes it QMIX's: no agent's value ever counts against the team."""
+"""QMIX's mixer against the worked example, and its monotonicity."""
 
 import jax
 import jax.numpy as jnp
@@ -6,42 +6,40 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers.worked_qmix import PINNED, networks
-from lare_rl.algorithms.mixer import Mixer, mixed
+from helpers.numpy_qmix import PINNED, numpy_networks
+from lare_rl.algorithms.qmix.mixer import Mixer, mix
 
 
-def chosen(value, action):
-    return jnp.asarray(
-        np.take_along_axis(np.asarray(value), np.asarray(action)[..., None], axis=-1)[..., 0], jnp.float32
-    )
+def select(value, action):
+    index = np.asarray(action)[..., None]
+    return jnp.asarray(np.take_along_axis(np.asarray(value), index, axis=-1)[..., 0], jnp.float32)
 
 
-def test_totals_are_those_of_the_worked_example():
+def test_mix_worked_example():
     state = jnp.asarray(PINNED["state"], jnp.float32)
-    taken = chosen(np.asarray(PINNED["q"])[:, :-1], PINNED["action"])
-    total = mixed(networks(PINNED["online"]).mixer, taken, state[:, :-1])
-    np.testing.assert_allclose(total, PINNED["q_total"], rtol=1e-5, atol=5e-6)
-    best = chosen(PINNED["q_target"], PINNED["best"])
-    np.testing.assert_allclose(mixed(networks(PINNED["target"]).mixer, best, state), PINNED["v"], rtol=1e-5, atol=5e-6)
+    online, target = (numpy_networks(PINNED[name]).mixer for name in ("online", "target"))
+    q_total = mix(online, select(np.asarray(PINNED["q"])[:, :-1], PINNED["action"]), state[:, :-1])
+    np.testing.assert_allclose(q_total, PINNED["q_total"], rtol=1e-5, atol=5e-6)
+    v = mix(target, select(PINNED["q_target"], PINNED["best"]), state)
+    np.testing.assert_allclose(v, PINNED["v"], rtol=1e-5, atol=5e-6)
+
+
+def test_mix_without_mixer_is_sum():
+    value = jnp.array([[1.0, -2.0, 4.0], [0.5, 0.0, 0.25]])
+    np.testing.assert_allclose(mix(None, value, jnp.zeros((2, 0))), [3.0, 0.75])
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**31 - 1), st.floats(1e-2, 1e2), st.floats(1e-2, 1e2))
-def test_the_total_never_falls_where_a_value_rises(seed, of_parameters, of_values):
+def test_mixer_is_monotonic(seed, parameter_scale, value_scale):
     mixer_key, value_key, state_key = jax.random.split(jax.random.key(seed), 3)
-    mixer = jax.tree.map(lambda leaf: of_parameters * leaf, Mixer(3, 5, 4, 6, key=mixer_key))
-    value = of_values * jax.random.normal(value_key, (20, 3))
-    state = of_values * jax.random.normal(state_key, (20, 5))
-    slope = np.asarray(jax.grad(lambda value: mixer(value, state).sum())(value))
-    assert (slope >= 0).all()
+    mixer = jax.tree.map(lambda leaf: parameter_scale * leaf, Mixer(3, 5, 4, 6, key=mixer_key))
+    value = value_scale * jax.random.normal(value_key, (20, 3))
+    state = value_scale * jax.random.normal(state_key, (20, 5))
+    assert (np.asarray(jax.grad(lambda value: mixer(value, state).sum())(value)) >= 0).all()
 
 
-def test_without_a_mixer_it_is_the_sum():
-    value = jnp.array([[1.0, -2.0, 4.0], [0.5, 0.0, 0.25]])
-    np.testing.assert_allclose(mixed(None, value, jnp.zeros((2, 0))), [3.0, 0.75])
-
-
-def test_the_state_decides_what_an_agent_counts():
+def test_mixer_weights_depend_on_state():
     mixer = Mixer(2, 3, 4, 5, key=jax.random.key(0))
     slope = jax.vmap(jax.grad(mixer), (None, 0))(jnp.zeros(2), jax.random.normal(jax.random.key(1), (2, 3)))
     assert not np.allclose(slope[0], slope[1], rtol=1e-3)

@@ -1,136 +1,121 @@
-"""PPO's update against plain NumPy, its rules one by one, and a toy that it must learn."""
+"""PPO's update against NumPy, its invariances, and a toy that it must learn."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare_rl.algorithms import ppo
-from lare_rl.algorithms.ppo import Rollout
-from lare_rl.algorithms.settings import PPOSettings
-from lare_rl.nn.normalise import deviation, observe
+from lare_rl.algorithms.batches import Rollout
+from lare_rl.algorithms.ppo import PPOSettings, ppo
+from lare_rl.nn.normalise import running_std, update_mean_std
 
 SETTINGS = PPOSettings(hidden=(16,), minibatch_size=8, epochs=3)
+ONE_STEP = PPOSettings(hidden=(16,), minibatch_size=24, epochs=1, learning_rate=0.05)
+KEY, START = jax.random.key(1), jnp.array(1.0)
 init, update = jax.jit(ppo.init, static_argnums=(1, 2, 3, 4)), jax.jit(ppo.update, static_argnums=4)
 
 
-def state_of(discrete=True, settings=SETTINGS):
+def init_state(settings=SETTINGS, discrete=True):
     return init(jax.random.key(0), 3, 2, discrete, settings)
 
 
-def rollout_of(time=6, lanes=4, discrete=True, seed=0, ended=None):
-    rng = np.random.default_rng(seed)
-    observation = rng.normal(size=(time + 1, lanes, 3)).astype(np.float32)
-    action = rng.normal(size=(time, lanes, 2)).astype(np.float32)
+def random_rollout(time=6, actors=4, discrete=True, done=None):
+    rng = np.random.default_rng(0)
+    observation = rng.normal(size=(time + 1, actors, 3))
+    action = rng.normal(size=(time, actors, 2))
     if discrete:
-        action = np.eye(2, dtype=np.float32)[action.argmax(axis=-1)]
-    ended = np.zeros((time, lanes), np.float32) if ended is None else ended
-    reward = rng.normal(size=(time, lanes)).astype(np.float32)
-    return Rollout(*map(jnp.asarray, (observation[:-1], action, reward, observation[1:], 1 - ended, ended)))
+        action = np.eye(2)[action.argmax(axis=-1)]
+    done = np.zeros((time, actors)) if done is None else done
+    reward = rng.normal(size=(time, actors))
+    arrays = (observation[:-1], action, reward, observation[1:], done, done)
+    return Rollout(*(jnp.asarray(array, jnp.float32) for array in arrays))
 
 
-def test_advantages_against_a_slow_sum():
-    ended = np.zeros((6, 4), np.float32)
-    ended[2, 1] = ended[4, 2] = 1
-    rollout, rng = rollout_of(ended=ended), np.random.default_rng(1)
-    value, following = rng.normal(size=(2, 6, 4)).astype(np.float32)
-    got = ppo.advantages(rollout, jnp.asarray(value), jnp.asarray(following), SETTINGS)
-    for lane in range(4):
-        for t in range(6):
-            want, weight = 0.0, 1.0
-            for later in range(t, 6):
-                goes_on = float(rollout.continues[later, lane])
-                delta = rollout.reward[later, lane] + 0.99 * goes_on * following[later, lane] - value[later, lane]
-                want += weight * float(delta)
-                weight *= 0.99 * 0.95
-                if ended[later, lane]:
-                    break
-            assert float(got[t, lane]) == pytest.approx(want, rel=1e-4, abs=1e-5)
+def done_at(*indices):
+    done = np.zeros((6, 4))
+    for index in indices:
+        done[index] = 1
+    return done
 
 
-def test_out_of_time_bootstraps_and_a_termination_does_not():
-    """Both end the trace; only the termination takes the value of what follows away."""
-    ended = np.ones((1, 2), np.float32)
-    rollout = rollout_of(1, 2, ended=ended)._replace(continues=jnp.array([[1.0, 0.0]]))
+def assert_close(a, b, rtol=1e-4, atol=1e-5):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=atol), a, b)
+
+
+def test_advantages():
+    rollout, rng = random_rollout(done=done_at((2, 1), (4, 2))), np.random.default_rng(1)
+    v_tm1, v_t = rng.normal(size=(2, 6, 4)).astype(np.float32)
+    got = ppo.advantages(rollout, jnp.asarray(v_tm1), jnp.asarray(v_t), SETTINGS)
+    reward, done = np.asarray(rollout.reward), np.asarray(rollout.done)
+    for actor, t in np.ndindex(4, 6):
+        expected, weight = 0.0, 1.0
+        for k in range(t, 6):
+            expected += weight * (reward[k, actor] + 0.99 * (1 - done[k, actor]) * v_t[k, actor] - v_tm1[k, actor])
+            weight *= 0.99 * 0.95 * (1 - done[k, actor])
+        assert float(got[t, actor]) == pytest.approx(expected, rel=1e-4, abs=1e-5)
+
+
+def test_advantages_bootstrap_after_truncation():
+    rollout = random_rollout(1, 2, done=np.ones((1, 2)))._replace(terminated=jnp.array([[0.0, 1.0]]))
     got = ppo.advantages(rollout, jnp.zeros((1, 2)), jnp.full((1, 2), 10.0), SETTINGS)
     np.testing.assert_allclose(got - rollout.reward, [[9.9, 0.0]], rtol=1e-5, atol=1e-6)
 
 
-def test_values_are_in_units_of_the_reward_and_targets_in_deviations_of_the_return():
-    state, rollout = state_of(), rollout_of()
-    state = state._replace(returns=observe(state.returns, jnp.array([[3.0], [11.0]])))
-    said = np.asarray(state.params.critic(rollout.observation))[..., 0]
+def test_prepare_batch():
+    """Values are in units of the reward; targets and the critic's outputs in standard deviations of the return."""
+    state, rollout = init_state(), random_rollout()
+    state = state._replace(returns=update_mean_std(state.returns, jnp.array([[3.0], [11.0]])))
+    output = np.asarray(state.params.critic(rollout.observation))[..., 0]
     value = np.asarray(ppo.values(state, rollout.observation))
-    np.testing.assert_allclose(value, 7 + 4 * said, rtol=1e-5)
-    batch, returns, explained = ppo.prepare(state, rollout, SETTINGS)
+    np.testing.assert_allclose(value, 7 + 4 * output, rtol=1e-5)
+    batch, returns, explained_variance = ppo.prepare_batch(state, rollout, SETTINGS)
     advantage = ppo.advantages(rollout, jnp.asarray(value), ppo.values(state, rollout.next_observation), SETTINGS)
-    want = np.asarray(advantage) + value
-    np.testing.assert_allclose(
-        batch.target * float(deviation(returns)[0]) + float(returns.mean[0]), want.ravel(), rtol=1e-4
-    )
-    assert float(returns.mean[0]) == pytest.approx((3 + 11 + want.sum()) / 26, rel=1e-4)
-    np.testing.assert_allclose(batch.value, said.ravel(), rtol=1e-5)
-    assert float(explained) == pytest.approx(1 - np.var(want - value) / np.var(want), rel=1e-3)
-    centred = np.asarray(advantage - advantage.mean()) / np.asarray(advantage).std()
-    np.testing.assert_allclose(batch.advantage, centred.ravel(), rtol=1e-4, atol=1e-5)
+    return_ = np.asarray(advantage) + value
+    assert float(returns.mean[0]) == pytest.approx((3 + 11 + return_.sum()) / 26, rel=1e-4)
+    target = (return_.ravel() - returns.mean) / running_std(returns)
+    np.testing.assert_allclose(batch.target, target, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(batch.value, output.ravel(), rtol=1e-5)
+    assert float(explained_variance) == pytest.approx(1 - np.var(return_ - value) / np.var(return_), rel=1e-3)
+    normalised = np.asarray(advantage - advantage.mean()) / np.asarray(advantage).std()
+    np.testing.assert_allclose(batch.advantage, normalised.ravel(), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("ratio", "advantage", "want"),
+    ("ratio", "advantage", "expected"),
     [(1.0, 2.0, 2.0), (1.5, 2.0, 2.4), (0.5, 2.0, 1.0), (1.5, -2.0, -3.0), (0.5, -2.0, -1.6)],
 )
-def test_policy_objective_is_pessimistic(ratio, advantage, want):
+def test_policy_objective_is_pessimistic(ratio, advantage, expected):
     got = ppo.policy_objective(jnp.array([ratio]), jnp.array([advantage]), 0.2)
-    assert float(got) == pytest.approx(want, rel=1e-5)
+    assert float(got) == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("value", "old", "target", "want"),
+    ("value", "old_value", "target", "expected"),
     [
         (1.0, 1.0, 3.0, 2.0),  # half the square
-        (2.0, 0.0, 3.0, 3.125),  # kept at 0.5, so 2.5 away: the worse of the two
+        (2.0, 0.0, 3.0, 3.125),  # clipped to 0.5, so 2.5 away: the larger of the two
         (30.0, 30.0, 0.0, 250.0),  # linear beyond 10
     ],
 )
-def test_value_loss_is_clipped_and_huber(value, old, target, want):
-    got = ppo.value_loss(jnp.array([value]), jnp.array([old]), jnp.array([target]), SETTINGS)
-    assert float(got) == pytest.approx(want, rel=1e-5)
+def test_value_loss_is_clipped_and_huber(value, old_value, target, expected):
+    got = ppo.value_loss(jnp.array([value]), jnp.array([old_value]), jnp.array([target]), SETTINGS)
+    assert float(got) == pytest.approx(expected, rel=1e-5)
 
 
-def test_every_epoch_reads_every_step_once():
-    order = np.asarray(ppo.minibatches(jax.random.key(0), 24, SETTINGS))
-    assert order.shape == (9, 8)
-    for epoch in order.reshape(3, 24):
-        assert sorted(epoch) == list(range(24))
+def test_minibatch_indices_cover_each_epoch():
+    indices = np.asarray(ppo.minibatch_indices(KEY, 24, SETTINGS))
+    assert indices.shape == (9, 8)
+    np.testing.assert_array_equal(np.sort(indices.reshape(3, 24)), np.tile(np.arange(24), (3, 1)))
+    assert ppo.minibatch_indices(KEY, 27, SETTINGS).shape == (9, 8)
 
 
-@pytest.mark.parametrize("discrete", [True, False])
-def test_rewards_of_any_scale_and_offset_train_alike(discrete):
-    """Undiscounted episodes of one length: an offset is the same for all, a scale leaves the advantages as they are."""
-    ended = np.zeros((6, 4), np.float32)
-    ended[-1] = 1
-    settings = PPOSettings(hidden=(16,), minibatch_size=24, epochs=2, gamma=1.0, gae_lambda=1.0)
-    rollout = rollout_of(ended=ended, discrete=discrete)._replace(continues=jnp.asarray(1 - ended))
-    state = state_of(discrete, settings)
-    quiet = state._replace(params=state.params._replace(critic=jax.tree.map(jnp.zeros_like, state.params.critic)))
-    actors = [
-        update(quiet, rollout._replace(reward=scale * rollout.reward), jax.random.key(1), jnp.array(1.0), settings)[
-            0
-        ].params.actor
-        for scale in (1.0, 1e-3, 1e3)
-    ]
-    for other in actors[1:]:
-        for a, b in zip(jax.tree.leaves(actors[0]), jax.tree.leaves(other), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
-
-
-def test_an_update_against_plain_numpy():
-    """One gradient step on a whole rollout, its gradient taken by differences in float64: loss, cut and Adam."""
+def test_update_against_numpy():
+    """One gradient step on a whole rollout, its gradient by differences in float64: loss, clipping and Adam."""
     settings = PPOSettings(
         hidden=(4,), minibatch_size=24, epochs=1, entropy_coef=0.3, value_coef=0.7, max_grad_norm=0.1, anneal=True
     )
-    state, rollout = state_of(settings=settings), rollout_of()
-    rows = jax.tree.map(np.asarray, ppo.prepare(state, rollout, settings)[0])
+    state, rollout = init_state(settings), random_rollout()
+    batch = jax.tree.map(np.asarray, ppo.prepare_batch(state, rollout, settings)[0])
 
     def network(leaves, x):
         *hidden, last = zip(leaves[::2], leaves[1::2], strict=True)
@@ -139,161 +124,132 @@ def test_an_update_against_plain_numpy():
         return x @ last[0] + last[1]
 
     def loss(leaves):
-        out = network(leaves[:4], rows.observation)
-        log = out - np.log(np.exp(out).sum(axis=1, keepdims=True))
-        gain = (np.exp((rows.action * log).sum(axis=1) - rows.log_probability) * rows.advantage).mean()
-        entropy = -(np.exp(log) * log).sum(axis=1).mean()
-        missed = 0.5 * (network(leaves[4:], rows.observation)[:, 0] - rows.target) ** 2
-        return -gain + 0.7 * missed.mean() - 0.3 * entropy
+        logits = network(leaves[:4], batch.observation)
+        log_pi = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
+        objective = np.exp((batch.action * log_pi).sum(axis=1) - batch.log_probability) * batch.advantage
+        entropy = -(np.exp(log_pi) * log_pi).sum(axis=1)
+        error = network(leaves[4:], batch.observation)[:, 0] - batch.target
+        return -objective.mean() + 0.7 * 0.5 * (error**2).mean() - 0.3 * entropy.mean()
 
-    old = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(state.params)]
-    gradient = [np.zeros_like(leaf) for leaf in old]
-    for slope, leaf in zip(gradient, old, strict=True):
-        for place in np.ndindex(leaf.shape):
-            kept, ends = leaf[place], []
+    leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(state.params)]
+    gradient = [np.zeros_like(leaf) for leaf in leaves]
+    for slope, leaf in zip(gradient, leaves, strict=True):
+        for index in np.ndindex(leaf.shape):
+            value, losses = leaf[index], []
             for change in (1e-5, -1e-5):
-                leaf[place] = kept + change
-                ends.append(loss(old))
-            leaf[place], slope[place] = kept, (ends[0] - ends[1]) / 2e-5
+                leaf[index] = value + change
+                losses.append(loss(leaves))
+            leaf[index], slope[index] = value, (losses[0] - losses[1]) / 2e-5
     norm = np.sqrt(sum((slope**2).sum() for slope in gradient))
     assert norm > 0.1
-    after, _ = update(state, rollout, jax.random.key(1), jnp.array(0.5), settings)
-    mean, square = (jax.tree.leaves(getattr(after.optimizer[0], name)) for name in ("mu", "nu"))
-    new = jax.tree.leaves(after.params)
-    for slope, leaf, m, v, moved in zip(gradient, old, mean, square, new, strict=True):
-        cut = slope * 0.1 / norm
-        np.testing.assert_allclose(m, 0.1 * cut, rtol=1e-2, atol=1e-6)
-        np.testing.assert_allclose(v, 0.001 * cut**2, rtol=2e-2, atol=1e-9)
+    after, _ = update(state, rollout, KEY, jnp.array(0.5), settings)
+    mu, nu = (jax.tree.leaves(getattr(after.optimizer[0], name)) for name in ("mu", "nu"))
+    for slope, leaf, m, v, new in zip(gradient, leaves, mu, nu, jax.tree.leaves(after.params), strict=True):
+        clipped = slope * 0.1 / norm
+        np.testing.assert_allclose(m, 0.1 * clipped, rtol=1e-2, atol=1e-6)
+        np.testing.assert_allclose(v, 0.001 * clipped**2, rtol=2e-2, atol=1e-9)
         step = 0.5 * settings.learning_rate * (m / 0.1) / (np.sqrt(v / 0.001) + 1e-8)
-        np.testing.assert_allclose(moved, leaf - step, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(new, leaf - step, rtol=1e-4, atol=1e-6)
 
 
-def test_how_far_an_update_moves_the_policy_is_measured():
-    """Schulman's estimate of the divergence, and the share of steps beyond the clip: nothing at first, then what the step did."""
-    settings = PPOSettings(hidden=(16,), minibatch_size=24, epochs=1, learning_rate=0.05)
-    state, rollout = state_of(settings=settings), rollout_of()
-    batch, left = ppo.prepare(state, rollout, settings)[0], jnp.array(1.0)
-    after, first = update(state, rollout, jax.random.key(1), left, settings)
-    assert float(first["actor/approx_kl"]) == pytest.approx(0, abs=1e-6)
-    assert float(first["actor/clip_fraction"]) == 0
-    twice = settings.model_copy(update={"epochs": 2})
-    _, both = update(state, rollout, jax.random.key(1), left, twice)
-    log = np.asarray(after.params.actor.log_probability(batch.observation, batch.action) - batch.log_probability)
-    assert float(both["actor/approx_kl"]) == pytest.approx((np.exp(log) - 1 - log).mean() / 2, rel=1e-3)
-    beyond = (np.abs(np.exp(log) - 1) > 0.2).mean()
-    assert 0 < beyond < 1
-    assert float(both["actor/clip_fraction"]) == pytest.approx(beyond / 2)
+def test_update_metrics_of_policy_change():
+    """The KL estimate and the clipped fraction are 0 before the first step, and then measure that step."""
+    state, rollout = init_state(ONE_STEP), random_rollout()
+    batch = ppo.prepare_batch(state, rollout, ONE_STEP)[0]
+    after, metrics = update(state, rollout, KEY, START, ONE_STEP)
+    assert float(metrics["actor/approx_kl"]) == pytest.approx(0, abs=1e-6)
+    assert float(metrics["actor/clip_fraction"]) == 0
+    _, metrics = update(state, rollout, KEY, START, ONE_STEP.model_copy(update={"epochs": 2}))
+    log_ratio = np.asarray(after.params.actor.log_probability(batch.observation, batch.action) - batch.log_probability)
+    assert float(metrics["actor/approx_kl"]) == pytest.approx((np.exp(log_ratio) - 1 - log_ratio).mean() / 2, rel=1e-3)
+    clip_fraction = (np.abs(np.exp(log_ratio) - 1) > 0.2).mean()
+    assert 0 < clip_fraction < 1
+    assert float(metrics["actor/clip_fraction"]) == pytest.approx(clip_fraction / 2)
 
 
-def test_annealing_ends_at_rest():
+def test_update_anneals_to_zero():
     settings = PPOSettings(hidden=(16,), minibatch_size=8, epochs=1, anneal=True)
-    state = state_of(settings=settings)
-    after, _ = update(state, rollout_of(), jax.random.key(1), jnp.array(0.0), settings)
+    state = init_state(settings)
+    after, _ = update(state, random_rollout(), KEY, jnp.array(0.0), settings)
     assert jax.tree.all(jax.tree.map(jnp.array_equal, after.params, state.params))
-    after, _ = update(state, rollout_of(), jax.random.key(1), jnp.array(1.0), settings)
-    assert not jax.tree.all(jax.tree.map(jnp.array_equal, after.params, state.params))
 
 
 @pytest.mark.parametrize("discrete", [True, False])
-def test_must_learn_to_follow(discrete):
-    """r = 1 where the choice is the sign of s_0; or -(a_0 - s_0)^2. The policy must find out by trying."""
+def test_update_is_invariant_to_reward_scale(discrete):
+    settings = PPOSettings(hidden=(16,), minibatch_size=24, epochs=2, gamma=1.0, gae_lambda=1.0)
+    rollout, state = random_rollout(done=done_at(-1), discrete=discrete), init_state(settings, discrete)
+    params = state.params._replace(critic=jax.tree.map(jnp.zeros_like, state.params.critic))
+    actors = [
+        update(state._replace(params=params), rollout._replace(reward=scale * rollout.reward), KEY, START, settings)[0]
+        for scale in (1.0, 1e-3, 1e3)
+    ]
+    for other in actors[1:]:
+        assert_close(actors[0].params.actor, other.params.actor, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("discrete", "normalise"), [(True, True), (True, False), (False, True)])
+def test_update_ignores_masked_actors(discrete, normalise):
+    rollout = random_rollout(done=done_at((3, 1), -1), discrete=discrete)
+    settings = ONE_STEP.model_copy(
+        update={"minibatch_size": 99, "epochs": 2, "learning_rate": 0.01, "entropy_coef": 0.1}
+        | {"normalise_observations": normalise}
+    )
+    padded = jax.tree.map(lambda rows: jnp.concatenate([rows, jnp.full_like(rows[:, :2], 7)], axis=1), rollout)
+    mask = jnp.concatenate([jnp.ones((6, 4)), jnp.zeros((6, 2))], axis=1)
+    state = init_state(settings, discrete)
+    expected, all_valid, masked = (
+        update(state, case, KEY, START, settings)
+        for case in (rollout, rollout._replace(mask=jnp.ones((6, 4))), padded._replace(mask=mask))
+    )
+    assert_close(all_valid, expected, rtol=2e-3)
+    assert_close(masked, expected, rtol=2e-3)
+    if normalise:
+        assert float(masked[0].observations.n_rows) == 24
+
+
+def test_prepare_batch_ignores_steps_after_an_agent_has_left():
+    state, rollout = init_state(), random_rollout(done=done_at(2))
+    short = jax.tree.map(lambda rows: rows[:3], rollout)
+    spoilt = jax.tree.map(lambda rows: rows.at[3:].set(9.0), rollout)
+    mask = (jnp.arange(6) < 3)[:, None] * jnp.ones((6, 4))
+    masked, *masked_statistics = ppo.prepare_batch(state, spoilt._replace(mask=mask), SETTINGS)
+    expected, *statistics = ppo.prepare_batch(state, short, SETTINGS)
+    assert_close(masked.advantage[:12], expected.advantage)
+    assert_close(masked.target[:12], expected.target)
+    assert_close(masked_statistics, statistics)
+
+
+def test_update_does_not_train_unavailable_choices():
+    state, rollout = init_state(), random_rollout()
+    only_choice = rollout._replace(available=rollout.action > 0)
+    after, metrics = update(state, only_choice, KEY, START, SETTINGS)
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, after.params.actor, state.params.actor))
+    assert float(metrics["actor/entropy"]) == 0
+
+
+@pytest.mark.parametrize("discrete", [True, False])
+def test_ppo_learns(discrete):
+    """The reward is 1 if the choice is the sign of s_0; or it is -(a_0 - s_0)^2."""
     settings = PPOSettings(hidden=(32,), minibatch_size=64, epochs=4, gamma=0.0, learning_rate=3e-3, entropy_coef=0.0)
-    state = state_of(discrete, settings)
+    state = init_state(settings, discrete)
 
-    @jax.jit
-    def turn(state, key):
-        keys = jax.random.split(key, 3)
-        observation = jax.random.uniform(keys[0], (1, 256, 3), minval=-1, maxval=1)
-        draw = jax.random.gumbel if discrete else jax.random.normal
-        action = state.params.actor.sample(observation, draw(keys[1], (1, 256, 2)))
-        reward = reward_of(observation, action)
-        ends = jnp.ones((1, 256))
-        rollout = Rollout(observation, action, reward, observation, 1 - ends, ends)
-        return update(state, rollout, keys[2], jnp.array(1.0), settings)[0]
-
-    def reward_of(observation, action):
+    def compute_reward(observation, action):
         if discrete:
             return (action[..., 0] == (observation[..., 0] > 0)).astype(jnp.float32)
         return -((action[..., 0] - observation[..., 0]) ** 2)
 
-    for number in range(80):
-        state = turn(state, jax.random.key(number))
+    @jax.jit
+    def iterate(state, key):
+        observation_key, noise_key, update_key = jax.random.split(key, 3)
+        observation = jax.random.uniform(observation_key, (1, 256, 3), minval=-1, maxval=1)
+        noise = (jax.random.gumbel if discrete else jax.random.normal)(noise_key, (1, 256, 2))
+        action = ppo.explore(ppo.get_actor(state), observation, None, noise)
+        done = jnp.ones((1, 256))
+        rollout = Rollout(observation, action, compute_reward(observation, action), observation, done, done)
+        return update(state, rollout, update_key, START, settings)[0]
+
+    for seed in range(80):
+        state = iterate(state, jax.random.key(seed))
     observation = jax.random.uniform(jax.random.key(5), (1, 256, 3), minval=-1, maxval=1)
-    learned = float(jnp.mean(reward_of(observation, state.params.actor.mode(observation))))
-    assert learned > (0.93 if discrete else -0.03)
-
-
-def test_values_may_move_from_what_the_critic_said():
-    """The anchor of the value clip is the critic's own output, whatever unit the newest returns give it."""
-    settings = PPOSettings(hidden=(8,))
-    state = init(jax.random.key(0), 3, 2, False, settings)
-    rng = np.random.default_rng(0)
-    rows = rng.normal(size=(2, 6, 4, 3)).astype(np.float32)
-    action, reward = rng.normal(size=(6, 4, 2)).astype(np.float32), 100 + rng.normal(size=(6, 4)).astype(np.float32)
-    rollout = ppo.Rollout(*map(jnp.asarray, (rows[0], action, reward, rows[1], np.ones((6, 4)), np.zeros((6, 4)))))
-    batch, returns, _ = ppo.prepare(state, rollout, settings)
-    np.testing.assert_allclose(batch.value, state.params.critic(rollout.observation.reshape(-1, 3))[:, 0], rtol=1e-5)
-    assert float(returns.mean[0]) > 50
-    np.testing.assert_allclose([batch.target.mean(), batch.target.std()], [0, 1], atol=1e-2)
-
-
-def padded(rollout):
-    """The same with two more lanes, of agents that are not there: what they hold is nonsense."""
-
-    def wider(rows, more):
-        return jnp.concatenate([rows, jnp.full((len(rows), more, *rows.shape[2:]), 7, rows.dtype)], axis=1)
-
-    time, lanes = rollout.reward.shape
-    mask = jnp.concatenate([jnp.ones((time, lanes)), jnp.zeros((time, 2))], axis=1)
-    return jax.tree.map(lambda rows: wider(rows, 2), rollout._replace(mask=None, available=None))._replace(mask=mask)
-
-
-@pytest.mark.parametrize("discrete", [True, False])
-@pytest.mark.parametrize("normalise", [True, False])
-def test_agents_that_are_not_there_change_nothing(discrete, normalise):
-    """One gradient step on all lanes at once: with padding, and with no more than those who are there."""
-    ended = np.zeros((6, 4), np.float32)
-    ended[3, 1] = ended[-1] = 1
-    rollout = rollout_of(ended=ended, discrete=discrete)
-    settings = PPOSettings(
-        hidden=(16,),
-        minibatch_size=99,
-        epochs=2,
-        entropy_coef=0.1,
-        normalise_observations=normalise,
-        learning_rate=0.01,
-    )
-    state = state_of(discrete, settings)
-    with_all = jnp.ones((6, 4))
-    found = [
-        update(state, given, jax.random.key(1), jnp.array(1.0), settings)
-        for given in (rollout, rollout._replace(mask=with_all), padded(rollout))
-    ]
-    for other in found[1:]:
-        for a, b in zip(jax.tree.leaves(found[0]), jax.tree.leaves(other), strict=True):
-            np.testing.assert_allclose(a, b, rtol=2e-3, atol=1e-5)
-
-
-def test_what_follows_an_agents_last_step_does_not_reach_back():
-    """Steps behind it are masked, whatever stands there; the same lane cut off has the same advantages."""
-    ended, rollout = np.zeros((6, 4), np.float32), rollout_of()
-    ended[2] = 1
-    left = rollout._replace(ended=jnp.asarray(ended), continues=jnp.asarray(1 - ended))
-    mask = (jnp.arange(6) < 3)[:, None] * jnp.ones((6, 4))
-    spoilt = jax.tree.map(lambda rows: rows.at[3:].set(9.0), left)
-    short = jax.tree.map(lambda rows: rows[:3], left)
-    state = state_of()
-    one, other = (ppo.prepare(state, given, SETTINGS) for given in (spoilt._replace(mask=mask), short))
-    np.testing.assert_allclose(one[0].advantage.reshape(6, 4)[:3].ravel(), other[0].advantage, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(one[0].target.reshape(6, 4)[:3].ravel(), other[0].target, rtol=1e-4, atol=1e-5)
-    for a, b in zip(jax.tree.leaves(one[1:]), jax.tree.leaves(other[1:]), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4)
-
-
-def test_what_an_unavailable_choice_is_worth_teaches_nothing():
-    """The gradient does not know of logits that were not there."""
-    state, rollout = init(jax.random.key(0), 3, 2, True, SETTINGS), rollout_of()
-    only = rollout.action > 0
-    after, measured = update(state, rollout._replace(available=only), jax.random.key(1), jnp.array(1.0), SETTINGS)
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, after.params.actor, state.params.actor))
-    assert float(measured["actor/entropy"]) == 0
+    reward = compute_reward(observation, ppo.act(ppo.get_actor(state), observation, None))
+    assert float(reward.mean()) > (0.93 if discrete else -0.03)

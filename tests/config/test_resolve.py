@@ -1,149 +1,154 @@
-"""What does not go together."""
-
-from dataclasses import replace
+"""Which settings, method, algorithm and task go together, and the defaults of open values."""
 
 import pytest
 
-from helpers.toys import pick_spec, toy_spec
-from lare_rl.config.resolve import check_credit, decide
+from helpers.toy_envs import pick_spec, toy_spec
+from lare_rl.algorithms.qmix import QMIXSettings
+from lare_rl.config.replay_size import replay_rows
+from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
-from lare_rl.credit.methods import find_method
-from lare_rl.envs.families import env_spec
+from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
 from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
 
 
-def decided(settings, task):
-    return decide(Settings(**settings), read_task(task))
+def resolve_named(task, settings):
+    return resolve(Settings(**settings), read_task(task))
 
 
 @pytest.mark.parametrize(
-    ("task", "settings", "message"),
+    ("task", "settings", "texts"),
     [
-        ("CN-6", {"algorithm": "td3"}, "td3 is for a single agent, and CN-6 is a task of many"),
-        (
-            "Reacher-v4",
-            {"algorithm": "ippo", "steps": 1000},
-            "ippo is for many agents, and Reacher-v4 is a task of one",
-        ),
-        (
-            "CompetitivePP-6",
-            {"algorithm": "qmix"},
-            "qmix trains one team, and CompetitivePP-6 has 2: ippo trains several",
-        ),
-        (
-            "Reacher-v4",
-            {"algorithm": "vdn"},
-            "vdn needs discrete actions, and those of Reacher-v4 are continuous",
-        ),
-        ("Reacher-v4", {"method": "arel"}, "arel assigns credit among agents, and Reacher-v4 is a task of one"),
-        ("CN-6", {"method": "diaster"}, "diaster assigns credit to a single agent, and CN-6 is a task of many"),
-        (
-            "CN-6",
-            {"method": "stas", "rollout_steps": 10},
-            "stas looks at whole episodes: rollout_steps = 10 is not a multiple of their length, 25",
-        ),
-        (
-            "Reacher-v4",
-            {"method": "llm-reward", "judges": "both"},
-            "llm-reward is one reward a step: it judges the observation before or after, not both",
-        ),
-        (
-            "Reacher-v4",
-            {"method": "ircr", "scale_rewards": True},
-            "scale_rewards divides by the size of returns, and the rewards of ircr are not in their unit",
-        ),
-        (
-            "CN-6",
-            {"steps": 5000},
-            "steps = 5000 is not a multiple of 2050 (rollout_steps = 25 of environments = 82): take 4100",
-        ),
-        (
-            "Reacher-v4",
-            {"method": "rrd", "credit": {"steps": 16}},
-            "credit.steps = 16 is less than credit.drawn_steps = 64, of one episode",
-        ),
-        (
-            "Reacher-v4",
-            {"method": "diaster", "credit": {"hidden": ()}},
-            "credit.hidden is empty, and diaster needs a hidden layer",
-        ),
-        ("Reacher-v4", {"steps": 1001}, "steps = 1001 is not a multiple of rollout_steps = 50: take 1000"),
-        (
-            "Reacher-v4",
-            {"steps": 1000, "evaluate_every": 70},
-            "evaluate_every = 70 is not a multiple of rollout_steps = 50: take 50",
-        ),
-        (
-            "CN-6",
-            {"capacity": 6149, "method": "rd"},
-            "capacity = 6149 is too small: a rollout of CN-6 takes up to 6150",
-        ),
-        (
-            "CN-6",
-            {"algorithm": "qmix", "method": "rd", "capacity": 999},
-            "capacity = 999 is too small: an iteration of CN-6 takes up to 1000",
-        ),
+        ("CN-6", {"algorithm": "td3"}, ["td3", "single agent", "6", "ippo"]),
+        ("Reacher-v4", {"algorithm": "ippo", "steps": 1000}, ["ippo", "many agents", "td3"]),
+        ("CompetitivePP-6", {"algorithm": "qmix"}, ["qmix", "one team", "2", "ippo"]),
+        ("CompetitivePP-6-prey", {}, ["one team of", "CompetitivePP-6"]),
+        ("Reacher-v4", {"algorithm": "vdn"}, ["vdn", "discrete", "Reacher-v4"]),
+        ("CN-6", {"method": "stas", "rollout_steps": 10}, ["stas", "rollout_steps = 10", "25"]),
+        ("CN-6", {"method": "diaster"}, ["diaster", "single agent", "6"]),
+        ("Reacher-v4", {"method": "llm-reward", "judges": "both"}, ["llm-reward", "judges"]),
+        ("Reacher-v4", {"method": "ircr", "scale_rewards": True}, ["scale_rewards", "ircr"]),
+        ("Reacher-v4", {"method": "rrd", "credit": {"steps": 16}}, ["steps = 16", "drawn_steps = 64"]),
+        ("CN-6", {"steps": 5000}, ["steps = 5000", "2050", "environments = 82", "4100 or 6150"]),
+        ("Reacher-v4", {"steps": 1001}, ["steps = 1001", "rollout_steps = 50", "1000 or 1050"]),
+        ("Reacher-v4", {"steps": 1000, "evaluate_every": 40}, ["evaluate_every = 40", "use 50"]),
+        ("Reacher-v4", {"rollout_steps": 20, "steps": 20}, ["steps = 20", "50"]),
+        ("CN-6", {"capacity": 6149, "method": "rd"}, ["capacity = 6149", "rollout", "6150"]),
+        ("CN-6", {"algorithm": "qmix", "method": "rd", "capacity": 999}, ["capacity = 999", "iteration", "1000"]),
     ],
 )
-def test_what_does_not_go_together_is_refused(task, settings, message):
+def test_resolve_refuses(task, settings, texts):
     with pytest.raises(LareError) as error:
-        decided(settings, task)
-    assert str(error.value) == message
+        resolve_named(task, settings)
+    assert all(text in str(error.value) for text in texts)
 
 
-@pytest.mark.parametrize("method", ["stas", "arel", "lare-rd-shared"])
-def test_credit_among_agents_is_not_judged_from_the_state(method, echo):
-    of_state = echo.model_copy(update={"judged_from": "state", "observation_size": 9, "action_size": 9})
-    with pytest.raises(
-        LareError, match=f"^{method} assigns credit among agents, and Echo is judged from the global state$"
-    ):
-        decide(Settings(method=method), of_state)
+def test_resolve_refuses_continuous_algorithm_for_choices():
+    with pytest.raises(LareError, match=r"sac needs continuous actions.*ppo"):
+        resolve(Settings(algorithm="sac"), pick_spec())
 
 
-@pytest.mark.parametrize("method", ["stas", "arel"])
-def test_who_looks_at_whole_episodes_wants_them_of_one_length(method, echo):
-    with pytest.raises(
-        LareError,
-        match=f"^{method} looks at whole episodes of one length, and so it trains on LaRe's particle tasks only: episodes of Echo "
-        "could differ in length$",
-    ):
-        decide(Settings(method=method, rollout_steps=6), echo)
-
-
-def test_one_team_of_several_is_not_trained_alone():
-    with pytest.raises(LareError, match="is one team of particles/CompetitivePP-6: train the task that has both"):
-        decide(Settings(), read_task("CompetitivePP-6").roles[0])
-
-
-def test_who_acts_within_bounds_cannot_choose():
-    with pytest.raises(LareError, match=r"^sac needs continuous actions, and those of Pick are discrete: use ppo$"):
-        decide(Settings(algorithm="sac"), pick_spec())
+def test_resolve_refuses_method_of_agents_on_team_level(echo):
+    task = echo.model_copy(update={"judged_from": "state", "observation_size": 9, "action_size": 9})
+    with pytest.raises(LareError, match=r"lare-rd-shared.*global state"):
+        resolve(Settings(method="lare-rd-shared"), task)
 
 
 @pytest.mark.parametrize(
-    ("said_by_task", "set_by_user", "taken"),
+    ("task", "settings", "expected"),
+    [
+        (
+            toy_spec(),
+            {},
+            {"algorithm": "td3", "method": "lare-bayes", "steps": 1_000_000, "evaluate_every": 5000, "environments": 1}
+            | {"rollout_steps": 50, "capacity": 1_000_000, "credit": CreditSettings()},
+        ),
+        (
+            pick_spec(),
+            {},
+            {"algorithm": "ppo", "method": "lare-bayes", "steps": 1_000_000, "evaluate_every": 10_000, "fit_every": 1}
+            | {"environments": 1, "rollout_steps": 2000, "fit_updates": 500},
+        ),
+        (
+            read_task("CN-6"),
+            {},
+            {"algorithm": "ippo", "method": "lare-bayes", "steps": 2_050_000, "environments": 82, "rollout_steps": 25}
+            | {"evaluate_every": 20_500, "evaluation_episodes": 50, "fit_every": 10, "fit_updates": 50}
+            | {"credit": MULTI_AGENT_CREDIT, "first_fit": None},
+        ),
+        (read_task("CN-6"), {"method": "lare-rd"}, {"first_fit": "held-out"}),
+    ],
+)
+def test_resolve_defaults(task, settings, expected):
+    resolved = resolve(Settings(**settings), task)
+    assert {name: getattr(resolved, name) for name in expected} == expected
+
+
+def test_resolve_defaults_of_qmix(echo):
+    resolved = resolve(Settings(), echo)
+    assert (resolved.algorithm, resolved.method, resolved.hyperparameters) == ("qmix", "lare-rd", QMIXSettings())
+    assert (resolved.environments, resolved.evaluation_episodes, resolved.capacity) == (8, 32, 5000 * 7)
+    assert resolved.steps % resolved.iteration_steps == resolved.evaluate_every % resolved.iteration_steps == 0
+    assert abs(resolved.steps - 2_000_000) < 400
+
+
+def test_resolve_keeps_given_values():
+    settings = Settings(method="dense", steps=4100, evaluate_every=2050, evaluation_episodes=3)
+    resolved = resolve(settings, read_task("CN-6"))
+    assert {name: getattr(resolved, name) for name in settings.model_fields_set} == settings.model_dump(
+        exclude_unset=True
+    )
+
+
+@pytest.mark.parametrize(("task", "default"), [("CN-6", MULTI_AGENT_CREDIT), ("Reacher-v4", CreditSettings())])
+@pytest.mark.parametrize("changes", [{"learning_rate": 0.5}, {"hidden": (256, 256)}])
+def test_resolve_completes_credit(task, default, changes):
+    """A set value replaces the algorithm's, even if it is the default of the class."""
+    for credit in (changes, CreditSettings(**changes)):
+        assert resolve_named(task, {"credit": credit}).credit == default.model_copy(update=changes)
+
+
+@pytest.mark.parametrize(
+    ("settings", "fit_updates"),
+    [
+        ({"method": "rd", "algorithm": "ppo", "rollout_steps": 2000}, 500),
+        ({"method": "diaster", "algorithm": "ppo", "rollout_steps": 2000}, 40),
+        ({"method": "diaster", "algorithm": "ppo", "rollout_steps": 2000, "fit_updates": 120}, 120),
+        ({"method": "diaster", "environments": 4}, 4),
+    ],
+)
+def test_resolve_fit_updates(settings, fit_updates):
+    """The fit of diaster is expensive: one update for 50 steps."""
+    assert resolve_named("Reacher-v4", settings).fit_updates == fit_updates
+
+
+@pytest.mark.parametrize(
+    ("task_score", "user_score", "score"),
     [(None, "auto", "auto"), ("average", "auto", "average"), ("average", "sum", "sum"), ("sum", "average", "average")],
 )
-def test_the_form_of_the_score_is_the_users_else_the_tasks(said_by_task, set_by_user, taken):
-    task = toy_spec(score=said_by_task)
-    settings = Settings(method="lare-linear", algorithm="td3", credit={"score": set_by_user})
-    assert decide(settings, task).credit.score == taken
+def test_resolve_score(task_score, user_score, score):
+    settings = Settings(method="lare-linear", algorithm="td3", credit={"score": user_score})
+    assert resolve(settings, toy_spec(score=task_score)).credit.score == score
 
 
-def test_the_form_of_the_score_makes_no_difference_to_episodes_of_one_length():
-    settings = [Settings(method="lare-rd", credit={"score": score}) for score in ("auto", "sum", "average")]
-    assert len({decide(one, read_task("CN-6")) for one in settings}) == 1
+def test_resolve_normalises_settings_without_effect():
+    """Runs that are the same have the same settings."""
+    fixed_length = [{"method": "lare-rd", "credit": {"score": score}} for score in ("auto", "sum", "average")]
+    assert len({resolve_named("CN-6", settings) for settings in fixed_length}) == 1
+    assert resolve_named("Reacher-v4", {"method": "bayes", "judges": "before"}).judges is None
+    assert resolve_named("Reacher-v4", {"method": "bayes", "judges": "after"}).judges == "after"
+    assert resolve_named("SMAX-2s3z", {"method": "rd"}).credit.score == "sum"
 
 
-@pytest.mark.parametrize("method", ["bayes", "rd-linear"])
-def test_no_weight_for_each_entry_of_a_picture(method):
-    task = toy_spec()
-    settings, env = decide(Settings(method=method), task), replace(env_spec(task), observation_size=84 * 84)
-    with pytest.raises(LareError) as error:
-        check_credit(settings, find_method(method), task, env)
-    assert str(error.value) == (
-        f"{method} fits a weight to each of at most 1024 entries, and Chase has 7057: "
-        "lare-bayes fits weights to the factors of phi, rrdu trains a network"
-    )
-    check_credit(settings, find_method("lare-bayes"), task, env)
+@pytest.mark.parametrize(
+    ("task", "settings", "max_steps", "rows"),
+    [
+        ("Reacher-v4", {"algorithm": "ppo", "method": "rrdu", "steps": 100_000}, 50, 200_002),
+        ("Reacher-v4", {"algorithm": "ppo", "method": "dense", "steps": 100_000}, 50, 2 * 2000 + 50 + RECENT_STEPS),
+        ("Reacher-v4", {"algorithm": "ppo", "method": "dense", "steps": 2000, "evaluate_every": 2000}, 50, 4050),
+        ("CN-6", {"method": "rrdu"}, 25, 15_000 * 26 // 82),
+        ("CN-6", {"method": "dense"}, 25, 2 * 25 + 25 + RECENT_STEPS // 82),
+    ],
+)
+def test_replay_rows(task, settings, max_steps, rows):
+    assert replay_rows(resolve_named(task, settings), max_steps) == rows

@@ -1,73 +1,83 @@
-"""Settings as they are given, read back, and set in vain."""
+"""Settings as a user gives them, read back, and without effect."""
 
 import pytest
 
-from helpers.toys import pick_spec, toy_spec
-from lare_rl.algorithms.settings import PPOSettings
-from lare_rl.algorithms.table import ALGORITHMS, IPPO
-from lare_rl.config.resolve import decide
-from lare_rl.config.settings import ResolvedSettings, Settings, set_in_vain
+from helpers.toy_envs import pick_spec
+from lare_rl.algorithms.ppo import PPOSettings
+from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.config.effective import effective_settings, unused_settings, warmup_warning
+from lare_rl.config.resolve import resolve
+from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import TABLE
+from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
 
 
-def decided(settings, task):
-    return decide(Settings(**settings), read_task(task))
-
-
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_what_is_left_open_has_the_default_of_its_place(name):
-    """Which need not be the default of its class: DDPG is TD3 of other figures, IPPO is PPO."""
-    usual = getattr(Settings(), name)
-    for field, value in usual:
-        assert getattr(Settings(**{name: {field: value}}), name) == usual
-        assert getattr(Settings(**{name: type(usual)(**{field: value})}), name) == usual
-    assert getattr(Settings(**{name: {}}), name) == getattr(Settings(**{name: type(usual)()}), name) == usual
+def test_settings_complete_hyperparameters_from_the_algorithm(name):
+    """Not from the class, which algorithms share: ddpg and td3 are `TD3Settings`."""
+    published = ALGORITHMS[name].settings
+    assert getattr(Settings(), name) == published
+    for field, value in published:
+        for changes in ({field: value}, type(published)(**{field: value}), {}, type(published)()):
+            assert Settings(**{name: changes}) == Settings()
 
 
 @pytest.mark.parametrize(
-    ("credit", "message"),
+    ("settings", "texts"),
     [
-        ({"step": 800}, r"^there is no key 'credit.step' \(did you mean 'steps'\?\)$"),
-        ({"fit": 3}, "^there is no key 'credit.fit'; the keys of credit are hidden, learning_rate, "),
-        ({"drawn_steps": 1}, "^credit.drawn_steps = 1: input should be"),
-        ({"hidden": (0,)}, "hidden"),
+        ({"credit": {"step": 800}}, ["'credit.step'", "'steps'"]),
+        ({"credit": {"fit": 3}}, ["'credit.fit'", "hidden, learning_rate"]),
+        ({"credit": {"drawn_steps": 1}}, ["credit.drawn_steps = 1"]),
+        ({"credit": {"hidden": (0,)}}, ["credit.hidden", "0"]),
+        ({"gamma": 0.9}, ["'gamma'", "'td3.gamma'"]),
+        ({"td3.gamma": 0.9}, ["'td3.gamma'", "td3={'gamma': ...}"]),
+        ({"td3": {"gamma": 3}}, ["td3.gamma = 3"]),
+        ({"td3": 3}, ["td3 = 3", "table"]),
+        ({"algorithm": "dqn"}, ["'dqn'", "td3, ddpg"]),
+        ({"method": "lare"}, ["'lare'", "lare-bayes"]),
+        ({"seeds": 1001}, ["seeds = 1001", "1000"]),
+        ({"seed": 2**31 - 1, "seeds": 2}, ["seeds = 2", "2147483647"]),
+        ({"steps": 0, "stepz": 2, "seed": -1, "rollout_steps": -1}, ["'stepz'", "steps = 0", "and 1 more"]),
     ],
 )
-def test_options_of_the_decoder_are_checked(credit, message):
-    with pytest.raises(LareError, match=message):
-        Settings(credit=credit)
-
-
-@pytest.mark.parametrize(
-    ("key", "message"),
-    [
-        ("gamma", "there is no key 'gamma' (did you mean 'td3.gamma'?)"),
-        ("td3.gamma", "there is no key 'td3.gamma': write td3={'gamma': ...}"),
-    ],
-)
-def test_a_key_of_a_table_within_is_hinted_at(key, message):
+def test_settings_refuse(settings, texts):
     with pytest.raises(LareError) as error:
-        Settings(**{key: 0.9})
-    assert str(error.value) == message
+        Settings(**settings)
+    assert all(text in str(error.value) for text in texts)
 
 
-def test_tables_within_tables():
-    found = Settings(credit={"steps": 800}, ippo={"gae_lambda": 1.0}, method="dense")
-    assert found.credit.steps == 800
-    assert found.ippo == IPPO.model_copy(update={"gae_lambda": 1.0})
-    assert Settings(credit=CreditSettings(steps=800), ippo=PPOSettings(gae_lambda=1.0), method="dense") == found
+def test_settings_accept_models_and_mappings():
+    settings = Settings(credit={"steps": 800}, ippo={"gae_lambda": 1.0}, method="dense")
+    assert settings.credit.steps == 800
+    assert settings.ippo == ALGORITHMS["ippo"].settings.model_copy(update={"gae_lambda": 1.0})
+    assert Settings(credit=CreditSettings(steps=800), ippo=PPOSettings(gae_lambda=1.0), method="dense") == settings
+    assert Settings(**settings.model_dump(exclude_unset=True)) == settings
 
 
-def test_what_is_decided_is_read_back_as_it_was():
-    """The hyperparameters as those of their algorithm, whose keys others have too."""
-    for settings, task in (({"algorithm": "sac"}, "Reacher-v4"), ({"algorithm": "ddpg"}, "Reacher-v4"), ({}, "CN-6")):
-        found = decided(settings, task)
-        again = ResolvedSettings.model_validate_json(found.model_dump_json())
-        assert again == found
-        assert type(again.hyperparameters) is type(found.hyperparameters)
+@pytest.mark.parametrize(("task", "algorithm"), [("Reacher-v4", "sac"), ("Reacher-v4", "ddpg"), ("CN-6", None)])
+def test_resolved_settings_round_trip(task, algorithm):
+    """Hyperparameters keep the class of their algorithm, although other classes have the same keys."""
+    resolved = resolve(Settings(algorithm=algorithm), read_task(task))
+    restored = ResolvedSettings.model_validate_json(resolved.model_dump_json())
+    assert restored == resolved
+    assert type(restored.hyperparameters) is type(resolved.hyperparameters)
+
+
+@pytest.mark.parametrize(
+    ("changes", "texts"),
+    [
+        ({"steps": None}, ["steps = None"]),
+        ({"hyperparameters": {"gamma": 2}}, ["hyperparameters.gamma = 2"]),
+        ({"algorithm": "dqn"}, ["'dqn'"]),
+    ],
+)
+def test_resolved_settings_refuse(changes, texts):
+    values = resolve(Settings(), read_task("Reacher-v4")).model_dump()
+    with pytest.raises(LareError) as error:
+        ResolvedSettings(**values | changes)
+    assert all(text in str(error.value) for text in texts)
 
 
 @pytest.mark.parametrize(
@@ -76,61 +86,59 @@ def test_what_is_decided_is_read_back_as_it_was():
         ("CN-6", {"td3": {"hidden": (8,)}, "method": "rd"}, ["td3.hidden"]),
         ("CN-6", {"method": "lare-rd", "credit": {"steps": 800}}, []),
         ("CN-6", {"fit_every": 3, "method": "rd"}, []),
+        ("CN-6", {"method": "lare-linear", "credit": {"optimism": 1}}, []),
+        ("CN-6", {"method": "lare-linear", "capacity": 10_000}, []),
+        ("CN-6", {"method": "ircr", "capacity": 10_000}, ["capacity"]),
+        ("CN-6", {"method": "rd", "algorithm": "qmix", "capacity": 10_000, "fit_every": 2}, ["fit_every"]),
+        ("CN-6", {"method": "lare-bayes", "first_fit": "published"}, ["first_fit"]),
         ("Reacher-v4", {"method": "dense", "judges": "after", "draw": 1}, ["judges", "draw"]),
         ("Reacher-v4", {"method": "bayes", "judges": "after"}, []),
         ("Reacher-v4", {"method": "rd", "credit": {"drawn_steps": 10}}, ["credit.drawn_steps"]),
         ("Reacher-v4", {"method": "rrd", "credit": {"drawn_steps": 10}}, []),
         ("Reacher-v4", {"method": "lare-linear", "credit": {"sum_form": True, "score": "sum"}}, ["credit.sum_form"]),
-        ("Reacher-v4", {"method": "lare-signs", "credit": {"score": "sum"}}, ["credit.score"]),
-        ("Reacher-v4", {"method": "bayes", "credit": {"optimism": 1}}, []),
-        ("CN-6", {"method": "lare-linear", "credit": {"optimism": 1}}, []),
         ("Reacher-v4", {"method": "lare-rrdu", "credit": {"optimism": 1}}, ["credit.optimism"]),
-        ("Reacher-v4", {"method": "lare-signs", "credit": {"optimism": 1}}, ["credit.optimism"]),
+        ("Reacher-v4", {"method": "lare-signs", "credit": {"score": "sum"}}, ["credit.score"]),
         ("Reacher-v4", {"method": "vib-rd", "credit": {"bottleneck": 3}}, []),
         ("Reacher-v4", {"method": "diaster", "fit_updates": 9, "credit": {"episodes": 4}}, []),
         ("Reacher-v4", {"method": "rd", "fit_every": 3, "fit_updates": 9}, ["fit_every", "fit_updates"]),
         ("Reacher-v4", {"method": "rd", "algorithm": "ppo", "fit_every": 3, "fit_updates": 9}, []),
-        ("Reacher-v4", {"method": "diaster", "credit": {"sum_form": True}}, ["credit.sum_form"]),
+        ("Reacher-v4", {"method": "ircr", "algorithm": "ppo", "fit_updates": 3}, ["fit_updates"]),
         ("Reacher-v4", {"algorithm": "ddpg", "ddpg": {"noise_clip": 0.2}}, ["ddpg.noise_clip"]),
         ("Reacher-v4", {"algorithm": "ddpg", "ddpg": {"noise_clip": 0.2, "policy_noise": 0.1}}, []),
         ("Reacher-v4", {"method": "dense", "algorithm": "ppo", "capacity": 10_000}, ["capacity"]),
         ("Reacher-v4", {"method": "dense", "algorithm": "ppo", "scale_rewards": True}, ["scale_rewards"]),
         ("Reacher-v4", {"method": "rrdu", "algorithm": "ppo", "capacity": 10_000}, []),
         ("Reacher-v4", {"method": "dense", "capacity": 10_000}, []),
-        ("CN-6", {"method": "lare-linear", "capacity": 10_000}, []),
-        ("CN-6", {"method": "ircr", "capacity": 10_000}, ["capacity"]),
-        ("CN-6", {"method": "rd", "algorithm": "qmix", "capacity": 10_000, "fit_every": 2}, ["fit_every"]),
-        ("Reacher-v4", {"method": "ircr", "algorithm": "ppo", "fit_updates": 3}, ["fit_updates"]),
     ],
 )
-def test_what_is_set_in_vain(task, settings, names):
-    spec, given = read_task(task), Settings(**settings)
-    found = decide(given, spec)
-    assert sorted(set_in_vain(given, found, spec)) == sorted(names)
-    assert not set(names) & set(found.in_force(spec))
+def test_unused_settings(task, settings, names):
+    spec, settings = read_task(task), Settings(**settings)
+    resolved = resolve(settings, spec)
+    assert sorted(unused_settings(settings, resolved, spec)) == sorted(names)
+    assert not set(names) & set(effective_settings(resolved, spec))
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("settings", "texts"),
     [
-        ({"td3": {"gamma": 0.5}}, "td3.gamma makes no difference to ppo on Pick; it has ppo.gamma"),
-        ({"td3": {"tau": 0.5}}, "td3.tau makes no difference to ppo on Pick"),
-        ({"scale_rewards": True}, "scale_rewards makes no difference to ppo on Pick"),
-        ({"credit": {"steps": 70}}, "credit.steps makes no difference to dense"),
+        ({"td3": {"gamma": 0.5}}, ["td3.gamma", "ppo on Pick", "ppo.gamma"]),
+        ({"td3": {"tau": 0.5}}, ["td3.tau", "ppo on Pick"]),
+        ({"scale_rewards": True}, ["scale_rewards", "ppo on Pick"]),
+        ({"credit": {"steps": 70}}, ["credit.steps", "dense"]),
     ],
 )
-def test_it_is_said_to_whom_it_makes_no_difference(settings, message):
-    given = Settings(method="dense", **settings)
-    found = set_in_vain(given, decide(given, pick_spec()), pick_spec())
-    assert list(found.values()) == [message]
+def test_unused_settings_message(settings, texts):
+    settings = Settings(method="dense", **settings)
+    (message,) = unused_settings(settings, resolve(settings, pick_spec()), pick_spec()).values()
+    assert all(text in message for text in texts)
 
 
-def test_every_setting_of_the_decoder_matters_to_some_method():
-    assert frozenset().union(*(method.settings for method in TABLE)) == set(CreditSettings.model_fields)
+def test_credit_settings_all_have_an_effect():
+    assert frozenset().union(*(method.settings for method in METHODS.values())) == set(CreditSettings.model_fields)
 
 
-def test_the_score_of_a_battle_is_a_sum():
-    """Of a task of one's own it is found out, unless the task says what it is."""
-    battle = decide(Settings(method="rd"), read_task("SMAX-2s3z"))
-    assert (battle.credit.score, decide(Settings(method="rd"), toy_spec()).credit.score) == ("sum", "auto")
-    assert decide(Settings(method="rd"), toy_spec(score="average")).credit.score == "average"
+def test_warmup_warning():
+    settings = Settings(steps=10_000, algorithm="td3")
+    assert "td3.warmup is 10,000" in (warmup_warning(resolve(settings, read_task("Reacher-v4"))) or "")
+    longer = settings.model_copy(update={"steps": 10_050})
+    assert warmup_warning(resolve(longer, read_task("Reacher-v4"))) is None

@@ -4,13 +4,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
+from helpers.numpy_attention import numpy_linear
 from lare_rl.credit.diaster import Diaster
-from lare_rl.nn.networks import descend, start_adam
+from lare_rl.nn.networks import adam_step, init_adam
 
-BATCH, STEPS, FEATURES = 4, 7, 3
+EPISODES, STEPS, FEATURES = 4, 7, 3
 LENGTH = np.array([7, 4, 2, 1])
 
 
@@ -21,87 +21,81 @@ def decoder():
 
 @pytest.fixture(scope="module")
 def rows():
-    return np.random.default_rng(0).normal(size=(BATCH, STEPS, FEATURES)).astype(np.float32)
+    return np.random.default_rng(0).normal(size=(EPISODES, STEPS, FEATURES)).astype(np.float32)
 
 
-def sigmoid(x):
-    return 1 / (1 + np.exp(-x))
+def numpy_piece_reward(decoder, rows):
+    """Return F of some steps, computed one step after the other."""
 
+    def sigmoid(x):
+        return 1 / (1 + np.exp(-x))
 
-def piece(decoder, rows):
-    """F of all of some steps, one step at a time."""
-    given, kept = decoder.recurrent.given, decoder.recurrent.kept
     h = np.zeros(5)
     for x in rows:
-        u = x @ np.asarray(given.weight) + np.asarray(given.bias)
-        w = h @ np.asarray(kept.weight) + np.asarray(kept.bias)
+        u, w = numpy_linear(decoder.gru.input_projection, x), numpy_linear(decoder.gru.hidden_projection, h)
         z, r = sigmoid(u[:5] + w[:5]), sigmoid(u[5:10] + w[5:10])
         h = (1 - z) * np.tanh(u[10:] + r * w[10:]) + z * h
-    return float((h @ np.asarray(decoder.value.weight) + np.asarray(decoder.value.bias))[0])
+    return float(numpy_linear(decoder.value, h)[0])
 
 
-def test_pieces_against_numpy(decoder, rows):
-    begins = np.zeros((BATCH, STEPS), bool)
+def test_piece_rewards_against_numpy(decoder, rows):
+    begins = np.zeros((EPISODES, STEPS), bool)
     begins[0, 3] = begins[2, 1] = True
-    found = np.asarray(decoder.pieces(jnp.asarray(rows), jnp.asarray(begins)))
-    for place in range(BATCH):
-        for step in range(STEPS):
-            begin = max([0, *(b for b in np.flatnonzero(begins[place]) if b <= step)])
-            assert found[place, step] == pytest.approx(
-                piece(decoder, rows[place, begin : step + 1]), rel=1e-4, abs=1e-5
-            )
+    rewards = np.asarray(decoder.piece_rewards(jnp.asarray(rows), jnp.asarray(begins)))
+    for episode, step in np.ndindex(rewards.shape):
+        begin = max([0, *(b for b in np.flatnonzero(begins[episode]) if b <= step)])
+        want = numpy_piece_reward(decoder, rows[episode, begin : step + 1])
+        assert rewards[episode, step] == pytest.approx(want, rel=1e-4, abs=1e-5)
 
 
-def test_the_loss_against_numpy(decoder, rows):
-    """Episodes of different lengths; one of a single step cannot be cut."""
+def test_loss_against_numpy(decoder, rows):
+    """The last episode has a single step, so that it cannot be cut. The third is padding."""
     key, target = jax.random.key(5), np.array([1.0, -0.5, 2.0, 0.3], np.float32)
-    weight = np.array([1.0, 1, 0, 1], np.float32)
-    cuts = np.asarray(jax.random.randint(key, (BATCH,), 1, jnp.maximum(jnp.asarray(LENGTH), 2)))
+    mask = np.array([1.0, 1, 0, 1], np.float32)
+    cuts = np.asarray(jax.random.randint(key, (EPISODES,), 1, jnp.maximum(jnp.asarray(LENGTH), 2)))
     want = 0.0
-    for x, length, mean, counts, cut in zip(rows, LENGTH, target, weight, cuts, strict=True):
-        total = mean * length / STEPS
-        second = piece(decoder, x[cut:length]) if length > 1 else 0.0
-        prefix = [piece(decoder, x[: t + 1]) for t in range(length)]
+    for x, length, mean_reward, valid, cut in zip(rows, LENGTH, target, mask, cuts, strict=True):
+        total = mean_reward * length / STEPS
+        second = numpy_piece_reward(decoder, x[cut:length]) if length > 1 else 0.0
+        prefix = [numpy_piece_reward(decoder, x[: t + 1]) for t in range(length)]
         prefix[-1] = total
         r_hat = np.asarray(decoder(jnp.asarray(x[:length]), None).r_hat)
-        missed = np.mean((r_hat - STEPS * np.diff(prefix, prepend=0)) ** 2)
-        want += counts * ((piece(decoder, x[:cut]) + second - total) ** 2 + missed)
-    given = (jnp.asarray(part) for part in (rows, LENGTH, target, weight))
-    assert float(decoder.loss(*given, key)) == pytest.approx(want / 3, rel=1e-3)
+        step_loss = np.mean((r_hat - STEPS * np.diff(prefix, prepend=0)) ** 2)
+        want += valid * ((numpy_piece_reward(decoder, x[:cut]) + second - total) ** 2 + step_loss)
+    loss = decoder.loss(*map(jnp.asarray, (rows, LENGTH, target, mask)), key)
+    assert float(loss) == pytest.approx(want / 3, rel=1e-3)
 
 
-def test_steps_behind_the_end_do_not_matter(decoder, rows):
-    changed = rows.copy()
-    for place, length in enumerate(LENGTH):
-        changed[place, length:] = 99.0
-    given = [jnp.asarray(LENGTH), jnp.ones(BATCH), jnp.ones(BATCH), jax.random.key(1)]
-    one, other = (jax.grad(lambda d, x=x: d.loss(jnp.asarray(x), *given))(decoder) for x in (rows, changed))
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+def loss_gradient(decoder, rows):
+    args = jnp.asarray(rows), jnp.asarray(LENGTH), jnp.ones(EPISODES), jnp.ones(EPISODES), jax.random.key(1)
+    return jax.grad(lambda decoder: decoder.loss(*args))(decoder)
+
+
+def test_padding_has_no_gradient(decoder, rows):
+    changed = np.where(np.arange(STEPS)[:, None] < LENGTH[:, None, None], rows, 99.0)
+    gradients = (jax.tree.leaves(loss_gradient(decoder, values)) for values in (rows, changed))
+    for a, b in zip(*gradients, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
 
 
-def test_the_step_model_teaches_the_other_nothing(decoder, rows):
-    """The differences are its targets: no gradient flows back through them."""
-    given = [jnp.asarray(LENGTH), jnp.ones(BATCH), jnp.ones(BATCH), jax.random.key(1)]
-    loud = jax.tree.map(lambda leaf: 100 * leaf, decoder.step)
-    changed = eqx.tree_at(lambda decoder: decoder.step, decoder, loud)
-    one, other = (jax.grad(lambda d: d.loss(jnp.asarray(rows), *given))(each) for each in (decoder, changed))
-    for a, b in zip(jax.tree.leaves(one.recurrent), jax.tree.leaves(other.recurrent), strict=True):
+def test_step_model_does_not_train_the_sub_trajectory_model(decoder, rows):
+    changed = eqx.tree_at(lambda d: d.step, decoder, jax.tree.map(lambda leaf: 100 * leaf, decoder.step))
+    gradients = (jax.tree.leaves(loss_gradient(network, rows).gru) for network in (decoder, changed))
+    for a, b in zip(*gradients, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5)
 
 
-def test_must_learn_what_a_step_pays():
-    """Step rewards that are linear in the features, from returns alone."""
+def test_must_learn_step_rewards():
+    """Step rewards are linear in the features. Only returns are observed."""
     rng, weight = np.random.default_rng(1), np.array([1.0, -2.0, 0.5], np.float32)
     decoder = Diaster(FEATURES, (32,), key=jax.random.key(0))
-    optimizer = start_adam(decoder, 3e-3)
+    optimizer = init_adam(decoder, 3e-3)
 
     @jax.jit
-    def update(decoder: Diaster, optimizer: optax.OptState, x: jax.Array, key: jax.Array):
-        target = jnp.mean(x @ weight, axis=1)
-        count = jnp.full(len(x), STEPS)
-        gradient = jax.grad(lambda d: d.loss(x, count, target, jnp.ones(len(x)), key))(decoder)
-        return descend(decoder, gradient, optimizer, 3e-3)
+    def update(decoder, optimizer, x, key):
+        target, length = jnp.mean(x @ weight, axis=1), jnp.full(len(x), STEPS)
+        gradient = jax.grad(lambda d: d.loss(x, length, target, jnp.ones(len(x)), key))(decoder)
+        return adam_step(decoder, gradient, optimizer, 3e-3)
 
     for number in range(1500):
         x = jnp.asarray(rng.normal(size=(32, STEPS, FEATURES)), jnp.float32)

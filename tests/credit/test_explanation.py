@@ -1,4 +1,4 @@
-"""What is explained, by which factor, and what is missing: on episodes whose score is known."""
+"""Explanations of episodes whose rewards are known functions of the inputs."""
 
 from functools import partial
 
@@ -9,10 +9,11 @@ import pytest
 
 from lare_rl.credit import evidence
 from lare_rl.credit.basis import Basis, expand
-from lare_rl.credit.explanation import add_steps, no_steps
-from lare_rl.credit.explanation import explain as explain_sums
+from lare_rl.credit.explanation import add_steps, empty_step_statistics
+from lare_rl.credit.explanation import explain as explain_statistics
 
-explain = jax.jit(explain_sums, static_argnames="basis")
+explain = jax.jit(explain_statistics, static_argnames="basis")
+expand = jax.jit(expand, static_argnums=0)
 
 
 @pytest.fixture(autouse=True)
@@ -21,189 +22,166 @@ def in_float64():
         yield
 
 
-def summed(basis, reward, count=120, seed=0, noise=0.1, form=0):
-    """Sums over episodes of about 20 steps that pay a function of the inputs, or weights times them; or the average of this."""
-    u, length = moody(basis.inputs, count, seed)
-    paid = reward(u) if callable(reward) else u @ reward
-    return summed_over(basis, u, length, paid + noise * np.random.default_rng([seed, 1]).normal(size=len(u)), form)
-
-
-def moody(inputs, count, seed=0):
-    """Steps whose inputs vary within episodes and between them, and the lengths of the episodes."""
-    random = np.random.default_rng(seed)
-    mood = random.normal(size=(count, inputs))
-    length = random.integers(10, 30, size=count)
-    return np.repeat(mood, length, axis=0) + random.normal(size=(length.sum(), inputs)), length
-
-
-def means_of(values, length):
-    return np.add.reduceat(values, np.append(0, np.cumsum(length)[:-1])) / length.reshape(-1, *[1] * (values.ndim - 1))
-
-
-def summed_over(basis, u, length, paid, form=0):
-    """The sums over the episodes, and those over the steps."""
-    features = np.asarray(expanded(basis, u))
-    returns = means_of(paid, length) * (1 if form else length)
-    return over_episodes(means_of(features, length), returns, length), over_steps(features, basis)
-
-
-expanded = jax.jit(expand, static_argnums=0)
-
-
 @jax.jit
-def over_episodes(means, returns, length):
-    return evidence.add_episodes(evidence.no_sums(means.shape[1]), means, returns, length)
+def episode_statistics(means, returns, length):
+    return evidence.add_episodes(evidence.empty_statistics(means.shape[1]), means, returns, length)
 
 
 @partial(jax.jit, static_argnums=1)
-def over_steps(features, basis):
-    return add_steps(no_steps(basis), features, jnp.ones(len(features), bool), basis)
+def step_statistics(features, basis):
+    return add_steps(empty_step_statistics(basis), features, jnp.ones(len(features), bool), basis)
+
+
+def sample_inputs(n_inputs, count, seed=0):
+    """Return inputs of steps that vary within episodes and between them, and the lengths of the episodes."""
+    random = np.random.default_rng(seed)
+    episode_mean = random.normal(size=(count, n_inputs))
+    length = random.integers(10, 30, size=count)
+    return np.repeat(episode_mean, length, axis=0) + random.normal(size=(length.sum(), n_inputs)), length
+
+
+def explain_rewards(basis, u, length, reward, score_type=0):
+    """Explain episodes with these inputs and rewards, of which the score is the sum or the mean."""
+    starts, features = np.append(0, np.cumsum(length)[:-1]), np.asarray(expand(basis, u))
+    means = np.add.reduceat(features, starts) / length[:, None]
+    returns = np.add.reduceat(reward, starts) / (length if score_type else 1)
+    return explain(episode_statistics(means, returns, length), step_statistics(features, basis), score_type, basis)
+
+
+def explain_function(basis, function, count=120, noise=0.1, score_type=0):
+    """Explain episodes of about 20 steps whose reward is a function of the inputs, or weights times them."""
+    u, length = sample_inputs(basis.n_inputs, count)
+    reward = function(u) if callable(function) else u @ np.array(function)
+    noise = noise * np.random.default_rng([0, 1]).normal(size=len(u))
+    return explain_rewards(basis, u, length, reward + noise, score_type)
 
 
 @pytest.mark.parametrize("extended", [False, True])
-@pytest.mark.parametrize("form", [0, 1])
-def test_factors_that_tell_all(extended, form):
-    """Two factors that vary alike: shares go as the squares of their weights."""
+@pytest.mark.parametrize("score_type", [0, 1])
+def test_linear_rewards(extended, score_type):
+    """The factors vary alike, so that their shares are proportional to the squares of their weights."""
     basis = Basis(3, 2, extended)
-    sums, of_steps = summed(basis, np.array([2.0, -1.0, 0, 0, 0]), form=form)
-    found = explain(sums, of_steps, form, basis)
-    steps = float(sums.steps / sums.episodes) if form else 1  # a step of an average has a T-th of it
-    assert float(found.episodes) == 120
-    assert bool(found.of_steps) == (form == 0)
-    assert float(found.by_factors) > 0.98
-    np.testing.assert_allclose(found.share, [0.8, 0.2, 0], atol=0.1)
-    weight, deviation = np.asarray(found.slope) * steps, np.sqrt(np.diagonal(found.uncertainty)) * steps
-    np.testing.assert_allclose(weight, [2, -1, 0], atol=0.15)
-    assert (deviation > 0).all()
-    assert (np.abs(weight - [2, -1, 0]) < 4 * deviation + 0.02).all()
+    explanation = explain_function(basis, [2.0, -1.0, 0, 0, 0], score_type=score_type)
+    _, length = sample_inputs(5, 120)
+    unit = length.mean() if score_type else 1  # a step of a mean gets a T-th of the reward
+    assert float(explanation.n_episodes) == 120
+    assert bool(explanation.explains_mean_reward) == (score_type == 0)
+    assert float(explanation.factors_r2) > 0.98
+    np.testing.assert_allclose(explanation.factor_shares, [0.8, 0.2, 0], atol=0.1)
+    slope, std = np.asarray(explanation.slope) * unit, np.sqrt(np.diagonal(explanation.slope_covariance)) * unit
+    np.testing.assert_allclose(slope, [2, -1, 0], atol=0.15)
+    assert (std > 0).all()
+    assert (np.abs(slope - [2, -1, 0]) < 4 * std + 0.02).all()
 
 
-def test_episodes_of_one_length_are_explained_by_their_returns():
-    basis, random = Basis(2, 0, extended=False), np.random.default_rng(0)
-    means, length = random.normal(size=(30, 2)), np.full(30, 7)
-    given = (jnp.asarray(part) for part in (means, 7 * means @ [2.0, -1.0], length))
-    assert not explain(evidence.add_episodes(evidence.no_sums(2), *given), no_steps(basis), 0, basis).of_steps
+def test_episodes_of_the_same_length_are_explained_by_returns():
+    basis, u = Basis(2, 0, extended=False), np.random.default_rng(0).normal(size=(210, 2))
+    assert not explain_rewards(basis, u, np.full(30, 7), u @ [2.0, -1.0]).explains_mean_reward
 
 
-def test_what_the_factors_leave_goes_with_the_entry_that_is_missing():
-    basis = Basis(2, 3, extended=True)
-    found = explain(*summed(basis, np.array([1.0, 0, 0, -1.0, 0])), 0, basis)
-    assert 0.3 < float(found.by_factors) < 0.7
-    assert float(found.by_all) > 0.98
-    left = np.asarray(found.left)
-    assert left[1] < -0.9
-    assert np.abs(left[[0, 2]]).max() < 0.4
+def test_residual_correlates_with_the_missing_raw_feature():
+    explanation = explain_function(Basis(2, 3, extended=True), [1.0, 0, 0, -1.0, 0])
+    assert 0.3 < float(explanation.factors_r2) < 0.7
+    assert float(explanation.total_r2) > 0.98
+    correlation = np.asarray(explanation.residual_correlation)
+    assert correlation[1] < -0.9
+    assert np.abs(correlation[[0, 2]]).max() < 0.4
 
 
-def test_the_entries_share_what_a_fit_on_everything_explains():
-    """Two entries that pay twice as much as the factor, by a line and by a pair with a third entry."""
-    basis = Basis(1, 3, extended=True)
-    found = explain(*summed(basis, lambda u: u[:, 0] + 2 * u[:, 1] + 2 * u[:, 2] * u[:, 3], noise=0.01), 0, basis)
-    line, one, other = np.asarray(found.of_entries)
-    assert float(found.by_all) > 0.98
-    assert one == pytest.approx(other, abs=0.1)
-    assert 0.5 < float(found.by_all) - float(found.by_factors) < 0.95
-    assert line + one + other == pytest.approx(float(found.by_all) - float(found.by_factors), abs=0.1)
-    assert min(line, one + other) > 0.2
+def test_raw_feature_shares():
+    """The effect of two raw features, a line and a pair with a third one, is twice that of the factor."""
+    explanation = explain_function(
+        Basis(1, 3, extended=True), lambda u: u[:, 0] + 2 * u[:, 1] + 2 * u[:, 2] * u[:, 3], noise=0.01
+    )
+    line, first, second = np.asarray(explanation.raw_feature_shares)
+    raw_share = float(explanation.total_r2) - float(explanation.factors_r2)
+    assert float(explanation.total_r2) > 0.98
+    assert first == pytest.approx(second, abs=0.1)
+    assert 0.5 < raw_share < 0.95
+    assert line + first + second == pytest.approx(raw_share, abs=0.1)
+    assert min(line, first + second) > 0.2
 
 
-def test_factors_that_tell_nothing():
-    basis = Basis(2, 1, extended=False)
-    found = explain(*summed(basis, np.array([0, 0, 1.0])), 0, basis)
-    assert float(found.by_factors) < 0.1
-    assert float(found.by_all) > 0.98
+def test_useless_factors_and_no_factors():
+    useless = explain_function(Basis(2, 1, extended=False), [0, 0, 1.0])
+    assert float(useless.factors_r2) < 0.1
+    assert float(useless.total_r2) > 0.98
+    none = explain_function(Basis(0, 3, extended=False), [1.0, 0, 0])
+    assert (float(none.factors_r2), none.factor_shares.shape, none.slope.shape) == (0, (0,), (0,))
+    assert float(none.total_r2) > 0.98
+    np.testing.assert_allclose(none.raw_feature_shares, [none.total_r2, 0, 0], atol=0.02)
 
 
-def test_without_factors_the_entries_tell():
-    found = explain(*summed(Basis(0, 3, extended=False), np.array([1.0, 0, 0])), 0, Basis(0, 3, extended=False))
-    assert (float(found.by_factors), found.share.shape, found.slope.shape) == (0, (0,), (0,))
-    assert float(found.by_all) > 0.98
-    np.testing.assert_allclose(found.of_entries, [found.by_all, 0, 0], atol=0.02)
+def test_raw_feature_that_never_varies_has_no_correlation():
+    basis, (u, length) = Basis(1, 2, extended=False), sample_inputs(3, 120)
+    u[:, 2] = 0
+    assert float(explain_rewards(basis, u, length, u @ [1.0, 1.0, 0]).residual_correlation[1]) == 0
 
 
-def test_an_entry_that_never_varies_goes_with_nothing():
-    basis = Basis(1, 2, extended=False)
-    sums, steps = summed(basis, np.array([1.0, 1.0, 0]))
-    products = sums.products.at[2, :].set(0).at[:, 2].set(0)
-    assert float(explain(sums._replace(products=products), steps, 0, basis).left[1]) == 0
-
-
-def test_a_factor_whose_mean_is_the_same_in_all_episodes_is_told_apart():
-    """Although it varies within them, returns cannot tell what it pays. Rounding is no difference."""
-    basis, random = Basis(2, 0, extended=False), np.random.default_rng(0)
-    length = np.full(40, 8)
-    u = random.normal(size=(320, 2))
+def test_factor_varies():
+    """The second factor varies within episodes only, but for rounding, so that returns do not determine its effect."""
+    u = np.random.default_rng(0).normal(size=(320, 2))
     u[:, 1] = np.tile([1.0, 1, 1, -1, -1, -1, -1, 1], 40) + 1e-9 * u[:, 0]
-    found = explain(*summed_over(basis, u, length, u @ [1.0, 1.0]), 0, basis)
-    assert found.varied.tolist() == [True, False]
+    explanation = explain_rewards(Basis(2, 0, extended=False), u, np.full(40, 8), u @ [1.0, 1.0])
+    assert explanation.factor_varies.tolist() == [True, False]
 
 
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_of_few_episodes_nothing_is_said(count):
-    basis = Basis(1, 1, extended=False)
-    given = summed(basis, np.ones(2), count=count) if count else (evidence.no_sums(2), no_steps(basis))
-    found = explain(*given, 0, basis)
-    assert np.isnan(found.by_all)
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_episodes_explain_nothing(count):
+    assert np.isnan(explain_function(Basis(1, 1, extended=False), [1.0, 1.0], count=count).total_r2)
 
 
 @pytest.mark.parametrize("noise", [0.1, 3.0])
-def test_the_shares_of_the_factors_add_up_to_what_they_explain(noise):
-    basis = Basis(3, 2, extended=True)
-    found = explain(*summed(basis, np.array([2.0, -1.0, 0.5, 1.0, 0]), count=30, noise=noise), 0, basis)
-    assert 0 < float(found.by_factors) < 1
-    assert float(found.share.sum()) == pytest.approx(float(found.by_factors))
+def test_factor_shares_add_up(noise):
+    explanation = explain_function(Basis(3, 2, extended=True), [2.0, -1.0, 0.5, 1.0, 0], count=30, noise=noise)
+    assert 0 < float(explanation.factors_r2) < 1
+    assert float(explanation.factor_shares.sum()) == pytest.approx(float(explanation.factors_r2))
 
 
-def test_a_factor_that_offsets_another_has_a_share_below_0():
-    """A cost that grows with the gain: its share is -Cov(cost, return) / Var(return), and that of the gain is above 1."""
+def test_factor_that_offsets_another_has_a_negative_share():
+    """A cost grows with the gain. Its share is -Cov(cost, return) / Var(return), and that of the gain is above 1."""
     basis, random = Basis(2, 0, extended=False), np.random.default_rng(3)
     gain = random.normal(size=200)
     means = np.stack([gain, 0.8 * gain + 0.3 * random.normal(size=200)], axis=1)
-    returns, length = means @ [2.0, -1.0], np.full(200, 20)
-    sums = evidence.add_episodes(
-        evidence.no_sums(2), jnp.asarray(means), jnp.asarray(20 * returns), jnp.asarray(length)
-    )
-    steps = add_steps(no_steps(basis), jnp.asarray(means), jnp.ones(200, bool), basis)
-    found = explain(sums, steps, 0, basis)
-    np.testing.assert_allclose(found.slope, [2, -1], rtol=1e-3)
-    want = [
-        weight * np.cov(column, returns)[0, 1] / returns.var(ddof=1)
-        for weight, column in zip([2, -1], means.T, strict=True)
-    ]
+    returns = means @ [2.0, -1.0]
+    statistics = episode_statistics(means, 20 * returns, np.full(200, 20))
+    explanation = explain(statistics, step_statistics(means, basis), 0, basis)
+    np.testing.assert_allclose(explanation.slope, [2, -1], rtol=1e-3)
+    covariance = [np.cov(column, returns)[0, 1] for column in means.T]
+    want = np.array([2, -1]) * covariance / returns.var(ddof=1)
     assert want[1] < -0.3
-    np.testing.assert_allclose(found.share, want, rtol=1e-2)
+    np.testing.assert_allclose(explanation.factor_shares, want, rtol=1e-2)
 
 
 @pytest.mark.parametrize("count", [30, 100])
-def test_the_slope_is_that_of_the_closest_line_whatever_features_express_it(count):
-    """|u| bends the shapes of all factors, and a sine then takes the place of the second factor's line."""
-    basis, (u, length) = Basis(2, 0, True), moody(2, count)
+def test_slope_is_that_of_the_closest_line(count):
+    """|u| bends the shapes of all factors, and a sine then replaces the second factor's line."""
+    u, length = sample_inputs(2, count)
     effects = np.stack([-2 * np.abs(u[:, 0]), 0.5 * u[:, 1]], axis=1)
-    found = explain(*summed_over(basis, u, length, effects.sum(axis=1)), 0, basis)
-    lines = [np.polyfit(u[:, i], effects[:, i], 1) for i in range(2)]
-    np.testing.assert_allclose(found.slope, [slope for slope, _ in lines], atol=0.05)
-    assert float(found.linear[0]) < 0.1
-    assert float(found.linear[1]) > 0.9
-    np.testing.assert_allclose(found.paired, 0, atol=0.02)
+    explanation = explain_rewards(Basis(2, 0, extended=True), u, length, effects.sum(axis=1))
+    want = [np.polyfit(u[:, i], effects[:, i], 1)[0] for i in range(2)]
+    np.testing.assert_allclose(explanation.slope, want, atol=0.05)
+    assert float(explanation.linear_share[0]) < 0.1
+    assert float(explanation.linear_share[1]) > 0.9
+    np.testing.assert_allclose(explanation.pair_shares, 0, atol=0.02)
 
 
 @pytest.mark.parametrize("count", [30, 100])
-def test_the_effect_of_a_rare_event_is_what_it_pays(count):
-    """It has two values, so that all of its shapes are one line: weights are not known one by one, but what they add up to is."""
+def test_effect_of_a_rare_event(count):
+    """An event has two values, so that all of its shapes are one line. Only the sum of its weights is determined."""
     random = np.random.default_rng(0)
     length = random.integers(20, 40, size=count)
     event = random.random(length.sum()) < 0.03
-    deviation = event.std()
-    u = np.stack([(event - event.mean()) / deviation, random.normal(size=len(event))], axis=1)
-    basis = Basis(2, 0, extended=True)
-    found = explain(*summed_over(basis, u, length, 5.0 * event + 0.01 * random.normal(size=len(event))), 0, basis)
-    assert float(found.slope[0]) == pytest.approx(5 * deviation, rel=0.02)
-    assert float(found.uncertainty[0, 0]) < 0.02**2
-    assert float(found.linear[0]) == pytest.approx(1, abs=1e-3)
+    std = event.std()
+    u = np.stack([(event - event.mean()) / std, random.normal(size=len(event))], axis=1)
+    reward = 5.0 * event + 0.01 * random.normal(size=len(event))
+    explanation = explain_rewards(Basis(2, 0, extended=True), u, length, reward)
+    assert float(explanation.slope[0]) == pytest.approx(5 * std, rel=0.02)
+    assert float(explanation.slope_covariance[0, 0]) < 0.02**2
+    assert float(explanation.linear_share[0]) == pytest.approx(1, abs=1e-3)
 
 
-def test_the_effect_of_a_pair_is_told_apart():
-    basis = Basis(2, 0, True)
-    found = explain(*summed(basis, lambda u: u[:, 0] * u[:, 1], 100), 0, basis)
-    np.testing.assert_allclose(found.paired, found.share, atol=0.1)
-    np.testing.assert_allclose(found.slope, 0, atol=0.1)
+def test_pair_shares():
+    explanation = explain_function(Basis(2, 0, extended=True), lambda u: u[:, 0] * u[:, 1], count=100)
+    np.testing.assert_allclose(explanation.pair_shares, explanation.factor_shares, atol=0.1)
+    np.testing.assert_allclose(explanation.slope, 0, atol=0.1)

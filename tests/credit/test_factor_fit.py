@@ -1,107 +1,92 @@
-"""How well factors would have told returns, each before it was seen."""
-
-from itertools import pairwise
+"""How well factors predict returns, each before a fit sees it."""
 
 import jax
 import numpy as np
 import pytest
 
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.factor_fit import FIRST, features_of, growing, judge, predictions, r2_and_error
-from lare_rl.credit.returns import FormFound
+from lare_rl.credit.factor_fit import N_FIRST, assess_factors, mean_features, predict_returns
+from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.util.statistics import r_squared
 
 BASIS = Basis(2, 3, extended=True)
 
 
-def played(form="sum", count=60, seed=0, agents=1, noise=0.0):
-    """Episodes of 5 to 20 steps of rows [z, s', a]; what is paid is twice the first factor, less the second."""
-    random = np.random.default_rng(seed)
-    rows = [random.normal(size=(random.integers(5, 21), agents, BASIS.inputs)) for _ in range(count)]
-    rows = [(one + random.normal(size=BASIS.inputs)).astype(np.float32) for one in rows]
-    alive = [np.ones(one.shape[:2], bool) for one in rows]
-    mean = np.array([(one[..., :2] @ [2.0, -1.0]).mean() for one in rows])
-    length = np.array([len(one) for one in rows])
-    returns = (mean + noise * random.normal(size=count)) * (length if form == "sum" else 1)
-    return rows, alive, returns
+def sample_episodes(score="sum", count=60, agents=1, noise=0.0):
+    """Return episodes of 5 to 20 steps with inputs [z, s', a]. The reward is twice the first factor, less the second."""
+    random = np.random.default_rng(0)
+    inputs = [random.normal(size=(random.integers(5, 21), agents, BASIS.n_inputs)) for _ in range(count)]
+    inputs = [(episode + random.normal(size=BASIS.n_inputs)).astype(np.float32) for episode in inputs]
+    alive = [np.ones(episode.shape[:2], bool) for episode in inputs]
+    mean = np.array([(episode[..., :2] @ [2.0, -1.0]).mean() for episode in inputs])
+    length = np.array([len(episode) for episode in inputs])
+    returns = (mean + noise * random.normal(size=count)) * (length if score == "sum" else 1)
+    return inputs, alive, returns
 
 
-def test_factors_that_tell_the_score_are_preferred():
-    rows, alive, returns = played()
-    other = [np.concatenate([one[..., 3:5], one[..., 2:]], axis=-1) for one in rows]
-    assert judge(rows, alive, returns, BASIS).r2 > 0.95
-    assert judge(other, alive, returns, BASIS).r2 < 0.5
+def test_r2_compares_factors():
+    inputs, alive, returns = sample_episodes()
+    useless = [np.concatenate([episode[..., 3:5], episode[..., 2:]], axis=-1) for episode in inputs]
+    assert assess_factors(inputs, alive, returns, BASIS).r2 > 0.95
+    assert assess_factors(useless, alive, returns, BASIS).r2 < 0.5
+    few = (values[:N_FIRST] for values in (inputs, alive, returns))
+    assert np.isnan(assess_factors(*few, BASIS).r2)
 
 
-def test_no_return_is_seen_before_it_is_predicted():
-    rows, alive, returns = played(noise=0.3)
-    length = np.array([len(one) for one in rows])
+def test_returns_are_predicted_before_a_fit_sees_them():
+    inputs, alive, returns = sample_episodes(noise=0.3)
+    length = np.array([len(episode) for episode in inputs])
+    changed = np.where(np.arange(60) < 40, returns, -returns)
     with jax.enable_x64(True):
-        means = features_of(rows, alive, BASIS)[0][:, BASIS.of_factors]
-        changed = np.where(np.arange(len(rows)) < 40, returns, -returns)
-        one, other = (predictions(means, paid, length, BASIS, 0) for paid in (returns, changed))
-    # The block of episode 40 is predicted as a whole.
-    known = next(end for _, end in growing(len(rows)) if end > 40) - FIRST
-    np.testing.assert_array_equal(one[:known], other[:known])
-    assert (one[known:] != other[known:]).all()
+        features, _ = mean_features(inputs, alive, BASIS)
+        before, after = (predict_returns(features, r, length, BASIS, ScoreType.SUM) for r in (returns, changed))
+    n_equal = int(np.argmax(before != after))
+    assert 40 <= N_FIRST + n_equal <= 42  # the block of episode 40 is predicted as a whole
+    assert (before[n_equal:] != after[n_equal:]).all()
+
+
+@pytest.mark.parametrize("score", ["sum", "average"])
+def test_score_type(score):
+    inputs, alive, returns = sample_episodes(score)
+    estimated = assess_factors(inputs, alive, returns, BASIS)
+    want = ScoreType.MEAN if score == "average" else ScoreType.SUM
+    assert estimated.score_type == ScoreTypeEstimate(want, is_certain=True)
+    fixed = assess_factors(inputs, alive, returns, BASIS, score)
+    assert (fixed.score_type, fixed.r2) == (None, estimated.r2)
+    other = {"sum": "average", "average": "sum"}[score]
+    assert assess_factors(inputs, alive, returns, BASIS, other).r2 < estimated.r2
+
+
+def test_length_r2():
+    inputs, alive, returns = sample_episodes()
+    length = np.array([len(episode) for episode in inputs])
+    assessment = assess_factors(inputs, alive, 3.0 * length, BASIS, "sum")
+    assert assessment.length_r2 == pytest.approx(1)
+    assert assessment.r2 > 0.99
+    zero_mean = assess_factors(inputs, alive, returns, BASIS)
+    assert zero_mean.length_r2 < zero_mean.r2 - 0.3
+    assert assess_factors(*sample_episodes("average"), BASIS).length_r2 is None
+    equal = ([episode[:5] for episode in values] for values in (inputs, alive))
+    assert assess_factors(*equal, 3.0 * length, BASIS).length_r2 is None
+
+
+def test_agents_that_are_not_alive_are_ignored():
+    inputs, alive, _ = sample_episodes(agents=2)
+    padded = [np.concatenate([episode, np.full_like(episode[:, :1], 9.0)], axis=1) for episode in inputs]
+    masked = [np.concatenate([mask, np.zeros_like(mask[:, :1])], axis=1) for mask in alive]
+    with jax.enable_x64(True):
+        features, statistics = mean_features(inputs, alive, BASIS)
+        padded_features, padded_statistics = mean_features(padded, masked, BASIS)
+    np.testing.assert_allclose(features, padded_features, rtol=1e-4, atol=1e-5)
+    for a, b in zip(statistics, padded_statistics, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3)
+    assert int(statistics.n_steps) == sum(map(np.sum, alive))
 
 
 @pytest.mark.parametrize("noise", [0.2, 0.7, 1.2])
-def test_the_error_of_r2_is_its_deviation_from_sample_to_sample(noise):
+def test_error_of_r2_is_its_std_over_samples(noise):
     random = np.random.default_rng(0)
     returns = random.normal(3, 2, size=(1000, 40))
-    found = np.array([r2_and_error(one, one + noise * random.normal(0, 2, 40)) for one in returns])
-    assert np.median(found[:, 1]) == pytest.approx(found[:, 0].std(), rel=0.15)
-    assert found[:, 0].mean() == pytest.approx(1 - noise**2 * 40 / 37, abs=0.03)
-
-
-@pytest.mark.parametrize("returns", [[], [5.0], [5.0] * 12, [1e6] * 11 + [1e6 + 1e-9]])
-def test_equal_returns_have_no_r2(returns):
-    assert np.isnan(r2_and_error(np.array(returns), np.zeros(len(returns)))).all()
-
-
-@pytest.mark.parametrize("form", ["sum", "average"])
-def test_the_form_is_found_or_given(form):
-    rows, alive, returns = played(form)
-    found = judge(rows, alive, returns, BASIS)
-    assert found.form == FormFound(form == "average", decided=True)
-    given = judge(rows, alive, returns, BASIS, form)
-    assert (given.form, given.r2) == (None, found.r2)
-    assert judge(rows, alive, returns, BASIS, {"sum": "average", "average": "sum"}[form]).r2 < found.r2
-
-
-def test_lengths_alone_predict_the_score_of_equal_steps():
-    rows, alive, _ = played()
-    length = np.array([len(one) for one in rows])
-    found = judge(rows, alive, 3.0 * length, BASIS, "sum")
-    assert found.r2_of_lengths == pytest.approx(1)
-    assert found.r2 > 0.99
-    zero_mean = judge(*played(), BASIS)
-    assert zero_mean.r2_of_lengths < zero_mean.r2 - 0.3
-    assert judge(*played("average"), BASIS).r2_of_lengths is None
-    equal = judge([one[:5] for one in rows], [one[:5] for one in alive], 3.0 * length, BASIS)
-    assert equal.r2_of_lengths is None
-
-
-def test_agents_who_have_left_do_not_count():
-    rows, alive, _ = played(agents=2)
-    changed = [np.concatenate([one, np.full_like(one[:, :1], 9.0)], axis=1) for one in rows]
-    there = [np.concatenate([one, np.zeros_like(one[:, :1])], axis=1) for one in alive]
-    with jax.enable_x64(True):
-        (one, steps), (other, of_other) = (features_of(*given, BASIS) for given in ((rows, alive), (changed, there)))
-    np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
-    for sums, others in zip(steps, of_other, strict=True):
-        np.testing.assert_allclose(sums, others, rtol=1e-4, atol=1e-3)
-    assert int(steps.number) == sum(map(np.sum, alive))
-
-
-def test_few_episodes_say_nothing():
-    rows, alive, returns = played(count=FIRST)
-    assert np.isnan(judge(rows, alive, returns, BASIS).r2)
-
-
-@pytest.mark.parametrize("count", [1, FIRST, FIRST + 1, 200])
-def test_blocks_follow_each_other(count):
-    blocks = list(growing(count))
-    assert (blocks[0][0], blocks[-1][1]) == (0, count)
-    assert all(end == start for (_, end), (start, _) in pairwise(blocks))
-    assert len(blocks) <= 1 + max(0, count - FIRST)
+    r2, error = np.array([r_squared(r, r + noise * random.normal(0, 2, 40)) for r in returns]).T
+    assert np.median(error) == pytest.approx(r2.std(), rel=0.15)
+    assert r2.mean() == pytest.approx(1 - noise**2 * 40 / 37, abs=0.03)

@@ -1,37 +1,85 @@
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 import pytest
+from jaxtyping import Array, Float
 
-from lare_rl.credit.methods import METHODS, TABLE, Encoder, Fit, Reward, find_method
+from lare_rl import CreditAssigner
+from lare_rl.config.settings import Settings
+from lare_rl.credit import encoders
+from lare_rl.credit.decoder_network import DecoderOutput
+from lare_rl.credit.decoders import DECODERS, Decoder, register_decoder
+from lare_rl.credit.methods import METHODS, Fit, Method, Reward, find_method, register_method
 from lare_rl.errors import LareError
 
 
-def test_names_are_unique():
-    assert len(METHODS) == len(TABLE)
-
-
-@pytest.mark.parametrize("method", TABLE, ids=lambda method: method.name)
-def test_rows_are_whole(method):
+@pytest.mark.parametrize("method", METHODS.values(), ids=lambda method: method.name)
+def test_rows_are_consistent(method):
     assert (method.reward is Reward.PROXY) == (method.fit is not None)
     assert (method.reward in (Reward.PROXY, Reward.DESIGNED)) == (method.encoder is not None)
     assert method.summary
     assert method.source
 
 
-def test_published_rows():
-    assert (METHODS["rd"].encoder, METHODS["rd"].fit) == (Encoder.RAW, Fit.ALL_STEPS)
-    assert (METHODS["rrd"].encoder, METHODS["rrd"].fit) == (Encoder.RAW, Fit.DRAWN_STEPS)
-    assert (METHODS["rrdu"].encoder, METHODS["rrdu"].fit) == (Encoder.RAW, Fit.DRAWN_STEPS_UNBIASED)
-    assert (METHODS["lare-rd"].encoder, METHODS["lare-rd"].fit) == (Encoder.LATENT, Fit.ALL_STEPS)
-    assert (METHODS["lare-rrdu"].encoder, METHODS["lare-rrdu"].fit) == (Encoder.LATENT, Fit.DRAWN_STEPS_UNBIASED)
-
-
 @pytest.mark.parametrize(
-    ("name", "message"),
+    ("name", "encoder", "fit"),
     [
-        ("lare_rrdu", "no method 'lare_rrdu' (did you mean 'lare-rrdu'?)"),
-        ("", "no method ''"),
+        ("rd", encoders.RAW, Fit.ALL_STEPS),
+        ("rrd", encoders.RAW, Fit.SAMPLED_STEPS),
+        ("rrdu", encoders.RAW, Fit.SAMPLED_STEPS_UNBIASED),
+        ("lare-rd", encoders.FACTORS, Fit.ALL_STEPS),
+        ("lare-rrdu", encoders.FACTORS, Fit.SAMPLED_STEPS_UNBIASED),
     ],
 )
-def test_unknown_method(name, message):
-    with pytest.raises(LareError) as caught:
+def test_published_rows(name, encoder, fit):
+    assert (METHODS[name].encoder, METHODS[name].fit) == (encoder, fit)
+
+
+@pytest.mark.parametrize(("name", "words"), [("lare_rrdu", "'lare_rrdu' .*'lare-rrdu'"), ("", "dense, episodic, ")])
+def test_find_method_unknown(name, words):
+    with pytest.raises(LareError, match=words):
         find_method(name)
-    assert str(caught.value) == f"{message}; the methods are {', '.join(METHODS)}"
+
+
+class Squares(eqx.Module):
+    """A decoder with a loss of its own."""
+
+    weight: Float[Array, " inputs"]
+
+    def __call__(self, features, key):
+        r_hat = features**2 @ self.weight
+        return DecoderOutput(r_hat, jnp.zeros_like(r_hat))
+
+    def loss(self, features, length, target, mask, key):
+        valid = jnp.arange(features.shape[1]) < length[:, None]
+        mean = jnp.sum(self(features, key).r_hat * valid, axis=1) / length
+        return jnp.mean(mask * (mean - target) ** 2)
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Names that are registered by a test are removed after it."""
+    for registry in (DECODERS, METHODS):
+        monkeypatch.setattr(registry, "_values", dict(registry._values))
+
+
+@pytest.mark.parametrize("fit", [Fit.ALL_STEPS, Fit.SAMPLED_STEPS_UNBIASED, Fit.DECODER_LOSS])
+def test_registered_method_is_trained(fit, registered):
+    register_decoder(Decoder("squares", lambda key, shape, settings: Squares(shape.gain * jnp.ones(shape.n_inputs))))
+    register_method(Method(f"squares {fit}", "squares", "this test", encoder=encoders.RAW, fit=fit, decoder="squares"))
+    assert Settings(method=f"squares {fit}").method == f"squares {fit}"
+    credit = CreditAssigner(f"squares {fit}", observation_space=2, action_space=1)
+    random = np.random.default_rng(0)
+    for _ in range(4):
+        s, a, reward = random.normal(size=(10, 2)), random.normal(size=(10, 1)), random.normal(size=10)
+        credit.add_episode(s, a, s + 1, reward)
+    credit.fit(20)
+    assert np.isfinite(credit.metrics()["credit/loss"])
+
+
+def test_register_refuses(registered):
+    with pytest.raises(LareError, match="another method 'rd'"):
+        register_method(Method("rd", "mine", "this test"))
+    with pytest.raises(LareError, match="no decoder 'nothing'"):
+        register_method(Method("new", "mine", "this test", decoder="nothing"))
+    register_method(METHODS["rd"])

@@ -1,4 +1,4 @@
-"""The rings of trajectories against plain lists of episodes."""
+"""The replay against plain lists of episodes."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from lare_rl.data import replay
 from lare_rl.data.replay import Index
 
 ENVS, LONGEST, CHUNKS = 3, 6, (1, 3, 7)
-CAPACITY = replay.room(max(CHUNKS), LONGEST)
+CAPACITY = replay.required_capacity(max(CHUNKS), LONGEST)
 COLUMNS = {
     "observation": jax.ShapeDtypeStruct((2, 1), np.float32),
     "state": jax.ShapeDtypeStruct((3,), np.float32),
@@ -22,137 +22,149 @@ extend, read = jax.jit(replay.extend), jax.jit(replay.read)
 
 
 def stream(lengths, env=0):
-    """Steps of episodes, the last of which goes on: a list of what stands before, after, what teams earned, and the end.
+    """Return steps of episodes, the last of which is running: (observation, next observation, team rewards, ended).
 
-    Every observation is another number, so that each row can be recognised.
+    Every observation is a different number, so that each row can be recognised.
     """
     rows = []
     for episode, length in enumerate(lengths):
         for step in range(length):
-            here = 100_000 * env + 20 * episode + step
+            observation = 100_000 * env + 20 * episode + step
             ended = step == length - 1 and episode < len(lengths) - 1
-            rows.append((here, here + 1, np.float32([episode + 0.5, -step]), ended))
+            rows.append((observation, observation + 1, np.float32([episode + 0.5, -step]), ended))
     return rows
 
 
-def chunk(rows):
-    """Some steps of each environment as the replay takes them."""
-    here, led_to, reward, ended = (np.array([[row[k] for row in one] for one in rows]).swapaxes(0, 1) for k in range(4))
+def replay_columns(rows_by_env):
+    """Return some steps of each environment as the replay stores them."""
+    observation, next_observation, reward, ended = (
+        np.array([[row[k] for row in rows] for rows in rows_by_env]).swapaxes(0, 1) for k in range(4)
+    )
 
-    def shown(number):
-        many = number[..., None].astype(np.float32)
-        return {"observation": np.stack([many, -many], axis=2), "state": many * np.float32([1, 2, 3])}
+    def columns(number):
+        values = number[..., None].astype(np.float32)
+        return {"observation": np.stack([values, -values], axis=2), "state": values * np.float32([1, 2, 3])}
 
-    before = shown(here) | {"action": 7 + shown(here)["observation"], "terminated": ended & (here % 2 == 0)}
-    return before, shown(led_to), reward, ended
+    before = columns(observation)
+    before |= {"action": 7 + before["observation"], "terminated": ended & (observation % 2 == 0)}
+    return before, columns(next_observation), reward, ended
 
 
-def stored(rows, chunks, capacity=CAPACITY):
-    held, start = replay.empty(COLUMNS, len(rows), capacity, 2), 0
+def filled_replay(rows_by_env, chunks, capacity=CAPACITY):
+    buffer, start = replay.init_replay(COLUMNS, len(rows_by_env), capacity, 2), 0
     for count in chunks:
-        held = extend(held, *chunk([of_one[start : start + count] for of_one in rows]))
+        buffer = extend(buffer, *replay_columns([rows[start : start + count] for rows in rows_by_env]))
         start += count
-    return held
+    return buffer
 
 
-def kept(rows, chunks, capacity=CAPACITY):
-    """Which episodes the ring of one environment holds, the slow way: before each chunk, the oldest go until it fits."""
+def slow_replay(rows, chunks, capacity=CAPACITY):
+    """Return the finished episodes and the running one that a replay stores: before each chunk, remove the oldest until it fits."""
     episodes, running, start = [], [], 0
     for count in chunks:
-        whole = len(episodes)
+        n_removable = len(episodes)
         for row in rows[start : start + count]:
             running.append(row)
             if row[3]:
                 episodes.append(running)
                 running = []
         start += count
-        while whole and sum(len(one) + 1 for one in episodes) + (len(running) + 1 if running else 0) > capacity:
+        while n_removable and sum(len(e) + 1 for e in episodes) + (len(running) + 1 if running else 0) > capacity:
             episodes.pop(0)
-            whole -= 1
+            n_removable -= 1
     return episodes, running
 
 
-lengths = st.lists(st.integers(1, LONGEST), min_size=1, max_size=8)
+LENGTHS = st.lists(st.integers(1, LONGEST), min_size=1, max_size=8)
 
 
-@given(st.lists(lengths, min_size=ENVS, max_size=ENVS), st.lists(st.sampled_from(CHUNKS), min_size=1, max_size=8))
+@given(st.lists(LENGTHS, min_size=ENVS, max_size=ENVS), st.lists(st.sampled_from(CHUNKS), min_size=1, max_size=8))
 @settings(max_examples=40, deadline=None)
-def test_whatever_comes_in_whatever_pieces_the_newest_episodes_are_held_whole(of_envs, chunks):
+def test_replay_matches_slow_twin(lengths_by_env, chunks):
     total = sum(chunks)
-    rows = [stream(one * (total + 1), env)[:total] for env, one in enumerate(of_envs)]
-    held = stored(rows, chunks)
-    number = np.asarray(replay.oldest_transition(held))[:, None] + np.arange(CAPACITY)
-    found = read(held, Index(jnp.repeat(jnp.arange(ENVS)[:, None], CAPACITY, axis=1), jnp.asarray(number)))
-    sizes, whole = np.asarray(replay.size(held)), np.asarray(replay.finished(held))
+    rows = [stream(lengths * (total + 1), env)[:total] for env, lengths in enumerate(lengths_by_env)]
+    buffer = filled_replay(rows, chunks)
+    number = np.asarray(replay.oldest_transition(buffer))[:, None] + np.arange(CAPACITY)
+    steps = read(buffer, Index(jnp.repeat(jnp.arange(ENVS)[:, None], CAPACITY, axis=1), jnp.asarray(number)))
+    n_transitions, n_finished = np.asarray(replay.n_transitions(buffer)), np.asarray(replay.n_finished(buffer))
     for env in range(ENVS):
-        episodes, running = kept(rows[env], chunks)
-        assert whole[env] == len(episodes)
-        assert sizes[env] == sum(map(len, episodes)) + len(running)
-        place = 0
-        for done, steps in [*((True, one) for one in episodes), (False, running)]:
-            returned = np.sum([step[2] for step in steps], axis=0) if steps else None
-            for number, (here, led_to, _, ended) in enumerate(steps):
-                at, last = (env, place), number == len(steps) - 1
-                want = chunk([[(here, led_to, [0, 0], ended)]])
+        episodes, running = slow_replay(rows[env], chunks)
+        assert n_finished[env] == len(episodes)
+        assert n_transitions[env] == sum(map(len, episodes)) + len(running)
+        i = 0
+        for is_finished, episode in [*((True, episode) for episode in episodes), (False, running)]:
+            return_ = np.sum([step[2] for step in episode], axis=0) if episode else None
+            for t, (observation, next_observation, _, ended) in enumerate(episode):
+                at, is_last = (env, i), t == len(episode) - 1
+                columns, next_columns, *_ = replay_columns([[(observation, next_observation, [0, 0], ended)]])
                 for name in COLUMNS:
-                    np.testing.assert_array_equal(found.before[name][at], want[0][name][0, 0])
+                    np.testing.assert_array_equal(steps.columns[name][at], columns[name][0, 0])
                 for name in ("observation", "state"):
-                    np.testing.assert_array_equal(found.after[name][at], want[1][name][0, 0])
-                assert bool(found.finished[at]) == done
-                np.testing.assert_allclose(found.mean_reward[at], returned / len(steps), rtol=1e-6)
-                np.testing.assert_allclose(found.episodic_reward[at], returned * (done and last), rtol=1e-6)
-                place += 1
-    assert set(found.after) == {"observation", "state"}
+                    np.testing.assert_array_equal(steps.next_columns[name][at], next_columns[name][0, 0])
+                assert bool(steps.finished[at]) == is_finished
+                np.testing.assert_allclose(steps.mean_reward[at], return_ / len(episode), rtol=1e-6)
+                np.testing.assert_allclose(steps.episodic_reward[at], return_ * (is_finished and is_last), rtol=1e-6)
+                i += 1
+    assert set(steps.next_columns) == {"observation", "state"}
 
 
-def test_adding_in_pieces_is_adding_at_once():
+def test_extend_in_chunks():
     rows = [stream([4, 6, 3, 2, 5], env) for env in range(ENVS)]
-    pieces, whole = stored(rows, [3, 7, 1, 7, 1, 1], capacity=60), stored(rows, [20], capacity=60)
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, pieces, whole))
+    chunked, at_once = filled_replay(rows, [3, 7, 1, 7, 1, 1], capacity=60), filled_replay(rows, [20], capacity=60)
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, chunked, at_once))
 
 
-def test_a_column_that_nobody_reads_is_not_there():
-    steps, few = chunk([stream([3, 4], env) for env in range(2)]), {"observation": COLUMNS["observation"]}
-    before, after = ({"observation": part["observation"]} for part in steps[:2])
-    held = replay.extend(replay.empty(few, 2, CAPACITY, 2), before, after, *steps[2:])
-    found = replay.read(held, replay.newest(held, 2))
-    assert (set(found.before), set(found.after)) == ({"observation"}, {"observation"})
+def test_columns_are_those_of_init():
+    steps, few = replay_columns([stream([3, 4], env) for env in range(2)]), {"observation": COLUMNS["observation"]}
+    before, after = ({"observation": columns["observation"]} for columns in steps[:2])
+    buffer = replay.extend(replay.init_replay(few, 2, CAPACITY, 2), before, after, *steps[2:])
+    newest = replay.read(buffer, replay.newest_steps(buffer, 2))
+    assert (set(newest.columns), set(newest.next_columns)) == ({"observation"}, {"observation"})
 
 
-def test_the_newest_steps_of_every_environment():
+def test_newest_steps():
     rows = [stream([4, 6, 3, 2, 5], env) for env in range(ENVS)]
-    held = stored(rows, [7, 7])
-    found = read(held, replay.newest(held, 5)).before["observation"]
-    np.testing.assert_array_equal(found[..., 0, 0], [[row[0] for row in of_one[9:14]] for of_one in rows])
+    buffer = filled_replay(rows, [7, 7])
+    observation = read(buffer, replay.newest_steps(buffer, 5)).columns["observation"]
+    np.testing.assert_array_equal(observation[..., 0, 0], [[row[0] for row in env[9:14]] for env in rows])
 
 
-def test_dropping_running_episodes_forgets_them_and_nothing_else():
-    rows = [stream([2, 5], 0), stream([4, 3], 1), stream([3, 1, 9], 2)]
-    held = stored(rows, [7])
-    assert held.running.tolist() == [True, True, True]
-    dropped = replay.drop_running(held, jnp.array([True, False, True]))
-    assert replay.size(dropped).tolist() == [2, 7, 4]
-    assert dropped.next_row.tolist() == [3, int(held.next_row[1]), 6]
-    assert dropped.running.tolist() == [False, True, False]
-    again = extend(dropped, *chunk([stream([7], env)[:3] for env in (7, 8, 9)]))
-    found = read(again, replay.newest(again, 3))
+def test_abandon_running():
+    buffer = filled_replay([stream([2, 5], 0), stream([4, 3], 1), stream([3, 1, 9], 2)], [7])
+    assert buffer.running.tolist() == [True, True, True]
+    abandoned = replay.abandon_running(buffer, jnp.array([True, False, True]))
+    assert replay.n_transitions(abandoned).tolist() == [2, 7, 4]
+    assert abandoned.next_row.tolist() == [3, int(buffer.next_row[1]), 6]
+    assert abandoned.running.tolist() == [False, True, False]
+    longer = extend(abandoned, *replay_columns([stream([7], env)[:3] for env in (7, 8, 9)]))
+    steps = read(longer, replay.newest_steps(longer, 3))
     np.testing.assert_array_equal(
-        found.before["observation"][..., 0, 0], [[k, k + 1, k + 2] for k in (700_000, 800_000, 900_000)]
+        steps.columns["observation"][..., 0, 0], [[k, k + 1, k + 2] for k in (700_000, 800_000, 900_000)]
     )
-    np.testing.assert_allclose(found.mean_reward[0], [[0.5, -1]] * 3)
-    unchanged = replay.drop_running(dropped, jnp.array([True, False, True]))
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, unchanged, dropped))
+    np.testing.assert_allclose(steps.mean_reward[0], [[0.5, -1]] * 3)
+    unchanged = replay.abandon_running(abandoned, jnp.array([True, False, True]))
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, unchanged, abandoned))
+
+
+def test_hide_newest():
+    buffer = filled_replay([stream([2, 3, 1, 1])], [7])
+    hidden = replay.hide_newest(buffer, jnp.array([2]))
+    assert replay.n_finished(hidden).tolist() == [1]
+    number = jnp.arange(7)
+    assert read(hidden, Index(0 * number, number)).finished.tolist() == [True] * 2 + [False] * 5
+    restored = hidden._replace(episodes=buffer.episodes, running=buffer.running)
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, restored, buffer))
 
 
 @pytest.mark.parametrize(("steps", "longest"), [(1, 1), (7, 6), (50, 1000)])
-def test_room_for_the_worst_case(steps, longest):
-    """An episode under way that lacks one step of the longest, and then as many episodes of a single step as there are steps."""
+def test_required_capacity(steps, longest):
+    # The worst case: a running episode lacks one step of the longest, and then each step is an episode.
     worst = stream([longest, *[1] * (steps - 1), 1])
     rows = longest + 1 + 2 * (steps - 1) if steps > 1 else longest + 1
     assert len(worst) == longest + steps
-    assert rows <= replay.room(steps, longest)
+    assert rows <= replay.required_capacity(steps, longest)
 
 
-def test_drawing_from_nothing():
-    nothing = replay.empty(COLUMNS, ENVS, CAPACITY, 2)
-    assert replay.size(nothing).tolist() == replay.finished(nothing).tolist() == [0, 0, 0]
+def test_empty_replay():
+    empty = replay.init_replay(COLUMNS, ENVS, CAPACITY, 2)
+    assert replay.n_transitions(empty).tolist() == replay.n_finished(empty).tolist() == [0, 0, 0]

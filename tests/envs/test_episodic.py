@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lare_rl.envs.episodic import TRUE_REWARD, EpisodicReward
-from lare_rl.envs.guarded_gymnasium import make
+from lare_rl.envs.gymnasium_env import make_gymnasium
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.errors import LareError
 
@@ -45,8 +45,8 @@ def play(environment, steps):
 def test_pays_the_sum_at_the_end_and_nothing_before(end):
     environment = EpisodicReward(Scripted([1, -2.5, 4], end))
     assert environment.reset()[1] == {"fresh": True}
-    paid, infos = play(environment, 3)
-    assert paid == [0.0, 0.0, 2.5]
+    paid_rewards, infos = play(environment, 3)
+    assert paid_rewards == [0.0, 0.0, 2.5]
     assert infos == [{"mine": 1, TRUE_REWARD: reward} for reward in (1.0, -2.5, 4.0)]
 
 
@@ -70,9 +70,9 @@ def test_episodes_do_not_add_up():
 def test_whatever_the_rewards_the_payment_is_their_sum(rewards, end):
     environment = EpisodicReward(Scripted(rewards, end))
     environment.reset()
-    paid, infos = play(environment, len(rewards))
-    assert paid[:-1] == [0.0] * (len(rewards) - 1)
-    assert paid[-1] == pytest.approx(math.fsum(rewards), abs=1e-9)
+    paid_rewards, infos = play(environment, len(rewards))
+    assert paid_rewards[:-1] == [0.0] * (len(rewards) - 1)
+    assert paid_rewards[-1] == pytest.approx(math.fsum(rewards), abs=1e-9)
     assert [info[TRUE_REWARD] for info in infos] == rewards
 
 
@@ -93,13 +93,13 @@ def test_whatever_the_rewards_the_payment_is_their_sum(rewards, end):
     ],
 )
 def test_gymnasiums_checker_finds_no_fault(name):
-    environment = EpisodicReward(make(name))
+    environment = EpisodicReward(make_gymnasium(name))
     check_env(environment, skip_render_check=True)
     environment.close()
 
 
 def test_it_can_be_made_again_from_its_spec():
-    environment = EpisodicReward(make("Pendulum-v1"))
+    environment = EpisodicReward(make_gymnasium("Pendulum-v1"))
     again = gymnasium.make(environment.spec)
     assert isinstance(again, EpisodicReward)
 
@@ -116,8 +116,8 @@ def test_a_score_may_be_paid_instead():
     environment = EpisodicReward(Scored([1.0, 2.0, 4.0]), score="score")
     environment.unwrapped.score = np.float32(9)
     environment.reset()
-    paid, infos = play(environment, 3)
-    assert paid == [0.0, 0.0, 9.0]
+    paid_rewards, infos = play(environment, 3)
+    assert paid_rewards == [0.0, 0.0, 9.0]
     assert [info[TRUE_REWARD] for info in infos] == [1.0, 2.0, 4.0]
 
 
@@ -126,7 +126,7 @@ def test_a_score_may_be_paid_instead():
     [
         ("goals", 1, "the info of the last step has no 'goals': it has 'mine', 'score'"),
         ("score", "high", "info['score'] of the last step is 'high', which is not a number"),
-        ("score", math.nan, "info['score'] of the last step is nan: a score must be finite"),
+        ("score", math.nan, "info['score'] of the last step is nan, which is not finite"),
     ],
 )
 def test_a_score_that_is_none_is_refused(key, value, message):

@@ -1,15 +1,22 @@
-"""Choices as rows of numbers."""
+"""Spaces as vectors, and values that are checked on the way."""
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Discrete
+import pytest
+from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiDiscrete, Tuple
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
-from lare_rl.envs.guarded_gymnasium import make
-from lare_rl.envs.spaces import OneHot, OneHotAction
+from lare_rl.envs.gymnasium_env import make_gymnasium
+from lare_rl.envs.spaces import OneHot, OneHotAction, check_spaces, finite_array, flatten_value
+from lare_rl.errors import LareError
+
+PLANE = Box(-1, 1, (2,), np.float32)
 
 
 class Three(gymnasium.Env):
-    """Remembers what was chosen; its actions are 5, 6 and 7."""
+    """Remembers its last action, which is 5, 6 or 7."""
 
     observation_space = Discrete(4)
     action_space = Discrete(3, start=5)
@@ -19,38 +26,126 @@ class Three(gymnasium.Env):
         return 0, {}
 
     def step(self, action):
-        self.chosen = action
+        self.last_action = action
         return int(action) - 4, 0.0, False, False, {}
 
 
 gymnasium.register("toys/Three-v0", entry_point=Three, max_episode_steps=10)
 
 
-def test_an_environment_of_choices_takes_rows_and_gives_rows():
-    environment = make("toys/Three-v0")
-    assert isinstance(environment.action_space, OneHot)
-    observation, _ = environment.reset(seed=0)
-    np.testing.assert_array_equal(observation, [1, 0, 0, 0])
-    observation, *_ = environment.step(np.array([0.2, 0.1, 0.9], np.float32))
-    assert environment.unwrapped.chosen == 7
+def test_discrete_spaces_become_one_hot():
+    env = make_gymnasium("toys/Three-v0")
+    assert isinstance(env.action_space, OneHot)
+    np.testing.assert_array_equal(env.reset(seed=0)[0], [1, 0, 0, 0])
+    observation, *_ = env.step(np.array([0.2, 0.1, 0.9], np.float32))
+    assert env.unwrapped.last_action == 7
     np.testing.assert_array_equal(observation, [0, 0, 0, 1])
 
 
-def test_a_sample_has_a_single_one_and_every_choice_comes():
-    space = OneHot(3, seed=0)
-    rows = np.stack([space.sample() for _ in range(100)])
-    assert set(map(tuple, rows)) == {(1, 0, 0), (0, 1, 0), (0, 0, 1)}
-    assert all(space.contains(row) for row in rows)
+def test_flat_spaces_stay():
+    assert not isinstance(make_gymnasium("Pendulum-v1").unwrapped, OneHotAction)
+    assert make_gymnasium("Pendulum-v1").observation_space.shape == (3,)
 
 
-def test_an_algorithms_output_becomes_the_choice_of_its_largest_number():
-    np.testing.assert_array_equal(OneHot(3).chosen(np.array([-1, 0.5, 0.4], np.float32)), [0, 1, 0])
+def test_one_hot():
+    space = OneHot(3, start=5, seed=0)
+    samples = np.stack([space.sample() for _ in range(100)])
+    assert set(map(tuple, samples)) == {(1, 0, 0), (0, 1, 0), (0, 0, 1)}
+    assert all(map(space.contains, samples))
+    np.testing.assert_array_equal(space.project(np.array([-1, 0.5, 0.4], np.float32)), [0, 1, 0])
+    assert space.to_discrete(np.array([0.2, 0.1, 0.9], np.float32)) == 7
 
 
-def test_the_number_of_a_choice_counts_from_the_environments_first():
-    assert OneHot(3, start=5).number(np.array([0.2, 0.1, 0.9], np.float32)) == 7
+@pytest.mark.parametrize(
+    ("observation", "action", "content"),
+    [
+        (Graph(PLANE, None), PLANE, "observation space of x"),
+        (Dict({"net": Graph(PLANE, None)}), PLANE, "observation space of x"),
+        (PLANE, MultiDiscrete([2, 3]), "neither a Discrete nor a Box"),
+        (PLANE, Box(-np.inf, 1, (1,), np.float32), "no bounds"),
+    ],
+)
+def test_check_spaces_refuses(observation, action, content):
+    with pytest.raises(LareError, match=content):
+        check_spaces("x", observation, action)
 
 
-def test_what_is_a_row_already_stays_as_it_is():
-    assert not isinstance(make("Pendulum-v1").unwrapped, OneHotAction)
-    assert make("Pendulum-v1").observation_space.shape == (3,)
+boxes = st.builds(
+    lambda shape, low, width: Box(low, low + width, tuple(shape), np.float32),
+    st.lists(st.integers(1, 3), min_size=1, max_size=3),
+    st.floats(-100, 100, width=16),
+    st.floats(0.5, 100, width=16),
+)
+discretes = st.builds(lambda n, start: Discrete(n, start=start), st.integers(1, 5), st.integers(-2, 2))
+spaces = st.recursive(
+    boxes | discretes | st.builds(MultiDiscrete, st.lists(st.integers(1, 4), min_size=1, max_size=3)),
+    lambda inner: (
+        st.dictionaries(st.sampled_from("xyz"), inner, min_size=1, max_size=3).map(Dict)
+        | st.lists(inner, min_size=1, max_size=3).map(Tuple)
+    ),
+    max_leaves=4,
+)
+
+
+@given(space=spaces, seed=st.integers(0, 2**31))
+def test_flatten_value_equals_gymnasium(space, seed):
+    space.seed(seed)
+    value = space.sample()
+    np.testing.assert_allclose(flatten_value(space, value), gymnasium.spaces.flatten(space, value), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "content"),
+    [
+        (PLANE, None, r"shape \(\), not \(2,\)"),
+        (PLANE, np.zeros((1, 2)), r"shape \(1, 2\), not \(2,\)"),
+        (PLANE, [0, np.nan], "nan"),
+        (PLANE, [0, -np.inf], "-inf"),
+        (PLANE, [0, 1e39], "inf"),
+        (PLANE, [0, 10**400], "not an array of numbers"),
+        (PLANE, "ab", "'ab', which is not an array of numbers"),
+        (Discrete(3), 3, r"3, which is not in Discrete\(3\)"),
+        (Dict(x=PLANE, y=PLANE), {"x": [0, 0]}, "keys x, y"),
+        (Dict(x=PLANE), [0, 0], "keys x"),
+        (Tuple([PLANE, PLANE]), ([0, 0],), "2 elements"),
+        (Tuple([PLANE, Discrete(2)]), ([0, 0], 2), r"2, which is not in Discrete\(2\)"),
+    ],
+)
+def test_flatten_value_refuses(space, value, content):
+    with pytest.raises(ValueError, match=content):
+        flatten_value(space, value)
+
+
+def test_flatten_value_copies():
+    memory = np.zeros(2, np.float32)
+    vector = flatten_value(PLANE, memory)
+    memory += 1
+    assert vector.tolist() == [0, 0]
+
+
+numbers = st.floats() | st.integers() | st.integers(min_value=2**1024) | st.booleans() | st.none() | st.text(max_size=3)
+any_values = (
+    st.lists(numbers | st.lists(numbers, max_size=2), max_size=3)
+    | st.dictionaries(st.sampled_from("xy"), numbers)
+    | arrays.arrays(np.float64, arrays.array_shapes(min_dims=0, max_dims=2, max_side=3))
+    | st.complex_numbers()
+    | st.binary(max_size=4)
+    | numbers
+)
+
+
+@given(value=any_values, space=st.sampled_from([PLANE, Discrete(2), Dict(x=Discrete(2), y=PLANE), Tuple([PLANE])]))
+def test_flatten_value_of_anything(value, space):
+    """Either a valid vector or a `ValueError` of one line, which callers turn into a `LareError`."""
+    try:
+        vector = flatten_value(space, value)
+    except ValueError as error:
+        assert "\n" not in str(error)  # noqa: PT017
+    else:
+        assert (vector.ndim, vector.dtype) == (1, np.float32)
+        assert np.isfinite(vector).all()
+
+
+@given(value=arrays.arrays(np.float64, (2,), elements=st.floats(-1e30, 1e30)))
+def test_finite_array_keeps_numbers(value):
+    np.testing.assert_array_equal(finite_array(value, (2,)), value.astype(np.float32))

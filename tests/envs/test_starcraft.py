@@ -1,4 +1,7 @@
+"""SMAC through a mock of the game, whose battles are SMAX's."""
+
 import sys
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -7,167 +10,152 @@ import numpy as np
 import pytest
 
 from helpers.fake_smac import FROM_SMAC, FakeSmac
-from lare_rl.envs.interface import HostEnv
 from lare_rl.envs.smax.smax_env import SMAX
-from lare_rl.envs.starcraft import StarCraft, find_game
+from lare_rl.envs.starcraft import StarCraft
 from lare_rl.errors import LareError
 
-TO_SMAC = np.array([*(FROM_SMAC.index(one) for one in range(4)), 1, *range(6, 11)])
-"""SMAX's choices, as SMAC counts them."""
+TO_SMAC = np.array([*(FROM_SMAC.index(action) for action in range(4)), 1, *range(6, 11)])
+"""The numbers of SMAX's actions in SMAC."""
 
 
 @pytest.fixture(autouse=True)
-def nothing_was_launched():
+def no_launches():
     FakeSmac.launched = ()
 
 
-def legal(seen, random) -> np.ndarray:
-    """A random legal choice of each agent, as rows."""
-    choice = np.argmax(seen.available * random.uniform(0.5, 1, seen.available.shape), axis=1)
-    return np.eye(seen.available.shape[1], dtype=np.float32)[choice]
+def sample_actions(timestep, rng) -> np.ndarray:
+    """Random available actions, one-hot."""
+    choices = np.argmax(timestep.available * rng.uniform(0.5, 1, timestep.available.shape), axis=1)
+    return np.eye(timestep.available.shape[1], dtype=np.float32)[choices]
 
 
-def test_says_what_the_game_says():
-    env: HostEnv = StarCraft("2s3z", game=FakeSmac)
+def test_episode_equals_smax():
+    env, battle = StarCraft("2s3z", make_game=FakeSmac), SMAX("2s3z")
+    key, rng, step = jax.random.key(7), np.random.default_rng(0), jax.jit(battle.step)
+    timestep = env.reset(7)
+    key, start_key = jax.random.split(key)
+    state, expected = jax.jit(battle.reset)(start_key)
     spec = env.spec
-    assert (spec.agents, spec.action_size, spec.max_steps) == (5, 11, 120)
-    assert (spec.observation_size, spec.state_size) == (127, 120)
-    assert spec.discrete
-    assert spec.masks_actions
-    assert spec.agents_leave
-    assert spec.measures == ("won",)
-
-
-def test_an_episode_is_that_of_the_battle_within():
-    env, battle = StarCraft("2s3z", game=FakeSmac), SMAX("2s3z")
-    key, random, step = jax.random.key(7), np.random.default_rng(0), jax.jit(battle.step)
-    seen = env.reset(7)
-    key, start = jax.random.split(key)
-    state, expected = jax.jit(battle.reset)(start)
-    steps, left = 0, 0
+    assert (spec.n_agents, spec.action_size, spec.max_steps, spec.observation_size, spec.state_size) == (
+        5,
+        11,
+        120,
+        127,
+        120,
+    )
+    assert (spec.discrete, spec.masks_actions, spec.agents_leave, spec.measures) == (True, True, True, ("won",))
+    steps, n_dead = 0, 0
     while True:
-        np.testing.assert_array_equal(seen.observation, expected.observation)
-        np.testing.assert_array_equal(seen.state, expected.state)
-        np.testing.assert_array_equal(seen.alive, expected.alive)
+        np.testing.assert_array_equal(timestep.observation, expected.observation)
+        np.testing.assert_array_equal(timestep.state, expected.state)
+        np.testing.assert_array_equal(timestep.alive, expected.alive)
         np.testing.assert_array_equal(
-            seen.available[:, 1:][seen.alive][:, TO_SMAC - 1], expected.available[expected.alive]
+            timestep.available[:, 1:][timestep.alive][:, TO_SMAC - 1], expected.available[expected.alive]
         )
-        np.testing.assert_array_equal(seen.reward, expected.reward)
-        assert (seen.terminated, seen.truncated) == (expected.terminated, expected.truncated)
-        assert seen.measures["won"] == expected.measures["won"]
-        if seen.terminated or seen.truncated:
+        np.testing.assert_array_equal(timestep.reward, expected.reward)
+        assert (timestep.terminated, timestep.truncated) == (expected.terminated, expected.truncated)
+        assert timestep.measures["won"] == expected.measures["won"]
+        if timestep.terminated or timestep.truncated:
             break
-        rows = legal(seen, random)
-        assert (rows[~seen.alive].argmax(1) == 0).all()
-        left += (~seen.alive).sum()
-        choice = [FROM_SMAC[one] if one < 6 else one - 1 for one in rows.argmax(1)]
-        seen = env.step(rows)
-        key, now = jax.random.split(key)
-        state, expected = step(state, jax.nn.one_hot(jnp.array(choice), 10), now)
+        action = sample_actions(timestep, rng)
+        assert (action[~timestep.alive].argmax(1) == 0).all()
+        n_dead += (~timestep.alive).sum()
+        choices = [FROM_SMAC[choice] if choice < 6 else choice - 1 for choice in action.argmax(1)]
+        timestep = env.step(action)
+        key, step_key = jax.random.split(key)
+        state, expected = step(state, jax.nn.one_hot(jnp.array(choices), 10), step_key)
         steps += 1
     assert steps > 10
-    assert left > 0
-
-
-def test_time_that_runs_out_is_no_end_of_its_own():
-    env = StarCraft("2s3z", game=FakeSmac)
-    seen = env.reset(0)
-    env.steps = 119
-    env.game.state = env.game.state._replace(battle=env.game.state.battle._replace(step=jnp.array(119, jnp.int32)))
-    seen = env.step(np.eye(11, dtype=np.float32)[[1] * 5])
-    assert seen.truncated
-    assert not seen.terminated
+    assert n_dead > 0
 
 
 STOP = np.eye(11, dtype=np.float32)[[1] * 5]
 
 
-def test_an_episode_in_which_the_game_crashes_is_truncated_and_the_next_one_is_whole():
-    env = StarCraft("2s3z", game=partial(FakeSmac, crash_at=2))
+def test_time_limit_truncates():
+    games = []
+
+    class Recorded(FakeSmac):
+        def __init__(self, **kwargs):
+            super().__init__(**kwargs)
+            games.append(self)
+
+    env = StarCraft("2s3z", make_game=Recorded)
     env.reset(0)
-    before = env.step(STOP)
-    said = r"^StarCraft II crashed in step 2 of an episode of 2s3z: the episode ends there, and the game starts again$"
-    with pytest.warns(RuntimeWarning, match=said):
-        seen = env.step(STOP)
-    assert seen.truncated
-    assert not seen.terminated
-    assert (seen.reward == 0).all()
-    np.testing.assert_array_equal(seen.state, before.state)
-    seen = env.reset(1)
+    env.spec = replace(env.spec, max_steps=1)
+    battle = games[-1].state.battle
+    games[-1].state = games[-1].state._replace(battle=battle._replace(step=jnp.array(119, jnp.int32)))
+    timestep = env.step(STOP)
+    assert (bool(timestep.truncated), bool(timestep.terminated)) == (True, False)
+
+
+def test_crash_truncates_the_episode():
+    env = StarCraft("2s3z", make_game=partial(FakeSmac, crash_at=2))
+    env.reset(0)
+    previous = env.step(STOP)
+    with pytest.warns(RuntimeWarning, match="crashed in step 2"):
+        timestep = env.step(STOP)
+    assert (bool(timestep.truncated), bool(timestep.terminated)) == (True, False)
+    assert not timestep.reward.any()
+    np.testing.assert_array_equal(timestep.state, previous.state)
+    assert env.reset(1).alive.all()
     assert FakeSmac.launched == (0, 0, 1)
-    assert seen.alive.all()
-    assert env.steps == 0
 
 
-def test_a_game_that_crashes_again_and_again_ends_the_run():
-    env = StarCraft("2s3z", game=partial(FakeSmac, crash_at=1))
+def test_repeated_crashes_end_the_run():
+    env = StarCraft("2s3z", make_game=partial(FakeSmac, crash_at=1))
     for seed in range(2):
         env.reset(seed)
         with pytest.warns(RuntimeWarning):
             env.step(STOP)
     env.reset(2)
-    said = r"^StarCraft II crashed in step 1 of an episode of 2s3z; that makes 3 crashes in a row$"
-    with pytest.raises(LareError, match=said):
+    with pytest.raises(LareError, match=r"crashed .* 3rd time"):
         env.step(STOP)
 
 
-def test_what_is_not_available_is_refused_before_the_game_does():
-    env = StarCraft("2s3z", game=FakeSmac)
-    env.reset(0)
-    with pytest.raises(LareError, match="agent 0 of 2s3z chose action 0, which is not available to it now"):
-        env.step(np.eye(11, dtype=np.float32)[[0] * 5])
-
-
-def test_the_game_is_started_once_unless_every_seed_shall_count():
-    env, random = StarCraft("2s3z", game=FakeSmac), np.random.default_rng(0)
-    seen = env.reset(3)
-    while not (seen.terminated or seen.truncated):
-        seen = env.step(legal(seen, random))
+def test_launches():
+    """A new game only for the first episode and after an incomplete one, or for all with `relaunch`."""
+    env, rng = StarCraft("2s3z", make_game=FakeSmac), np.random.default_rng(0)
+    timestep = env.reset(3)
+    while not (timestep.terminated or timestep.truncated):
+        timestep = env.step(sample_actions(timestep, rng))
     env.reset(4)
-    env.reset(5)
     assert FakeSmac.launched == (0, 3)
-    env = StarCraft("2s3z", relaunch=True, game=FakeSmac)
+    env = StarCraft("2s3z", relaunch=True, make_game=FakeSmac)
     first, other, again = env.reset(3), env.reset(4), env.reset(3)
     assert FakeSmac.launched[2:] == (0, 3, 4, 3)
     np.testing.assert_array_equal(first.state, again.state)
     assert (first.state != other.state).any()
-
-
-def test_no_second_game_runs_beside_the_first_where_no_episode_has_ended():
-    env = StarCraft("2s3z", game=FakeSmac)
+    env = StarCraft("2s3z", make_game=FakeSmac)
     env.reset(3)
-    first = env.game
     env.reset(4)
-    assert first.closed
-    assert FakeSmac.launched == (0, 3, 4)
-
-
-def test_renders_and_closes():
-    env = StarCraft("2s3z", game=FakeSmac)
-    env.reset(0)
-    game = env.game
+    assert FakeSmac.launched[6:] == (0, 3, 4)
     assert env.render().shape == (4, 4, 3)
     env.close()
     env.close()
-    assert game.closed
 
 
-def test_what_the_game_complains_of_is_one_line():
+def test_errors():
+    env = StarCraft("2s3z", make_game=FakeSmac)
+    env.reset(0)
+    with pytest.raises(LareError, match=r"agent 0 .* action 0"):
+        env.step(np.eye(11, dtype=np.float32)[[0] * 5])
+
     def refuse(**_):
         raise KeyError("no map\n2s3y")
 
-    with pytest.raises(LareError, match=r"SMAC cannot make '2s3y': .*no map") as error:
-        StarCraft("2s3y", game=refuse)
+    with pytest.raises(LareError, match=r"cannot make '2s3y': .*no map") as error:
+        StarCraft("2s3y", make_game=refuse)
     assert "\n" not in str(error.value)
 
 
 @pytest.fixture
-def package(tmp_path, monkeypatch):
-    """Puts packages on the path, which Python forgets afterwards."""
+def write_package(tmp_path, monkeypatch):
+    """Writes packages on the path, which Python forgets afterwards."""
     monkeypatch.syspath_prepend(tmp_path)
 
     def write(path: str, text: str = "") -> None:
-        file = tmp_path / path
+        file = tmp_path / path / "__init__.py"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text)
 
@@ -176,27 +164,26 @@ def package(tmp_path, monkeypatch):
         del sys.modules[name]
 
 
-def test_the_other_smac_is_not_taken_for_it(package):
-    package("smac/__init__.py")
-    with pytest.raises(LareError, match=r"SMAC is not installed: pip install git.*PyPI calls smac is another project"):
-        find_game()
+def test_other_smac_package_is_refused(write_package):
+    write_package("smac")
+    with pytest.raises(LareError, match=r"not installed.* another project"):
+        StarCraft("2s3z")
 
 
-@pytest.mark.parametrize("files", [("smacv2/env",), ("smac/env", "smac/env/starcraft2")])
-def test_without_the_game_its_folder_is_named(package, files, monkeypatch, tmp_path):
-    package(f"{files[0].split('/')[0]}/__init__.py")
-    for file in files:
-        package(f"{file}/__init__.py", "StarCraft2Env = dict")
+@pytest.mark.parametrize("packages", [("smacv2", "smacv2/env"), ("smac", "smac/env", "smac/env/starcraft2")])
+def test_installed_game(write_package, packages, monkeypatch, tmp_path):
+    for package in packages:
+        write_package(package, "from helpers.fake_smac import FakeSmac as StarCraft2Env")
     monkeypatch.setenv("SC2PATH", str(tmp_path / "nowhere"))
-    with pytest.raises(LareError, match=r"StarCraft II is not at .*nowhere: set SC2PATH to its folder"):
-        find_game()
+    with pytest.raises(LareError, match=r"nowhere.*SC2PATH"):
+        StarCraft("2s3z")
     monkeypatch.setenv("SC2PATH", str(tmp_path))
-    assert find_game() is dict
+    assert StarCraft("2s3z").spec.n_agents == 5
 
 
-def test_a_package_that_does_not_import_says_why(package, monkeypatch, tmp_path):
-    package("smacv2/__init__.py")
-    package("smacv2/env/__init__.py", "raise TypeError('Descriptors cannot\\nbe created directly')")
+def test_package_that_cannot_be_imported(write_package, monkeypatch, tmp_path):
+    write_package("smacv2")
+    write_package("smacv2/env", "raise TypeError('Descriptors cannot\\nbe created directly')")
     monkeypatch.setenv("SC2PATH", str(tmp_path))
-    with pytest.raises(LareError, match=r"smacv2.env cannot be imported: Descriptors cannot be created directly"):
-        find_game()
+    with pytest.raises(LareError, match="cannot be imported: Descriptors cannot"):
+        StarCraft("2s3z")

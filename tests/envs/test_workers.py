@@ -12,25 +12,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers import hosts
-from helpers.hosts import Host
-from helpers.toys import toy_spec
+import lare_rl
+from helpers import host_envs
+from helpers.host_envs import ToyHostEnv
+from helpers.toy_envs import toy_spec
 from lare_rl.envs.pettingzoo_env import make
-from lare_rl.envs.workers import LocalEnvs, WorkerEnvs
+from lare_rl.envs.workers import LocalVecEnv, SubprocVecEnv
 from lare_rl.errors import LareError
 
-BOTH = [LocalEnvs, partial(WorkerEnvs, processes=2)]
+BOTH = [LocalVecEnv, partial(SubprocVecEnv, processes=2)]
 
 
-def same(one, other):
-    *arrays, measures = one
-    *others, other_measures = other
-    for left, right in zip(arrays, others, strict=True):
-        np.testing.assert_array_equal(left, right)
-        assert left.dtype == right.dtype
+def same(actual, other):
+    *arrays, measures = actual
+    *other_arrays, other_measures = other
+    for first_array, right in zip(arrays, other_arrays, strict=True):
+        np.testing.assert_array_equal(first_array, right)
+        assert first_array.dtype == right.dtype
     assert measures.keys() == other_measures.keys()
-    for name, left in measures.items():
-        np.testing.assert_array_equal(left, other_measures[name])
+    for name, first_array in measures.items():
+        np.testing.assert_array_equal(first_array, other_measures[name])
 
 
 def walk(envs, steps=3):
@@ -42,23 +43,23 @@ def walk(envs, steps=3):
 
 def test_workers_do_what_is_done_in_one_process():
     chance = np.random.default_rng(0)
-    makers = [Host] * 5
-    with LocalEnvs(makers) as near, WorkerEnvs(makers, processes=2) as far:
-        assert {worker.process.pid for worker in far.workers}.isdisjoint({os.getpid()})
-        assert [list(worker.places) for worker in far.workers] == [[0, 2, 4], [1, 3]]
+    makers = [ToyHostEnv] * 5
+    with LocalVecEnv(makers) as near, SubprocVecEnv(makers, processes=2) as far:
+        assert os.getpid() not in far.pids
+        assert len(set(far.pids)) == 2
         assert far.spec.teams == near.spec.teams
         for _ in range(4):
             where, seeds = chance.random(5) < 0.7, chance.integers(0, 2**31, 5)
             if not near.batch.alive[0].any():
                 where[:] = True
-            one, other = near.reset(where, seeds), far.reset(where, seeds)
+            actual, other = near.reset(where, seeds), far.reset(where, seeds)
             assert not other.state.any(), "a worker has imported JAX"
-            same(one._replace(state=other.state), other)
+            same(actual._replace(state=other.state), other)
             for _ in range(3):
                 action = chance.normal(size=(5, 2, 2)).astype(np.float32)
                 where = chance.random(5) < 0.5
-                one, other = near.step(action, where), far.step(action, where)
-                same(one._replace(state=other.state), other)
+                actual, other = near.step(action, where), far.step(action, where)
+                same(actual._replace(state=other.state), other)
         same(near.step(action)._replace(state=far.batch.state[:1].repeat(5, 0)), far.step(action))
 
 
@@ -71,26 +72,26 @@ def test_pettingzoo_in_workers():
     )
     chance = np.random.default_rng(0)
     makers = [partial(make, task)] * 3
-    with LocalEnvs(makers) as near, WorkerEnvs(makers, processes=2) as far:
+    with LocalVecEnv(makers) as near, SubprocVecEnv(makers, processes=2) as far:
         same(near.reset(np.ones(3, bool), np.arange(3)), far.reset(np.ones(3, bool), np.arange(3)))
         for _ in range(25):
             action = np.eye(5, dtype=np.float32)[chance.integers(0, 5, (3, 3))]
-            one, other = near.step(action), far.step(action)
-            same(one, other)
+            actual, other = near.step(action), far.step(action)
+            same(actual, other)
         assert other.truncated.all()
 
 
 @pytest.mark.parametrize("envs", BOTH)
 def test_rows_of_the_others_stay(envs):
-    with envs([Host] * 3) as made:
-        first = deepcopy(made.reset(np.array([True, False, True]), np.arange(3)))
+    with envs([ToyHostEnv] * 3) as vec_env:
+        first = deepcopy(vec_env.reset(np.array([True, False, True]), np.arange(3)))
         assert not first.observation[1].any()
         assert not first.alive[1].any()
-        second = deepcopy(made.reset(np.array([False, True, False]), np.array([9, 9, 9])))
+        second = deepcopy(vec_env.reset(np.array([False, True, False]), np.array([9, 9, 9])))
         np.testing.assert_array_equal(second.observation[[0, 2]], first.observation[[0, 2]])
         assert second.observation[1].any()
-        assert made.batch.observation.shape[1:] == (2, 2)
-        third = made.step(np.ones((3, 2, 2), np.float32), np.array([False, False, True]))
+        assert vec_env.batch.observation.shape[1:] == (2, 2)
+        third = vec_env.step(np.ones((3, 2, 2), np.float32), np.array([False, False, True]))
         np.testing.assert_array_equal(third.observation[:2], second.observation[:2])
         assert not np.array_equal(third.observation[2], second.observation[2])
 
@@ -107,48 +108,49 @@ def test_rows_of_the_others_stay(envs):
 )
 def test_what_an_environment_raises_is_one_line(envs, fault, message):
     with pytest.raises(LareError) as error:
-        walk(envs([Host, partial(Host, fault)]))
+        walk(envs([ToyHostEnv, partial(ToyHostEnv, fault)]))
     assert str(error.value) == message
 
 
 @pytest.mark.parametrize(("fault", "how"), [("dies", "signal SIGKILL"), ("leaves", "exit status 3")])
 def test_a_worker_that_dies(fault, how):
-    far = WorkerEnvs([Host, Host, Host, partial(Host, fault)], processes=2)
-    pids = [worker.process.pid for worker in far.workers]
+    far = SubprocVecEnv([ToyHostEnv, ToyHostEnv, ToyHostEnv, partial(ToyHostEnv, fault)], processes=2)
+    pids = far.pids
     with pytest.raises(LareError) as error:
         walk(far)
     assert str(error.value) == f"environment 3 (in worker process {pids[1]}) died: {how}"
     assert not any(map(runs, pids))
-    with pytest.raises(LareError, match="the worker processes have ended: make the environments again"):
+    with pytest.raises(LareError, match="the worker processes have ended"):
         far.step(np.zeros((4, 2, 2), np.float32))
 
 
 def test_a_worker_that_is_killed_between_steps():
-    far = WorkerEnvs([Host])
-    pid = far.workers[0].process.pid
+    far = SubprocVecEnv([ToyHostEnv])
+    pid = far.pids[0]
     far.reset(np.ones(1, bool), np.arange(1))
     os.kill(pid, signal.SIGKILL)
-    far.workers[0].process.wait()
+    while runs(pid):
+        time.sleep(0.01)
     with pytest.raises(LareError) as error:
         far.step(np.zeros((1, 2, 2), np.float32))
     assert str(error.value) == f"environment 0 (in worker process {pid}) died: signal SIGKILL"
 
 
 def test_a_worker_that_hangs():
-    far = WorkerEnvs([Host, Host, partial(Host, "hangs"), Host], processes=2)
-    pid = far.workers[0].process.pid
+    far = SubprocVecEnv([ToyHostEnv, ToyHostEnv, partial(ToyHostEnv, "hangs"), ToyHostEnv], processes=2)
+    pid = far.pids[0]
     walk(far, steps=2)
     far.timeout = 0.5
     with pytest.raises(LareError) as error:
         far.step(np.zeros((4, 2, 2), np.float32))
-    assert str(error.value) == f"environment 2 (in worker process {pid}) did not answer for 0.5 s in step"
+    assert str(error.value) == f"environment 2 (in worker process {pid}) did not reply for 0.5 s in step"
     assert not runs(pid)
 
 
 def test_closing_closes_the_environments(tmp_path):
     notes = [tmp_path / name for name in ("one", "two")]
-    far = WorkerEnvs([partial(Host, note=str(note)) for note in notes], processes=1)
-    pid = far.workers[0].process.pid
+    far = SubprocVecEnv([partial(ToyHostEnv, note=str(note)) for note in notes], processes=1)
+    pid = far.pids[0]
     far.close()
     assert [note.read_text() for note in notes] == ["closed", "closed"]
     assert not runs(pid)
@@ -156,25 +158,25 @@ def test_closing_closes_the_environments(tmp_path):
 
 
 def test_environments_must_be_alike():
-    with pytest.raises(LareError, match=r"^environment 1 is not like environment 0: .* 3, .*, not .* 2, "):
-        LocalEnvs([Host, partial(Host, size=3)])
+    with pytest.raises(LareError, match=r"^environment 1 differs from environment 0: .* 3, .*, not .* 2, "):
+        LocalVecEnv([ToyHostEnv, partial(ToyHostEnv, size=3)])
 
 
 def test_what_cannot_be_sent():
     with pytest.raises(LareError, match=r"^environment 0 cannot be sent to a worker process: .*lambda"):
-        WorkerEnvs([lambda: Host()])
+        SubprocVecEnv([lambda: ToyHostEnv()])
 
 
 PROGRAM = """
 import os, signal, sys, time
 from functools import partial
 import numpy as np
-from helpers.hosts import Host
-from lare_rl.envs.workers import WorkerEnvs
+from helpers.host_envs import ToyHostEnv
+from lare_rl.envs.workers import SubprocVecEnv
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
-far = WorkerEnvs([partial(Host, seconds=0.05)] * 2, processes=2)
-print(*[worker.process.pid for worker in far.workers], flush=True)
+far = SubprocVecEnv([partial(ToyHostEnv, seconds=0.05)] * 2, processes=2)
+print(*far.pids, flush=True)
 far.reset(np.ones(2, bool), np.arange(2))
 while True:
     far.step(np.zeros((2, 2, 2), np.float32))
@@ -184,7 +186,7 @@ while True:
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_with_their_parent_and_say_nothing(how):
     """The program has no `if __name__ == "__main__"`: workers do not run it again."""
-    paths = os.pathsep.join(str(Path(module.__file__).parents[1]) for module in (lare_rl, hosts))
+    paths = os.pathsep.join(str(Path(module.__file__).parents[1]) for module in (lare_rl, host_envs))
     parent = subprocess.Popen(
         [sys.executable, "-c", PROGRAM],
         env=os.environ | {"PYTHONPATH": paths},
@@ -198,10 +200,10 @@ def test_workers_end_with_their_parent_and_say_nothing(how):
         assert all(map(runs, pids))
         time.sleep(0.2)
         os.killpg(parent.pid, how)  # as a terminal does
-        _, said = parent.communicate(timeout=30)
+        _, error_output = parent.communicate(timeout=30)
     finally:
         parent.kill()
-    assert said.count("Traceback") == (how == signal.SIGINT)  # the parent's own
+    assert error_output.count("Traceback") == (how == signal.SIGINT)  # the parent's own
     until = time.monotonic() + 10
     while any(map(runs, pids)) and time.monotonic() < until:
         time.sleep(0.05)

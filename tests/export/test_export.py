@@ -1,10 +1,12 @@
-"""What a run exports agrees with JAX to the precision of float32, as ONNX and as NumPy arrays."""
+"""Exported functions, as ONNX and as NumPy arrays, agree with JAX to the precision of float32."""
 
 import importlib.util
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,54 +15,60 @@ import onnxruntime
 import pytest
 
 import lare_rl
-from helpers.recipes import TOTAL, steps_of
-from helpers.tiers import long
-from helpers.toys import pick_spec, toy_spec
-from lare_rl.algorithms import ppo
+from helpers.long_tests import long_case
+from helpers.small_configs import TOTAL, random_steps
+from helpers.toy_envs import pick_spec, toy_spec
+from lare_rl.algorithms.ppo import ppo
 from lare_rl.credit import decomposition
 from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
-from lare_rl.envs.interface import env_action
+from lare_rl.envs.interface import to_env_action
 from lare_rl.envs.load import read_task
-from lare_rl.errors import pip_install
 from lare_rl.export import export
-from lare_rl.latent.function import verified
-from lare_rl.training import learner as common
+from lare_rl.latent.function import verify_function
+from lare_rl.training import learner as learners
 from lare_rl.training import on_policy
-from lare_rl.training.compiled import compiled, new_memory
-from lare_rl.training.learner import Paid
-from lare_rl.training.seed_axis import of_seed
-from lare_rl.training.session import graphs, load_learner
+from lare_rl.training.compiled import compile_functions, init_memory
+from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
 
 CASES = [
     ("td3", "lare-bayes"),
-    long("ddpg", "rrdu"),
-    long("sac", "vib-rrdu"),
-    long("td3", "lare-signs"),
-    long("td3", "diaster"),
-    long("sac", "dense"),
+    long_case("ddpg", "rrdu"),
+    long_case("sac", "vib-rrdu"),
+    long_case("td3", "lare-signs"),
+    long_case("td3", "diaster"),
+    long_case("sac", "dense"),
     ("ppo", "lare-linear"),
-    long("ppo", "bayes"),
-    long("ppo", "llm-reward"),
-    long("ppo", "rrdu-next"),
-    long("ippo", "lare-bayes"),
-    long("ippo", "lare-rd-shared"),
-    long("ippo-teams", "lare-rd"),
-    long("ippo-state", "rrdu-next"),
-    long("qmix", "lare-bayes"),
-    long("vdn", "ircr"),
+    long_case("ppo", "bayes"),
+    long_case("ppo", "llm-reward"),
+    long_case("ppo", "rrdu-next"),
+    long_case("ippo", "lare-bayes"),
+    long_case("ippo", "lare-rd-shared"),
+    long_case("ippo-teams", "lare-rd"),
+    long_case("ippo-state", "rrdu-next"),
+    long_case("qmix", "lare-bayes"),
+    long_case("vdn", "ircr"),
 ]
-"""Every kind of policy, and every kind of decoder and of what it is given."""
+"""Every kind of policy, of decoder and of decoder input."""
 
-LEFT_OUT = {
-    "dense": "dense trains on what the environment pays",
-    "ircr": "ircr pays by the return of a step's episode",
-    "diaster": "diaster looks at whole episodes, not at steps",
+NO_REWARD = {
+    "dense": "rewards of the environment",
+    "ircr": "return of its episode",
+    "diaster": "all steps of an episode",
 }
-"""Why there is no reward."""
+"""Why there is no reward function."""
+
+PHI = """import numpy as np
+
+def evaluation_func(o, a):
+    return [o[:, 0:1] * np.sum(a, axis=1, keepdims=True), o[:, 1:2]]
+"""
+MEDIAN = PHI.replace("np.sum(a", "np.median(a")
 
 
-def task_of(kind, method, echo):
+def make_task(kind, method, echo):
     match kind:
         case "ppo":
             return pick_spec(judges="after" if method == "llm-reward" else "both")
@@ -74,156 +82,158 @@ def task_of(kind, method, echo):
             return toy_spec(judges="both" if method == "lare-signs" else "before")
 
 
-PHI = """import numpy as np
-
-def evaluation_func(o, a):
-    return [o[:, 0:1] * np.sum(a, axis=1, keepdims=True), o[:, 1:2]]
-"""
-MEDIAN = PHI.replace("np.sum(a", "np.median(a")
-
-
-def trained(kind, method, small, small_many, echo, out):
-    """A short run, of two seeds."""
-    row, task, one = METHODS[method], task_of(kind, method, echo), kind in ("td3", "ddpg", "sac", "ppo")
+def train_briefly(kind, method, small, small_many, echo, out):
+    """Train two seeds for a moment."""
+    single = kind in ("td3", "ddpg", "sac", "ppo")
+    task, phi_kind = make_task(kind, method, echo), METHODS[method].phi_kind
     source = MEDIAN if "ppo" in kind else PHI
-    source = source.replace(", o[:, 1:2]", "") if row.kind == "reward" else source
+    source = source.replace(", o[:, 1:2]", "") if phi_kind == "reward" else source
     function = None
-    if row.latent:
-        made = [verified(source, role, row.kind) for role in task.roles]
-        function = made if len(made) > 1 else made[0]
-    algorithm = kind.partition("-")[0]
-    settings = (small if one else small_many)(method=method, algorithm=algorithm, steps=120 if one else 200)
+    if METHODS[method].needs_phi:
+        functions = [verify_function(source, role, phi_kind) for role in task.roles]
+        function = functions if len(functions) > 1 else functions[0]
+    settings = (small if single else small_many)(
+        method=method, algorithm=kind.partition("-")[0], steps=120 if single else 200
+    )
     return lare_rl.train(task, settings, function=function, out=out, listeners=[])
 
 
-def loaded(directory):
-    """The file `exported.py` of a directory, as its users import it."""
+def import_exported(directory):
+    """Import the file `exported.py` of a directory, as its users do."""
     spec = importlib.util.spec_from_file_location("exported", directory / "exported.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-def same(exported, name, inputs, wanted):
-    """Both forms give what is wanted."""
-    described = json.loads((exported.HERE / "export.json").read_text())[name]
-    given = {key: np.asarray(inputs[key], one["type"]) for key, one in described["inputs"].items()}
-    for key, one in described["inputs"].items():
-        assert given[key].shape == (len(given[key]), *one["shape"][1:])
-    of_numpy = exported.load(name)(**given)
-    of_a_row = exported.load(name)(**{key: rows[0] for key, rows in given.items()})
-    session = onnxruntime.InferenceSession(exported.HERE / f"{name}.onnx", providers=["CPUExecutionProvider"])
-    of_onnx = dict(zip(described["outputs"], session.run(None, given), strict=True))
-    for key, one in described["outputs"].items():
-        np.testing.assert_allclose(of_a_row[key], of_numpy[key][0], rtol=1e-5, atol=1e-6)
-        for found in (of_numpy[key], of_onnx[key]):
-            assert found.shape == (len(found), *one["shape"][1:])
-            assert found.dtype == one["type"]
-            np.testing.assert_allclose(found, wanted[key], rtol=2e-5, atol=2e-5)
+def describe(exported, name):
+    return json.loads((Path(exported.__file__).parent / "export.json").read_text())[name]
+
+
+def check_function(exported, name, inputs, expected):
+    """Both forms of a function give the expected outputs."""
+    description, directory = describe(exported, name), Path(exported.__file__).parent
+    arrays = {key: np.asarray(inputs[key], spec["type"]) for key, spec in description["inputs"].items()}
+    for key, spec in description["inputs"].items():
+        assert arrays[key].shape == (len(arrays[key]), *spec["shape"][1:])
+    numpy_outputs = exported.load(name)(**arrays)
+    row_outputs = exported.load(name)(**{key: rows[0] for key, rows in arrays.items()})
+    session = onnxruntime.InferenceSession(directory / f"{name}.onnx", providers=["CPUExecutionProvider"])
+    onnx_outputs = dict(zip(description["outputs"], session.run(None, arrays), strict=True))
+    for key, spec in description["outputs"].items():
+        np.testing.assert_allclose(row_outputs[key], numpy_outputs[key][0], rtol=1e-5, atol=1e-6)
+        for output in (numpy_outputs[key], onnx_outputs[key]):
+            assert output.shape == (len(output), *spec["shape"][1:])
+            assert output.dtype == spec["type"]
+            np.testing.assert_allclose(output, expected[key], rtol=2e-5, atol=2e-5)
 
 
 @pytest.mark.parametrize(("kind", "method"), CASES)
-def test_what_is_exported_agrees_with_jax(kind, method, small, small_many, echo, tmp_path):
-    run = trained(kind, method, small, small_many, echo, tmp_path / "run")
-    found = lare_rl.export(run, tmp_path / "out", seed=1)
-    exported = loaded(tmp_path / "out")
+def test_export_agrees_with_jax(kind, method, small, small_many, echo, tmp_path):
+    run = train_briefly(kind, method, small, small_many, echo, tmp_path / "run")
+    result = lare_rl.export_run(run, tmp_path / "out", seed=1)
+    exported = import_exported(tmp_path / "out")
     config, learner, host, _ = load_learner(run)
-    one = of_seed(learner, 1)
-    check_policy(exported, config, jax.tree.map(lambda leaf: leaf[1:], compiled(config).actor(learner, host["step"])))
-    rewards = [name for name in found.functions if name != "policy"]
-    if found.left_out:
-        assert (found.left_out, rewards) == (LEFT_OUT[method], [])
+    seed_learner = select_seed(learner, 1)
+    actors = compile_functions(config).get_actor(learner, host["step"])
+    check_policy(exported, config, jax.tree.map(lambda leaf: leaf[1:], actors))
+    names = [name for name in result.functions if name != "policy"]
+    if result.no_reward_reason:
+        assert NO_REWARD[method] in result.no_reward_reason
+        assert names == []
         return
-    # Random steps, because a replay may hold the factors of its steps alone.
-    steps = steps_of(config.env, config.environments)
-    buffer = jax.jit(partial(common.store, config=config, phi=graphs(run)))(one, steps)[0].replay
-    stored = jax.tree.map(jnp.concatenate, replay.read(buffer, replay.newest(buffer, TOTAL)))
+    # Random steps, because a replay may hold only the factors of its steps.
+    steps = random_steps(config.env, config.n_envs)
+    buffer = jax.jit(partial(learners.store, config=config, phi=run.graphs))(seed_learner, steps)[0].replay
+    stored = jax.tree.map(jnp.concatenate, replay.read(buffer, replay.newest_steps(buffer, TOTAL)))
     steps = jax.tree.map(lambda leaf: np.concatenate(np.swapaxes(leaf, 0, 1)), steps)
-    wanted = common.rewards(stored, Paid(one.credit, one.scale), config)
-    if config.scale_rewards:
-        scale = [np.full(team.size, common.magnitude(of)) for team, of in zip(config.env.teams, one.scale, strict=True)]
-        wanted = wanted * np.concatenate(scale)
-    for place, name in enumerate(rewards):
-        check_reward(exported, name, config, steps, np.asarray(stored.length, np.float32), np.asarray(wanted), place)
+    # Exported rewards are in the unit of the true rewards, before they are scaled.
+    unscaled = replace(config, scale_rewards=False)
+    expected = np.asarray(rewards(stored, RewardState(seed_learner.credit, seed_learner.scale), unscaled))
+    for team_index, name in enumerate(names):
+        check_reward(exported, name, config, steps, np.asarray(stored.length, np.float32), expected, team_index)
 
 
 def check_policy(exported, config, actor):
     env, random = config.env, np.random.default_rng(0)
-    rows = (3, env.agents)
+    rows = (3, env.n_agents)
     observation = random.normal(size=(*rows, env.observation_size)).astype(np.float32)
     available = np.ones((*rows, env.action_size), bool)
     if env.masks_actions:
         available = random.uniform(size=available.shape) < 0.5
         available[..., 0] = True
-    memory, wanted = new_memory(config, 1, 3), {}
+    memory, expected = init_memory(config, 1, 3), {}
     inputs = {"observation": observation, "available": available}
     if memory:
         hidden = random.normal(size=memory.hidden.shape).astype(np.float32)
         last = random.integers(env.action_size, size=rows)
-        last[0] = env.action_size  # nothing was done before
+        last[0] = env.action_size  # there was no action before the first step
         memory = memory._replace(
             hidden=jnp.asarray(hidden),
             last_action=jnp.asarray(np.eye(env.action_size + 1, env.action_size)[last])[None],
         )
         inputs |= {"hidden": hidden[0], "last_action": last}
-    new = jnp.zeros((1, 3), bool)
-    action, memory = compiled(config).act(actor, memory, observation[None], available[None], None, new)
+    is_new = jnp.zeros((1, 3), bool)
+    action, memory = compile_functions(config).act(actor, memory, observation[None], available[None], None, is_new)
     if memory:
-        wanted["next_hidden"] = memory.hidden[0]
+        expected["next_hidden"] = memory.hidden[0]
     if env.discrete and not config.greedy:
-        shown = on_policy.policy_input(jnp.asarray(observation)[None], config)
-        logits = jax.vmap(lambda one, *given: one.policy.logits(ppo.shown(given[0], one.observations), given[1]))
-        wanted["logits"] = np.asarray(logits(actor, shown, available[None]))[0]
+        policy_input = on_policy.policy_input(jnp.asarray(observation)[None], config)
+
+        @jax.vmap
+        def logits(actor, policy_input, available):
+            return actor.policy.logits(ppo.normalise(policy_input, actor.observations), available)
+
+        expected["logits"] = np.asarray(logits(actor, policy_input, available[None]))[0]
     action = np.asarray(action)[0]
-    wanted["action"] = np.argmax(action, axis=-1) if env.discrete else env_action(action, env)
-    if env.agents == 1:
+    expected["action"] = np.argmax(action, axis=-1) if env.discrete else to_env_action(action, env)
+    if env.n_agents == 1:
         inputs = {name: rows[:, 0] for name, rows in inputs.items()}
-        wanted = {name: rows[:, 0] for name, rows in wanted.items()}
-    same(exported, "policy", inputs, wanted)
+        expected = {name: rows[:, 0] for name, rows in expected.items()}
+    check_function(exported, "policy", inputs, expected)
 
 
-def check_reward(exported, name, config, steps, length, wanted, place):
-    env, team = config.env, config.env.teams[place]
-    inputs = {"length": length, "alive": steps.before.alive, "action": steps.taken}
-    for side, timestep in (("before", steps.before), ("after", steps.after)):
-        inputs[side] = timestep.state if config.of_state else timestep.observation
-    if config.of_state:
+def check_reward(exported, name, config, steps, length, expected, team_index):
+    env, team = config.env, config.env.teams[team_index]
+    inputs = {"length": length, "alive": steps.timestep.alive, "action": steps.env_action}
+    for side, timestep in (("before", steps.timestep), ("after", steps.next_timestep)):
+        inputs[side] = timestep.state if config.team_level else timestep.observation
+    if config.team_level:
         inputs["action"] = inputs["action"].reshape(len(length), -1)
-        wanted = wanted[:, 0]
+        expected = expected[:, 0]
     else:
         inputs = {key: rows[:, team.agents] if rows.ndim > 1 else rows for key, rows in inputs.items()}
-        wanted = wanted[:, team.agents]
-        if team.size == 1:
+        expected = expected[:, team.agents]
+        if team.n_agents == 1:
             inputs = {key: rows[:, 0] if rows.ndim > 1 else rows for key, rows in inputs.items()}
-            wanted = wanted[:, 0]
+            expected = expected[:, 0]
         else:
             inputs["length"] = inputs["length"][:, None]
-    if config.env.agents_leave:  # the trainer pays those who have left nothing
-        given = {key: inputs[key] for key in exported.described(name)["inputs"]}
-        there = steps.before.alive[:, 0] if config.of_state else steps.before.alive[:, team.agents]
-        wanted = np.where(there, wanted, exported.load(name)(**given)["r_hat"])
-    same(exported, name, inputs, {"r_hat": wanted})
-    if env.discrete and not config.of_state:
-        of_numbers(exported, name, inputs, env.action_size)
+    if config.env.agents_leave:  # the trainer gives agents that have left no reward
+        arrays = {key: inputs[key] for key in describe(exported, name)["inputs"]}
+        alive = steps.timestep.alive[:, 0] if config.team_level else steps.timestep.alive[:, team.agents]
+        expected = np.where(alive, expected, exported.load(name)(**arrays)["r_hat"])
+    check_function(exported, name, inputs, {"r_hat": expected})
+    if env.discrete and not config.team_level:
+        check_choice_numbers(exported, name, inputs, env.action_size)
 
 
-def of_numbers(exported, name, inputs, count):
-    """A choice may also be given as its number."""
-    more = {key: inputs[key] for key in ("length", "alive") if key in exported.described(name)["inputs"]}
+def check_choice_numbers(exported, name, inputs, n_choices):
+    """A choice can be a one-hot row or a number."""
+    options = {key: inputs[key] for key in ("length", "alive") if key in describe(exported, name)["inputs"]}
     steps = {key: inputs[key] for key in ("before", "action", "after")}
     number = np.argmax(steps["action"], axis=-1)
-    found = exported.reward(**{**steps, "action": number}, name=name, **more)
-    np.testing.assert_array_equal(found, exported.reward(**steps, name=name, **more))
-    for wrong in (number - count, number + 0.5):
-        with pytest.raises(ValueError, match=f"an action is a number from 0 to {count - 1}, or a one-hot row"):
-            exported.reward(**{**steps, "action": wrong}, name=name, **more)
+    r_hat = exported.reward(**{**steps, "action": number}, name=name, **options)
+    np.testing.assert_array_equal(r_hat, exported.reward(**steps, name=name, **options))
+    for invalid in (number - n_choices, number + 0.5):
+        with pytest.raises(ValueError, match=f"from 0 to {n_choices - 1}"):
+            exported.reward(**{**steps, "action": invalid}, name=name, **options)
 
 
 @pytest.fixture
 def run(small, tmp_path, phi):
-    return lare_rl.train(
-        toy_spec(), small(method="lare-bayes", steps=120), function=phi, out=tmp_path / "run", listeners=[]
-    )
+    settings = small(method="lare-bayes", steps=120)
+    return lare_rl.train(toy_spec(), settings, function=phi, out=tmp_path / "run", listeners=[])
 
 
 WITHOUT_LARE = """
@@ -236,62 +246,60 @@ print(repr(exported.reward(**steps).tolist()))
 """
 
 
-def test_phi_and_decoder_are_one_function_without_lare(run, tmp_path, phi):
-    lare_rl.export(run, tmp_path / "out")
-    random = np.random.default_rng(0)
-    before, after = random.uniform(-1, 1, (2, 5, 2)).astype(np.float32)
-    action = random.uniform(-2, 2, (5, 1)).astype(np.float32)
+def test_reward_without_lare(run, tmp_path, phi):
+    lare_rl.export_run(run, tmp_path / "out")
+    rng = np.random.default_rng(0)
+    before, after = rng.uniform(-1, 1, (2, 5, 2)).astype(np.float32)
+    action = rng.uniform(-2, 2, (5, 1)).astype(np.float32)
     np.savez(tmp_path / "out" / "steps.npz", before=before, action=action, after=after)
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", WITHOUT_LARE], cwd=tmp_path / "out", capture_output=True, text=True, check=True
     )
     config, learner, _, _ = load_learner(run)
-    # What the decoder sees: the toy's actions are from -2 to 2, the trainer's from -1 to 1.
-    rows = np.concatenate([phi(before, action), before, action / 2], axis=1)
-    wanted = decomposition.proxy_rewards(of_seed(learner).credit[0], jnp.asarray(rows), config.credit)
-    np.testing.assert_allclose(json.loads(done.stdout), wanted, rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(loaded(tmp_path / "out").reward(before[0], action[0], after[0]), wanted[0], rtol=1e-4)
-    assert np.std(wanted) > 0
-    assert set(loaded(tmp_path / "out").described("reward")["inputs"]) == {"before", "action"}
+    # Actions of the toy are in [-2, 2], and those of the trainer in [-1, 1].
+    features = np.concatenate([phi(before, action), before, action / 2], axis=1)
+    expected = decomposition.proxy_rewards(select_seed(learner, 0).credit[0], jnp.asarray(features), config.credit)
+    np.testing.assert_allclose(json.loads(process.stdout), expected, rtol=1e-4, atol=1e-6)
+    exported = import_exported(tmp_path / "out")
+    np.testing.assert_allclose(exported.reward(before[0], action[0], after[0]), expected[0], rtol=1e-4)
+    assert np.std(expected) > 0
+    assert set(describe(exported, "reward")["inputs"]) == {"before", "action"}
 
 
-def test_the_policy_is_that_of_policy_of(run, tmp_path):
-    lare_rl.export(run, tmp_path / "out", seed=1)
+def test_policy_is_that_of_load_policy(run, tmp_path):
+    lare_rl.export_run(run, tmp_path / "out", seed=1)
     observation = np.random.default_rng(0).uniform(-1, 1, (4, 2)).astype(np.float32)
-    act = lare_rl.policy_of(run, seed=1)
-    found = loaded(tmp_path / "out").load("policy")(observation=observation)["action"]
-    np.testing.assert_allclose(found, [act(row) for row in observation], rtol=1e-5)
+    policy = lare_rl.load_policy(run, seed=1)
+    action = import_exported(tmp_path / "out").load("policy")(observation=observation)["action"]
+    np.testing.assert_allclose(action, [policy(row) for row in observation], rtol=1e-5)
 
 
-def test_the_command_line(run, command, monkeypatch, tmp_path):
-    status, said, noted = command("export", run.directory, "--out", "first")
-    assert (status, noted) == (0, "")
-    assert said == "wrote policy, reward to first; exported.py there says how to call them\n"
+def test_command(run, command, monkeypatch, tmp_path):
+    status, out, err = command("export", run.directory, "--out", "first")
+    assert (status, err) == (0, "")
+    assert out.startswith("wrote policy, reward to first; exported.py")
     monkeypatch.setattr(export, "is_installed", lambda: False)
-    status, _, noted = command("export", run.directory, "--out", "second")
-    assert noted == f"without the package onnx, no .onnx files were written: {pip_install('onnx')}\n"
+    status, _, err = command("export", run.directory, "--out", "second")
+    assert (status, err.count("\n")) == (0, 1)
+    assert "[onnx]" in err
     assert not list((tmp_path / "second").glob("*.onnx"))
-    status, _, noted = command("export", run.directory, "--out", "second")
-    assert (status, noted) == (2, "lare-rl: second exists, and is not overwritten; choose another directory\n")
-    status, _, noted = command("export", run.directory, "--out", "third", "--seed", "7")
-    assert (status, noted) == (2, f"lare-rl: {run.directory} has no seed 7; its seeds: 0, 1\n")
+    for options, words in ((["second"], "second exists"), (["third", "--seed", "7"], "no seed 7")):
+        status, _, err = command("export", run.directory, "--out", *options)
+        assert (status, err.count("\n")) == (2, 1)
+        assert words in err
 
 
-def test_what_an_exported_function_is_not_given_is_named(run, tmp_path):
-    lare_rl.export(run, tmp_path / "out")
-    exported = loaded(tmp_path / "out")
-    with pytest.raises(ValueError, match="there is no function 'nope', only policy, reward"):
+def test_invalid_inputs(run, tmp_path):
+    lare_rl.export_run(run, tmp_path / "out")
+    exported = import_exported(tmp_path / "out")
+    with pytest.raises(ValueError, match="'nope', only policy, reward"):
         exported.load("nope")
-    with pytest.raises(ValueError, match="policy needs the inputs observation: observation is missing"):
-        exported.load("policy")(obs=np.zeros((1, 2)))
-    with pytest.raises(ValueError, match="policy needs the inputs observation: there is no input obs"):
-        exported.load("policy")(observation=np.zeros((1, 2)), obs=np.zeros((1, 2)))
-
-
-def test_an_exported_function_refuses_arrays_of_other_sizes(run, tmp_path):
-    lare_rl.export(run, tmp_path / "out")
-    exported = loaded(tmp_path / "out")
-    with pytest.raises(ValueError, match=r"^observation must have the shape \(batch, 2\), and has \(5, 3\)$"):
-        exported.load("policy")(observation=np.zeros((5, 3)))
-    with pytest.raises(ValueError, match=r"^action must have the shape \(batch, 1\), and has \(\)$"):
-        exported.reward(np.zeros((1, 2)), 0.5, np.zeros((1, 2)))
+    policy, observation = exported.load("policy"), np.zeros((1, 2))
+    with pytest.raises(ValueError, match="observation is missing"):
+        policy(obs=observation)
+    with pytest.raises(ValueError, match="there is no input obs"):
+        policy(observation=observation, obs=observation)
+    with pytest.raises(ValueError, match=r"\(batch, 2\).*\(5, 3\)"):
+        policy(observation=np.zeros((5, 3)))
+    with pytest.raises(ValueError, match=r"action .*\(batch, 1\)"):
+        exported.reward(observation, 0.5, observation)

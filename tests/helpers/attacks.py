@@ -1,10 +1,11 @@
-"""Programs that try to spend time or memory (`from helpers.attacks import ATTACKS`)."""
+"""Programs that try to spend time or memory."""
 
-from lare_rl.phi.parse import LONGEST_SOURCE
+from helpers.toy_envs import phi_source
+from lare_rl.phi.limits import MAX_SOURCE_LENGTH
 
 NUMPY = "import numpy as np\nimport math\nimport itertools\n"
 ATTACKS = {
-    "long": "x = 1\n" * LONGEST_SOURCE,
+    "long": "x = 1\n" * MAX_SOURCE_LENGTH,
     "brackets": "(" * 9000 + ")" * 9000,
     "lists": "x = " + "[" * 4000 + "]" * 4000,
     "minus": "x = " + "-" * 19000 + "1",
@@ -73,11 +74,16 @@ ATTACKS = {
     "histogram": NUMPY + "x = np.histogram([1.0], bins=10 ** 12)",
     "many operations": NUMPY + "x = np.ones(9)\nfor i in range(30000):\n    x = np.sin(x)",
     "doubling array": NUMPY + "x = np.ones(9)\nfor i in range(99):\n    x = np.concatenate([x, x])",
-    "many graph operations": phi("x = observation\nfor i in range(9999):\n    x = x * 1.1 + i\nreturn [x[:, :1]]"),
-    "large graph": NUMPY + phi("x = np.repeat(observation, 3000, axis=1)\nreturn [(x * x).sum(axis=1, keepdims=True)]"),
-    "doubling graph": phi("x = observation\nfor i in range(400):\n    x = x * x + x[:, ::-1]\nreturn [x[:, :1]]"),
-    "polynomial": NUMPY + phi("return [np.polyval(np.ones(5000), observation[:, :1])]"),
-    "quantiles": NUMPY + phi("return [np.quantile(observation, np.linspace(0, 1, 9999), axis=1)]"),
+    "many graph operations": phi_source(
+        "x = observation\nfor i in range(9999):\n    x = x * 1.1 + i\nreturn [x[:, :1]]"
+    ),
+    "large graph": NUMPY
+    + phi_source("x = np.repeat(observation, 3000, axis=1)\nreturn [(x * x).sum(axis=1, keepdims=True)]"),
+    "doubling graph": phi_source(
+        "x = observation\nfor i in range(400):\n    x = x * x + x[:, ::-1]\nreturn [x[:, :1]]"
+    ),
+    "polynomial": NUMPY + phi_source("return [np.polyval(np.ones(5000), observation[:, :1])]"),
+    "quantiles": NUMPY + phi_source("return [np.quantile(observation, np.linspace(0, 1, 9999), axis=1)]"),
     # Found by a reviewer.
     "overflowing repetitions": NUMPY + "x = np.repeat(np.zeros(4), np.array([2 ** 62] * 4))",
     "negative payment": NUMPY + "itertools.repeat(0, -10 ** 15)\nwhile True:\n    pass",
@@ -93,19 +99,19 @@ ATTACKS = {
     "unravel": NUMPY + "x = np.unravel_index(3, [2 ** 62] * 9000)",
     "long keys": "t = (1,) * 9900\nfor i in range(9000):\n    {t}",
     "copied views": NUMPY
-    + phi(
+    + phi_source(
         "x = np.zeros((len(observation), 900))\nv = x[:, 9:]\nfor i in range(4000):\n    v.copy()\nreturn [v[:, :1]]"
     ),
-    "text of rows": phi("return ['%999999999s' % len(observation)]"),
+    "text of rows": phi_source("return ['%999999999s' % len(observation)]"),
     "product of texts": NUMPY + "x = math.prod([10 ** 9], start='a')",
     "lists of arrays": NUMPY + "x = [np.zeros(60000).tolist() for i in range(3000)]",
     "long tuples": NUMPY + "x = list(itertools.product(*[[1]] * 1500, [0, 1], repeat=13))",
     "indices of a matrix": NUMPY + "x = np.tril_indices(2, 0, 500000000)",
     "covariance": NUMPY + "x = np.cov(np.zeros((1, 1)), np.zeros((15000, 1)))",
     "text of long texts": "s = ['a' * 9000] * 9000\nx = str(s)",
-    "many letters": NUMPY + phi("return [np.einsum('b1->b', observation)]"),
-    "letters that could be split": NUMPY + phi("return [np.einsum('aaaaaaaaaa,' * 40 + '1', observation)]"),
-    "many axes": NUMPY + phi("return [np.sin(observation.reshape((-1,) + (1,) * 32 + (17,)))]"),
-    "large product": NUMPY + phi("return [np.einsum('bi,bj,bk,bl->b', *[observation] * 4)[:, None]]"),
-    "first row": NUMPY + phi("return [np.repeat(observation[0, 0][None, None], len(observation), axis=0)]"),
+    "many letters": NUMPY + phi_source("return [np.einsum('b1->b', observation)]"),
+    "letters that could be split": NUMPY + phi_source("return [np.einsum('aaaaaaaaaa,' * 40 + '1', observation)]"),
+    "many axes": NUMPY + phi_source("return [np.sin(observation.reshape((-1,) + (1,) * 32 + (17,)))]"),
+    "large product": NUMPY + phi_source("return [np.einsum('bi,bj,bk,bl->b', *[observation] * 4)[:, None]]"),
+    "first row": NUMPY + phi_source("return [np.repeat(observation[0, 0][None, None], len(observation), axis=0)]"),
 }

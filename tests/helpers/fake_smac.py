@@ -25,7 +25,7 @@ class FakeSmac:
     def get_env_info(self) -> dict[str, int]:
         spec = self.env.spec
         shapes = {"obs_shape": spec.observation_size, "state_shape": spec.state_size}
-        counts = {"n_agents": spec.agents, "n_actions": spec.action_size + 1, "episode_limit": spec.max_steps}
+        counts = {"n_agents": spec.n_agents, "n_actions": spec.action_size + 1, "episode_limit": spec.max_steps}
         return shapes | counts
 
     def reset(self):
@@ -33,36 +33,36 @@ class FakeSmac:
         assert self.ended or not self.runs, "a second game is started"
         self.runs = True
         self.key, key = jax.random.split(self.key)
-        (self.state, self.seen), self.steps = jax.jit(self.env.reset)(key), 0
+        (self.state, self.timestep), self.steps = jax.jit(self.env.reset)(key), 0
         return self.get_obs(), self.get_state()
 
     def get_obs(self) -> list[np.ndarray]:
-        return list(np.asarray(self.seen.observation))
+        return list(np.asarray(self.timestep.observation))
 
     def get_state(self) -> np.ndarray:
-        return np.asarray(self.seen.state)
+        return np.asarray(self.timestep.state)
 
     def get_avail_actions(self) -> list[list[int]]:
         rows = []
-        for alive, row in zip(self.seen.alive, np.asarray(self.seen.available, int), strict=True):
-            # Those of the living in SMAC's order; the dead may do nothing, and only that.
-            moves = [0, *(row[one] for one in FROM_SMAC[1:])]
+        for alive, row in zip(self.timestep.alive, np.asarray(self.timestep.available, int), strict=True):
+            # Actions of living agents are in SMAC's order. Dead agents have only the first one.
+            moves = [0, *(row[i] for i in FROM_SMAC[1:])]
             rows.append([*moves, *row[5:]] if alive else [1] + [0] * len(row))
         return rows
 
     def step(self, actions: list[int]):
-        assert all(type(one) is int for one in actions)
-        assert all(row[one] for row, one in zip(self.get_avail_actions(), actions, strict=True)), "not available"
+        assert all(type(action) is int for action in actions)
+        assert all(row[action] for row, action in zip(self.get_avail_actions(), actions, strict=True)), "not available"
         self.steps += 1
         if self.steps == self.crash_at:
             return 0, True, {}
         self.key, key = jax.random.split(self.key)
-        choice = jnp.array([FROM_SMAC[one] if one < 6 else one - 1 for one in actions])
+        choice = jnp.array([FROM_SMAC[action] if action < 6 else action - 1 for action in actions])
         rows = jax.nn.one_hot(choice, self.env.spec.action_size)
-        self.state, self.seen = self.advance(self.state, rows, key)
-        over = bool(self.seen.terminated | self.seen.truncated)
+        self.state, self.timestep = self.advance(self.state, rows, key)
+        over = bool(self.timestep.terminated | self.timestep.truncated)
         self.ended = self.ended or over
-        return float(self.seen.reward.max()), over, {"battle_won": bool(self.seen.measures["won"])}
+        return float(self.timestep.reward.max()), over, {"battle_won": bool(self.timestep.measures["won"])}
 
     def close(self) -> None:
         self.closed = True

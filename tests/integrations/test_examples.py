@@ -1,4 +1,4 @@
-"""The files in CleanRL's manner: what LaRe adds is marked, and is nothing where rewards are dense."""
+"""The examples in CleanRL's style. Lines that LaRe adds are marked, and have no effect with dense rewards."""
 
 import difflib
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from helpers.tiers import long
+from helpers.long_tests import long_case
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {
@@ -23,51 +23,43 @@ def one_thread():
     torch.set_num_threads(1)
 
 
-def lines_of(name):
+def read_lines(name):
     return (ROOT / "examples" / name).read_text(encoding="utf-8").splitlines(keepends=True)
 
 
-def plain(name):
-    """The lines of a script without those that LaRe adds."""
-    return [line for line in lines_of(name) if not line.rstrip().endswith(MARK)]
+def plain_lines(name):
+    return [line for line in read_lines(name) if not line.rstrip().endswith(MARK)]
 
 
 def run(path, **changes):
+    """Return the episodes' returns."""
     module = runpy.run_path(str(path))
     settings = {**SCRIPTS[path.name], "env_id": "toys/Chase-v0", "num_envs": 2, **changes}
     return module["main"](module["Args"](**settings))
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_without_the_marked_lines_it_is_the_plain_algorithm(name, tmp_path):
-    """Which `--method dense` is too, bit for bit."""
-    (tmp_path / name).write_text("".join(plain(name)), encoding="utf-8")
+def test_plain_script_equals_dense(name, tmp_path):
+    (tmp_path / name).write_text("".join(plain_lines(name)), encoding="utf-8")
     returns = run(tmp_path / name)
     assert returns == run(ROOT / "examples" / name, method="dense")
     assert len(returns) > 5
 
 
-@pytest.mark.parametrize("method", ["bayes", long("rrdu")])
+@pytest.mark.parametrize("method", ["bayes", long_case("rrdu")])
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_it_trains_on_what_the_assigner_says(name, method):
-    """The environment is the same, and with other rewards other actions follow."""
+def test_proxy_rewards_change_actions(name, method):
     returns = run(ROOT / "examples" / name, method=method)
     assert len(returns) > 5
     assert returns[-1] != run(ROOT / "examples" / name, method="dense")[-1]
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_the_page_shows_what_is_added(name):
+def test_page_shows_added_lines(name):
     page = (ROOT / "docs" / "plugs" / "cleanrl.md").read_text(encoding="utf-8")
-    shown = [block for block in re.findall(r"```diff\n(.*?)```", page, re.DOTALL) if f"+++ {name}" in block]
-    assert shown == [difference(name)]
-    added = [line for line in shown[0].splitlines()[2:] if line.startswith("+")]
-    assert len(added) <= 20
-    assert not any(line.startswith("-") for line in shown[0].splitlines()[2:])
-
-
-def difference(name):
-    """From the plain script to this one, without the marks and the numbers of lines."""
-    with_lare = [line.replace(MARK, "") for line in lines_of(name)]
-    found = difflib.unified_diff(plain(name), with_lare, f"{name} (plain)", name, n=1)
-    return "".join("@@\n" if line.startswith("@@") else line for line in found)
+    diffs = [block for block in re.findall(r"```diff\n(.*?)```", page, re.DOTALL) if f"+++ {name}" in block]
+    without_marks = [line.replace(MARK, "") for line in read_lines(name)]
+    diff = list(difflib.unified_diff(plain_lines(name), without_marks, f"{name} (plain)", name, n=1))
+    assert diffs == ["".join("@@\n" if line.startswith("@@") else line for line in diff)]
+    assert sum(line.startswith("+") for line in diff[2:]) <= 20
+    assert not any(line.startswith("-") for line in diff[2:])

@@ -1,9 +1,7 @@
-"""`lare_rl.integrations.sb3`, against Stable-Baselines3 and sb3-contrib themselves."""
+"""Replay buffers and callback, in the algorithms of Stable-Baselines3 and sb3-contrib."""
 
-import re
 import subprocess
 import sys
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -17,52 +15,48 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import lare_rl
-from helpers.tiers import long
-from helpers.toys import Chase, Pick, toy_spec
-from lare_rl import LareError
+from helpers.toy_envs import Chase, Pick, toy_spec
+from lare_rl import CreditAssigner, LareError
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import METHODS
-from lare_rl.errors import pip_install
+from lare_rl.errors import install_command
 from lare_rl.integrations.sb3 import CreditCallback, CreditDictReplayBuffer, CreditNStepReplayBuffer, CreditReplayBuffer
 
 torch.set_num_threads(1)
 
-SMALL = CreditSettings(hidden=(8,), drawn_steps=4, steps=16, episodes=2, encoder=(8,), bottleneck=2)
-NET = {"net_arch": [8]}
-WITH_BUFFER = {"learning_starts": 30, "buffer_size": 300, "batch_size": 8, "train_freq": 1, "gradient_steps": 1}
-STEPS_OF_TOY = 20
+SMALL_CREDIT = CreditSettings(hidden=(8,), drawn_steps=4, steps=16, episodes=2, encoder=(8,), bottleneck=2)
+SMALL_BUFFER = {"learning_starts": 30, "buffer_size": 300, "batch_size": 8, "train_freq": 1, "gradient_steps": 1}
+EPISODE_STEPS = 20
 
 
-class Logged(gymnasium.Wrapper):
-    """Keeps what happens, and pays multiples of 1/64: what a vector environment rounds to float32 stays equal."""
+class LoggedEnv(gymnasium.Wrapper):
+    """Logs (observation, action, next observation, reward, done), and pays each reward at once, in pairs, or at the end.
 
-    def __init__(self, env, paid="every step"):
+    Rewards are multiples of 1/64, so that float32 does not round their sums.
+    """
+
+    def __init__(self, env, pays="at once"):
         super().__init__(env)
-        self.log, self.paid, self.kept = [], paid, 0.0
+        self.log, self.pays = [], pays
 
-    def reset(self, **how):
-        self.before, info = self.env.reset(**how)
-        self.kept = 0.0
-        return self.before, info
+    def reset(self, **options):
+        self.observation, info = self.env.reset(**options)
+        self.unpaid = 0.0
+        return self.observation, info
 
     def step(self, action):
-        after, reward, terminated, truncated, info = self.env.step(action)
-        reward, ended = np.round(64 * reward) / 64, terminated or truncated
-        self.log.append((self.before, np.array(action), after, reward, ended))
-        self.kept += reward
-        if self.paid == "late" and not ended:
-            reward, self.kept = 0.0, self.kept
-        elif self.paid == "in pairs" and not (ended or len(self.log) % 2):
-            reward = 0.0
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        reward, done = np.round(64 * reward) / 64, terminated or truncated
+        self.log.append((self.observation, np.array(action), observation, reward, done))
+        self.observation = observation
+        self.unpaid += reward
+        if done or self.pays == "at once" or (self.pays == "in pairs" and len(self.log) % 2 == 0):
+            reward, self.unpaid = self.unpaid, 0.0
         else:
-            reward, self.kept = (self.kept, 0.0) if self.paid != "every step" else (reward, 0.0)
-        self.before = after
-        return after, reward, terminated, truncated, info
+            reward = 0.0
+        return observation, reward, terminated, truncated, info
 
 
-class Named(Chase):
-    """The toy, with observations of a Dict space."""
-
+class DictChase(Chase):
     observation_space = Dict({"place": Box(-1, 1, (2,), np.float32), "side": Discrete(2)})
 
     def observe(self):
@@ -70,132 +64,88 @@ class Named(Chase):
         return {"place": state, "side": int(state[0] > 0)}
 
 
-def toy(paid="every step", of=Chase):
-    return Logged(gymnasium.wrappers.TimeLimit(of(), STEPS_OF_TOY), paid)
+class ConstantChase(Chase):
+    """A reset cannot be seen in the observations."""
+
+    def observe(self):
+        self.state = np.zeros(2, np.float32)
+        return self.state
 
 
-def toys(count, paid="every step", of=Chase):
-    """A vector environment, and its parts."""
-    parts = [toy(paid, of) for _ in range(count)]
-    return DummyVecEnv([lambda part=part: part for part in parts]), parts
+class MaskedPick(Pick):
+    def action_masks(self):
+        return np.ones(4, bool)
 
 
-def assigner(method="ircr", of=Chase, capacity=300, **more):
-    """Of the cheapest method, unless given; it keeps all rows that it was shown in `seen`."""
-    spaces = {"observation_space": of.observation_space, "action_space": of.action_space}
-    credit = lare_rl.CreditAssigner(method, **({"settings": SMALL, "capacity": capacity} | spaces | more))
-    credit.seen, add = [], credit.add
+class RecordingAssigner(CreditAssigner):
+    """Records the rows that it is shown."""
 
-    def kept(before, action, after, reward, *rest, **more):
-        credit.seen += zip(*credit.config.rows(before, action, after), reward, strict=True)
-        return add(before, action, after, reward, *rest, **more)
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.recorded = []
 
-    credit.add = kept
-    return credit
+    def add(self, observation, action, next_observation, *args, **options):
+        self.recorded += zip(*self.config.to_rows(observation, action, next_observation), strict=True)
+        return super().add(observation, action, next_observation, *args, **options)
 
 
-def td3(env, credit, buffer=CreditReplayBuffer, kind=TD3, policy="MlpPolicy", extra=None, **settings):
-    """A small model with a replay buffer that pays."""
-    plug = {"replay_buffer_class": buffer, "replay_buffer_kwargs": {"credit": credit, **(extra or {})}}
-    return kind(policy, env, seed=0, device="cpu", policy_kwargs=dict(NET), **(WITH_BUFFER | settings), **plug)
+def make_env(env_class=Chase, pays="at once"):
+    return LoggedEnv(gymnasium.wrappers.TimeLimit(env_class(), EPISODE_STEPS), pays)
 
 
-def ppo(env, kind=PPO, policy="MlpPolicy", **settings):
-    size = {} if kind is A2C else {"batch_size": 8}
-    return kind(policy, env, seed=0, device="cpu", policy_kwargs=dict(NET), **({"n_steps": 32} | size | settings))
+def make_envs(n_envs, env_class=Chase, pays="at once"):
+    """Return a vector environment and its environments."""
+    envs = [make_env(env_class, pays) for _ in range(n_envs)]
+    return DummyVecEnv([lambda env=env: env for env in envs]), envs
 
 
-def check_met(credit, parts):
-    """What the assigner was shown, and which episodes it has, is what the environments have logged."""
+def make_assigner(method="ircr", env_class=Chase, **options):
+    """Return an assigner of the cheapest method."""
+    spaces = {"observation_space": env_class.observation_space, "action_space": env_class.action_space}
+    return RecordingAssigner(method, **({"settings": SMALL_CREDIT, "capacity": 300} | spaces | options))
+
+
+def off_policy(env, credit, kind=TD3, buffer=CreditReplayBuffer, policy="MlpPolicy", buffer_options=None, **settings):
+    return kind(
+        policy,
+        env,
+        seed=0,
+        device="cpu",
+        policy_kwargs={"net_arch": [8]},
+        replay_buffer_class=buffer,
+        replay_buffer_kwargs={"credit": credit, **(buffer_options or {})},
+        **(SMALL_BUFFER | settings),
+    )
+
+
+def on_policy(env, kind=PPO, policy="MlpPolicy", **settings):
+    batch = {} if kind is A2C else {"batch_size": 8}
+    options = {"n_steps": 32, **batch, **settings}
+    return kind(policy, env, seed=0, device="cpu", policy_kwargs={"net_arch": [8]}, **options)
+
+
+def check_shown(credit, envs):
+    """Assert that rows and episodes of the assigner are those of the environments' logs."""
     credit.metrics()
-    count, scores = len(parts), {}
-    shown, done = credit.config.observation, credit.config.action
-    for lane, part in enumerate(parts):
-        columns = list(zip(*part.log, strict=True))
-        seen = list(zip(*credit.seen[lane::count], strict=True))
-        for layout, column, found in zip([shown, done, shown], columns, seen, strict=False):
-            rows = np.stack([layout.rows(value, "log") for value in column])
-            np.testing.assert_allclose(np.stack(found), rows.reshape(len(rows), -1), atol=1e-6)
-        ends = np.flatnonzero(columns[4])
-        numbers = np.arange(len(part.log)) * count + lane
+    n_envs, scores = len(envs), {}
+    layouts = (credit.config.observation, credit.config.action, credit.config.observation)
+    for env_index, env in enumerate(envs):
+        *columns, rewards, dones = zip(*env.log, strict=True)
+        recorded = zip(*credit.recorded[env_index::n_envs], strict=True)
+        for layout, column, rows in zip(layouts, columns, recorded, strict=True):
+            expected = np.stack([layout.rows(value, "log") for value in column])
+            np.testing.assert_allclose(np.stack(rows), expected.reshape(len(expected), -1), atol=1e-6)
+        ends = np.flatnonzero(dones)
+        numbers = np.arange(len(env.log)) * n_envs + env_index
         for first, last in zip([0, *ends[:-1] + 1], ends, strict=True):
-            scores[tuple(numbers[first : last + 1])] = sum(columns[3][first : last + 1])
-    assert {tuple(one.steps.tolist()): one.score for one in credit.store.episodes.values()} == pytest.approx(scores)
+            scores[tuple(numbers[first : last + 1])] = sum(rewards[first : last + 1])
+    stored = {tuple(episode.steps.tolist()): episode.score for episode in credit.store.episodes.values()}
+    assert stored == pytest.approx(scores)
     assert credit.store.dropped == 0
 
 
-@pytest.mark.parametrize("environments", [1, 3])
-@pytest.mark.parametrize("paid", ["every step", "late"])
-def test_a_buffer_shows_what_happened(environments, paid):
-    env, parts = toys(environments, paid)
-    noise = NormalActionNoise(np.zeros(1), np.ones(1))
-    credit = assigner()
-    td3(env, credit, action_noise=noise).learn(90 * environments)
-    check_met(credit, parts)
-
-
-@pytest.mark.parametrize("kind", [PPO, A2C, sb3_contrib.TRPO])
-def test_a_callback_shows_what_happened(kind):
-    env, parts = toys(2)
-    credit = assigner()
-    ppo(env, kind).learn(128, callback=CreditCallback(credit, 5))
-    check_met(credit, parts)
-
-
-def test_actions_that_are_chosen():
-    env, parts = toys(2, of=Pick)
-    credit = assigner(of=Pick)
-    td3(env, credit, kind=DQN, exploration_fraction=0.5).learn(120)
-    check_met(credit, parts)
-    env, parts = toys(2, of=Pick)
-    credit = assigner(of=Pick)
-    ppo(env).learn(64, callback=CreditCallback(credit, 5))
-    check_met(credit, parts)
-
-
-def test_observations_by_name():
-    env, parts = toys(2, of=Named)
-    credit = assigner("rd-linear", of=Named)
-    model = td3(env, credit, CreditDictReplayBuffer, policy="MultiInputPolicy")
-    model.learn(120)
-    check_met(credit, parts)
-    check_paid_in_units(model, credit)
-    env, parts = toys(2, of=Named)
-    credit = assigner(of=Named)
-    ppo(env, policy="MultiInputPolicy").learn(64, callback=CreditCallback(credit, 5))
-    check_met(credit, parts)
-
-
-def test_a_task_may_know_rows_where_the_environment_has_names():
-    env, parts = toys(1, of=Named)
-    credit = assigner(of=Named, observation_space=4)
-    td3(env, credit, CreditDictReplayBuffer, policy="MultiInputPolicy").learn(60)
-    rows = [assigner(of=Named).config.observation.rows(before, "log") for before, *_ in parts[0].log]
-    np.testing.assert_array_equal([before for before, *_ in credit.seen], np.stack(rows))
-
-
-def test_what_is_normalised_is_shown_as_it_was():
-    env, parts = toys(2)
-    credit = assigner()
-    model = td3(VecNormalize(env), credit)
-    model.learn(120)
-    check_met(credit, parts)
-    np.random.seed(0)
-    drawn = model.replay_buffer.sample(8, model.get_vec_normalize_env())
-    np.random.seed(0)
-    rows, lanes = np.random.randint(0, 60, 8), np.random.randint(0, 2, 8)
-    expected = credit.rewards_at(model.replay_buffer.steps[rows, lanes])
-    assert np.abs(expected).max() > 0
-    np.testing.assert_array_equal(drawn.rewards.numpy().ravel(), expected)
-
-    env, parts = toys(2)
-    credit = assigner()
-    ppo(VecNormalize(env)).learn(128, callback=CreditCallback(credit, 5))
-    check_met(credit, parts)
-
-
-def check_paid_in_units(model, credit):
-    """r_hat of the rows is that of the same steps in the environment's units."""
+def check_units(model, credit):
+    """Assert that r_hat is computed from actions in the environment's units."""
     buffer, space = model.replay_buffer, model.action_space
 
     def stored(values):
@@ -203,221 +153,227 @@ def check_paid_in_units(model, credit):
             return {"place": values["place"][: buffer.pos, 0], "side": values["side"][: buffer.pos, 0, 0]}
         return values[: buffer.pos, 0]
 
-    action = space.low + 0.5 * (stored(buffer.actions) + 1) * (space.high - space.low)
-    found = credit.rewards(stored(buffer.observations), action, stored(buffer.next_observations))
-    np.testing.assert_allclose(found, buffer.rewards[: buffer.pos, 0], atol=1e-5)
+    env_action = space.low + 0.5 * (stored(buffer.actions) + 1) * (space.high - space.low)
+    r_hat = credit.rewards(stored(buffer.observations), env_action, stored(buffer.next_observations))
+    np.testing.assert_allclose(r_hat, buffer.rewards[: buffer.pos, 0], atol=1e-5)
 
 
-def test_actions_are_in_the_units_of_the_environment():
-    credit = assigner("rd-linear")
-    model = td3(toy(), credit)
+@pytest.mark.parametrize(
+    ("kind", "env_class", "n_envs", "pays"),
+    [
+        (TD3, Chase, 1, "at once"),
+        (TD3, Chase, 3, "at the end"),
+        *((kind, Chase, 2, "at once") for kind in (SAC, sb3_contrib.TQC, sb3_contrib.CrossQ)),
+        *((kind, Pick, 2, "at once") for kind in (DQN, sb3_contrib.QRDQN)),
+    ],
+)
+def test_buffer_steps(kind, env_class, n_envs, pays):
+    env, envs = make_envs(n_envs, env_class, pays)
+    credit = make_assigner(env_class=env_class)
+    noise = {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))} if kind is TD3 else {}
+    off_policy(env, credit, kind, **noise).learn(45 * n_envs)
+    check_shown(credit, envs)
+
+
+@pytest.mark.parametrize(
+    ("kind", "env_class", "policy"),
+    [
+        *((kind, Chase, "MlpPolicy") for kind in (PPO, A2C, sb3_contrib.TRPO)),
+        (PPO, Pick, "MlpPolicy"),
+        (PPO, DictChase, "MultiInputPolicy"),
+        (sb3_contrib.RecurrentPPO, Chase, "MlpLstmPolicy"),
+        (sb3_contrib.MaskablePPO, MaskedPick, "MlpPolicy"),
+    ],
+)
+def test_callback_steps(kind, env_class, policy):
+    env, envs = make_envs(2, env_class)
+    credit = make_assigner(env_class=env_class)
+    on_policy(env, kind, policy).learn(128, callback=CreditCallback(credit, 5))
+    check_shown(credit, envs)
+
+
+def test_dict_buffer():
+    env, envs = make_envs(2, DictChase)
+    credit = make_assigner("rd-linear", DictChase)
+    model = off_policy(env, credit, buffer=CreditDictReplayBuffer, policy="MultiInputPolicy")
     model.learn(120)
-    assert np.abs(model.replay_buffer.actions).max() <= 1
-    assert np.abs([action for _, action, *_ in credit.seen]).max() > 1
-    check_paid_in_units(model, credit)
+    check_shown(credit, envs)
+    check_units(model, credit)
 
 
-def test_episodes_of_a_log_come_first():
-    """The buffer pays its own steps, and the decoder knows the logged episodes."""
-    credit, random = assigner("rd-linear"), np.random.default_rng(0)
+def test_normalisation():
+    """The assigner is shown original observations and rewards, and r_hat is not normalised."""
+    env, envs = make_envs(2)
+    credit = make_assigner()
+    model = off_policy(VecNormalize(env), credit)
+    model.learn(120)
+    check_shown(credit, envs)
+    np.random.seed(0)
+    sample = model.replay_buffer.sample(8, model.get_vec_normalize_env())
+    np.random.seed(0)
+    rows, env_indices = np.random.randint(0, 60, 8), np.random.randint(0, 2, 8)
+    expected = credit.rewards_at(model.replay_buffer.steps[rows, env_indices])
+    assert np.abs(expected).max() > 0
+    np.testing.assert_array_equal(sample.rewards.numpy().ravel(), expected)
+    env, envs = make_envs(2)
+    credit = make_assigner()
+    on_policy(VecNormalize(env)).learn(128, callback=CreditCallback(credit, 5))
+    check_shown(credit, envs)
+
+
+def test_units_and_logged_episodes():
+    """The decoder also learns from episodes that were added before."""
+    credit, random = make_assigner("rd-linear"), np.random.default_rng(0)
     for _ in range(5):
-        before, after = random.uniform(-1, 1, (2, 10, 2))
-        credit.add_episode(before, random.uniform(-2, 2, (10, 1)), after, random.normal())
-    model = td3(toy(), credit)
+        observation, next_observation = random.uniform(-1, 1, (2, 10, 2))
+        credit.add_episode(observation, random.uniform(-2, 2, (10, 1)), next_observation, random.normal())
+    model = off_policy(make_env(), credit)
     model.learn(120)
-    assert credit.metrics()["credit/episodes"] == 5 + 120 // STEPS_OF_TOY
-    check_paid_in_units(model, credit)
-
-
-def weights(model):
-    return {name: value.numpy().copy() for name, value in model.policy.state_dict().items()}
+    assert credit.metrics()["credit/episodes"] == 5 + 120 // EPISODE_STEPS
+    assert np.abs(model.replay_buffer.actions).max() <= 1
+    assert np.abs([action for _, action, _ in credit.recorded]).max() > 1
+    check_units(model, credit)
 
 
 @pytest.mark.parametrize("algorithm", ["td3", "ppo"])
-def test_nothing_but_returns_gets_through(algorithm):
-    found = []
-    for paid in ("every step", "late", "in pairs"):
-        env, _ = toys(2, paid)
-        credit = assigner("rrdu")
+def test_policy_depends_on_returns_only(algorithm):
+    """Not on when rewards are paid."""
+    weights = []
+    for pays in ("at once", "at the end", "in pairs"):
+        env, _ = make_envs(2, pays=pays)
+        credit = make_assigner("rrdu")
         if algorithm == "td3":
-            model = td3(env, credit)
+            model = off_policy(env, credit)
             model.learn(120)
         else:
-            model = ppo(env)
+            model = on_policy(env)
             model.learn(192, callback=CreditCallback(credit, 5))
-        assert credit.learner.fits > 0
-        found.append(weights(model))
-    for other in found[1:]:
+        assert credit.metrics()["credit/fits"] > 0
+        weights.append({name: value.numpy().copy() for name, value in model.policy.state_dict().items()})
+    for other in weights[1:]:
         for name, values in other.items():
-            np.testing.assert_array_equal(values, found[0][name])
+            np.testing.assert_array_equal(values, weights[0][name])
 
 
-def test_the_newest_decoder_pays():
-    credit = assigner("rrdu")
-    model = td3(toy(), credit)
+def test_newest_decoder():
+    credit = make_assigner("rrdu")
+    model = off_policy(make_env(), credit)
     model.learn(90)
-    earlier = model.replay_buffer.rewards[:60, 0]
+    rewards = model.replay_buffer.rewards
+    before = rewards[:60, 0]
     credit.fit(50)
-    later = model.replay_buffer.rewards[:60, 0]
-    assert np.abs(later - earlier).max() > 1e-4
+    assert np.abs(rewards[:60, 0] - before).max() > 1e-4
     np.random.seed(0)
-    drawn = model.replay_buffer.sample(8).rewards.numpy().ravel()
+    sample = model.replay_buffer.sample(8).rewards.numpy().ravel()
     np.random.seed(0)
-    rows = np.random.randint(0, 90, 8)
-    np.testing.assert_array_equal(drawn, model.replay_buffer.rewards[rows, 0])
+    np.testing.assert_array_equal(sample, rewards[np.random.randint(0, 90, 8), 0])
 
 
-def test_updates_are_those_of_the_steps_whatever_the_algorithm_updates():
-    env, _ = toys(2)
-    credit = assigner("rrdu")
-    td3(env, credit, gradient_steps=5).learn(200)
-    assert 150 < credit.learner.fits <= 200
+def test_number_of_decoder_updates():
+    """It depends on the steps, not on the algorithm's own updates."""
+    credit = make_assigner("rrdu")
+    off_policy(make_envs(2)[0], credit, gradient_steps=5).learn(200)
+    assert 150 < credit.metrics()["credit/fits"] <= 200
 
 
-class Seen(BaseCallback):
-    """Keeps what the rollout buffer holds before the algorithm learns from it."""
+class RolloutRecorder(BaseCallback):
+    """Records what the rollout buffer holds before the algorithm learns from it."""
 
-    def __init__(self, credit, after):
+    def __init__(self, credit):
         super().__init__()
-        self.credit, self.after, self.last = credit, after, {}
+        self.credit, self.terminal = credit, {}
+
+    def _value(self, observation):
+        with torch.no_grad():
+            return self.model.policy.predict_values(self.model.policy.obs_to_tensor(observation)[0]).numpy().ravel()
 
     def _on_step(self):
-        for place in np.flatnonzero(self.locals["dones"]):
-            key = (len(self.after.steps) - 1, int(place))
-            self.last[key] = self.locals["infos"][place]["terminal_observation"]
+        for env_index in np.flatnonzero(self.locals["dones"]):
+            step = (self.num_timesteps // 2 - 1, int(env_index))
+            self.terminal[step] = self._value(self.locals["infos"][env_index]["terminal_observation"])[0]
         return True
 
     def _on_rollout_end(self):
-        buffer = self.model.rollout_buffer
-        self.found = {
-            name: getattr(buffer, name).copy() for name in ("rewards", "values", "advantages", "episode_starts")
-        }
-        count = self.credit.store.steps
-        steps = np.arange(count - buffer.buffer_size * buffer.n_envs, count).reshape(buffer.buffer_size, -1)
-        self.paid = self.credit.rewards_at(steps)
-        self.bootstrap = np.zeros_like(self.paid)
-        for place, observation in self.last.items():
-            with torch.no_grad():
-                value = self.model.policy.predict_values(self.model.policy.obs_to_tensor(observation)[0])
-            self.bootstrap[place] = self.model.gamma * float(value)
-        with torch.no_grad():
-            now = self.model.policy.obs_to_tensor(self.model._last_obs)[0]
-            self.next, self.dones = self.model.policy.predict_values(now).numpy().ravel(), self.locals["dones"]
-        self.last = {}
+        buffer, n_steps = self.model.rollout_buffer, self.credit.store.steps
+        names = ("rewards", "values", "advantages", "episode_starts")
+        self.buffer = {name: getattr(buffer, name).copy() for name in names}
+        self.r_hat = self.credit.rewards_at(
+            np.arange(n_steps - buffer.rewards.size, n_steps).reshape(buffer.rewards.shape)
+        )
+        self.bootstrap = np.zeros_like(self.r_hat)
+        for step, value in self.terminal.items():
+            self.bootstrap[step] = self.model.gamma * value
+        self.next_value, self.dones = self._value(self.model._last_obs), self.locals["dones"]
 
 
 @pytest.mark.parametrize("kind", [PPO, A2C, sb3_contrib.TRPO])
 @pytest.mark.parametrize("normalised", [False, True])
 def test_rewards_and_advantages_by_hand(kind, normalised):
-    env, _ = toys(2)
-    credit = assigner()
-    paying = CreditCallback(credit, 20)
-    seen = Seen(credit, paying)
-    model = ppo(VecNormalize(env) if normalised else env, kind, gae_lambda=0.9)
-    model.learn(64, callback=[paying, seen])
-    assert np.abs(seen.paid).max() > 0
-    assert np.count_nonzero(seen.bootstrap) == 2
-    np.testing.assert_allclose(seen.found["rewards"], seen.paid + seen.bootstrap, atol=1e-6)
-    advantage, next_value, goes_on = np.zeros(2), seen.next, 1 - seen.dones.astype(float)
-    for step in reversed(range(32)):
-        value = seen.found["values"][step]
-        delta = seen.found["rewards"][step] + model.gamma * next_value * goes_on - value
-        advantage = delta + model.gamma * 0.9 * goes_on * advantage
-        np.testing.assert_allclose(seen.found["advantages"][step], advantage, atol=1e-5)
-        next_value, goes_on = value, 1 - seen.found["episode_starts"][step]
+    env, _ = make_envs(2)
+    credit = make_assigner()
+    recorder = RolloutRecorder(credit)
+    model = on_policy(VecNormalize(env) if normalised else env, kind, gae_lambda=0.9)
+    model.learn(64, callback=[CreditCallback(credit, 20), recorder])
+    assert np.abs(recorder.r_hat).max() > 0
+    assert np.count_nonzero(recorder.bootstrap) == 2
+    reward, value = recorder.buffer["rewards"], recorder.buffer["values"]
+    np.testing.assert_allclose(reward, recorder.r_hat + recorder.bootstrap, atol=1e-6)
+    advantage, next_value, discount = np.zeros(2), recorder.next_value, model.gamma * ~recorder.dones
+    for t in reversed(range(32)):
+        advantage = reward[t] + discount * next_value - value[t] + 0.9 * discount * advantage
+        np.testing.assert_allclose(recorder.buffer["advantages"][t], advantage, atol=1e-5)
+        next_value, discount = value[t], model.gamma * (1 - recorder.buffer["episode_starts"][t])
 
 
-def test_other_algorithms_with_rollouts():
-    for kind, policy, of in (
-        (sb3_contrib.RecurrentPPO, "MlpLstmPolicy", Chase),
-        (sb3_contrib.MaskablePPO, "MlpPolicy", Masked),
-    ):
-        env, parts = toys(2, of=of)
-        credit = assigner(of=of)
-        ppo(env, kind, policy).learn(64, callback=CreditCallback(credit, 5))
-        check_met(credit, parts)
+def lengths(credit):
+    return {len(episode.steps) for episode in credit.store.episodes.values()}
 
 
-class Masked(Pick):
-    """The toy of choices, all of which there are."""
-
-    def action_masks(self):
-        return np.ones(4, bool)
-
-
-@pytest.mark.parametrize("kind", [SAC, sb3_contrib.TQC, sb3_contrib.CrossQ])
-def test_other_algorithms_with_a_buffer(kind):
-    env, parts = toys(2)
-    credit = assigner()
-    td3(env, credit, kind=kind).learn(80)
-    check_met(credit, parts)
-
-
-def test_other_algorithms_of_choices():
-    env, parts = toys(2, of=Pick)
-    credit = assigner(of=Pick)
-    td3(env, credit, kind=sb3_contrib.QRDQN).learn(80)
-    check_met(credit, parts)
-
-
-def test_a_second_learn_drops_what_was_cut():
-    credit = assigner()
-    env, _ = toys(3)
-    model = td3(env, credit)
-    model.learn(90)
-    model.learn(60)  # 10 steps into the second episode of each
-    assert credit.metrics()["credit/dropped"] == 3
-    model.learn(60, reset_num_timesteps=False)
-    assert credit.metrics()["credit/dropped"] == 3
-    assert {len(one.steps) for one in credit.store.episodes.values()} == {STEPS_OF_TOY}
-
-    credit = assigner(capacity=1000)
-    model = ppo(toys(3)[0])
-    model.learn(96, callback=CreditCallback(credit, 5))
-    model.learn(96, callback=CreditCallback(credit, 5))
-    assert credit.metrics()["credit/dropped"] == 3
-    model.learn(96, callback=CreditCallback(credit, 5), reset_num_timesteps=False)
-    assert credit.metrics()["credit/dropped"] == 3
-    assert {len(one.steps) for one in credit.store.episodes.values()} == {STEPS_OF_TOY}
-
-
-class Same(Chase):
-    """Every observation is the same."""
-
-    def observe(self):
-        self.state = np.zeros(2, np.float32)
-        return self.state
-
-
-def test_a_callback_knows_of_resets_that_cannot_be_seen():
-    credit = assigner()
-    model = ppo(toys(1, of=Same)[0])
+def test_second_learn_drops_running_episodes():
+    """Unless it continues the first one (`reset_num_timesteps=False`)."""
+    credit = make_assigner()
+    model = off_policy(make_envs(3)[0], credit)
+    n_dropped = []
+    for n_steps, reset in ((90, True), (60, True), (60, False)):
+        model.learn(n_steps, reset_num_timesteps=reset)
+        n_dropped.append(credit.metrics()["credit/dropped"])
+    assert n_dropped == [0, 3, 3]
+    assert lengths(credit) == {EPISODE_STEPS}
+    credit = make_assigner(capacity=1000)
+    model = on_policy(make_envs(3)[0])
+    n_dropped = []
+    for reset in (True, True, False):
+        model.learn(96, callback=CreditCallback(credit, 5), reset_num_timesteps=reset)
+        n_dropped.append(credit.metrics()["credit/dropped"])
+    assert n_dropped == [0, 3, 3]
+    assert lengths(credit) == {EPISODE_STEPS}
+    credit = make_assigner()
+    model = on_policy(make_envs(1, ConstantChase)[0])
     for _ in range(2):
         model.learn(32, callback=CreditCallback(credit, 5))
-    credit.metrics()
-    assert credit.store.dropped == 1
-    assert {len(one.steps) for one in credit.store.episodes.values()} == {STEPS_OF_TOY}
+    assert credit.metrics()["credit/dropped"] == 1
+    assert lengths(credit) == {EPISODE_STEPS}
 
 
 def mean_return(model, episodes=20):
-    """Of the policy without noise, by the environment's own rewards."""
-    env, total = gymnasium.wrappers.TimeLimit(Chase(), STEPS_OF_TOY), 0.0
+    """Return the mean true return of the policy without noise."""
+    env, total = gymnasium.wrappers.TimeLimit(Chase(), EPISODE_STEPS), 0.0
     for seed in range(episodes):
-        (observation, _), ended = env.reset(seed=1000 + seed), False
-        while not ended:
+        (observation, _), done = env.reset(seed=1000 + seed), False
+        while not done:
             action, _ = model.predict(observation, deterministic=True)
             observation, reward, terminated, truncated, _ = env.step(action)
-            total, ended = total + reward, terminated or truncated
+            total, done = total + reward, terminated or truncated
     return total / episodes
 
 
-def test_it_learns_as_from_true_rewards_where_the_return_alone_teaches_little(phi):
-    """Three seeds of this gave -0.12 to -0.19 with the plug, -0.13 to -0.19 with true rewards, -19 to -54 without; random -33."""
-    late = lare_rl.EpisodicReward(gymnasium.wrappers.TimeLimit(Chase(), STEPS_OF_TOY))
-    credit = lare_rl.CreditAssigner("lare-bayes", phi, task=toy_spec(), capacity=3000)
+def test_learns_from_returns(phi):
+    """Returns of three seeds: -0.12 to -0.19 with r_hat, -0.13 to -0.19 with true rewards, -19 to -54 without; random -33."""
+    env = lare_rl.EpisodicReward(gymnasium.wrappers.TimeLimit(Chase(), EPISODE_STEPS))
+    credit = CreditAssigner("lare-bayes", phi, task=toy_spec(), capacity=3000)
     model = TD3(
         "MlpPolicy",
-        late,
+        env,
         replay_buffer_class=CreditReplayBuffer,
         replay_buffer_kwargs={"credit": credit},
         learning_starts=200,
@@ -434,54 +390,52 @@ def test_it_learns_as_from_true_rewards_where_the_return_alone_teaches_little(ph
     assert credit.metrics()["credit/return_r2"] > 0.99
 
 
-def test_a_model_is_saved_without_episodes_and_a_buffer_with_them(tmp_path, phi):
-    credit = lare_rl.CreditAssigner("lare-rrdu", phi, task=toy_spec(), settings=SMALL, capacity=20_000)
-    model = td3(toy(), credit, buffer_size=20_000)
+def test_save_and_load(tmp_path, phi):
+    """The file of a model has no episodes, the file of a replay buffer has them."""
+    credit = CreditAssigner("lare-rrdu", phi, task=toy_spec(), settings=SMALL_CREDIT, capacity=20_000)
+    model = off_policy(make_env(), credit, buffer_size=20_000)
     model.learn(90)
-    steps = [np.float32(each) for each in (np.random.rand(5, 2), np.random.rand(5, 1), np.random.rand(5, 2))]
+    steps = [np.float32(array) for array in (np.random.rand(5, 2), np.random.rand(5, 1), np.random.rand(5, 2))]
     model.save(tmp_path / "model.zip")
     model.save_replay_buffer(tmp_path / "buffer.pkl")
     assert (tmp_path / "model.zip").stat().st_size < 300_000
 
-    light = TD3.load(tmp_path / "model.zip", env=toy(), device="cpu")
-    assert light.replay_buffer.credit.store.steps == 0
-    np.testing.assert_array_equal(light.replay_buffer.credit.rewards(*steps), credit.rewards(*steps))
-    light.learn(60)
-    assert (
-        light.replay_buffer.credit.metrics()["credit/episodes"] == 4 + 3
-    )  # counted, though only the new ones are there
-    assert len(light.replay_buffer.credit.store.episodes) == 3
+    loaded = TD3.load(tmp_path / "model.zip", env=make_env(), device="cpu")
+    credit_1 = loaded.replay_buffer.credit
+    assert credit_1.store.steps == 0
+    np.testing.assert_array_equal(credit_1.rewards(*steps), credit.rewards(*steps))
+    loaded.learn(60)
+    assert credit_1.metrics()["credit/episodes"] == 4 + 3
+    assert len(credit_1.store.episodes) == 3
 
-    whole = TD3.load(tmp_path / "model.zip", env=toy(), device="cpu")
-    whole.load_replay_buffer(tmp_path / "buffer.pkl")
-    buffer = whole.replay_buffer
+    loaded = TD3.load(tmp_path / "model.zip", env=make_env(), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer.pkl")
+    buffer = loaded.replay_buffer
     assert buffer.credit is not credit
     np.testing.assert_array_equal(buffer.credit.rewards(*steps), credit.rewards(*steps))
     np.testing.assert_array_equal(buffer.rewards[:90, 0], model.replay_buffer.rewards[:90, 0])
-    whole.learn(120, reset_num_timesteps=False)
-    assert buffer.credit.metrics()["credit/episodes"] == 4 + 6
-    assert buffer.credit.metrics()["credit/dropped"] == 1
-    assert buffer.credit.learner.fits > credit.learner.fits
+    loaded.learn(120, reset_num_timesteps=False)
+    metrics = buffer.credit.metrics()
+    assert (metrics["credit/episodes"], metrics["credit/dropped"]) == (4 + 6, 1)
+    assert metrics["credit/fits"] > credit.metrics()["credit/fits"]
 
 
-def test_every_one_of_n_steps_is_paid():
-    credit = assigner("ircr")
-    model = td3(toy(), credit, CreditNStepReplayBuffer, extra={"n_steps": 3, "gamma": 0.5})
+def test_n_step_returns():
+    options = {"n_steps": 3, "gamma": 0.5}
+    model = off_policy(make_env(), make_assigner(), buffer=CreditNStepReplayBuffer, buffer_options=options)
     model.learn(70)
-    buffer = model.replay_buffer
-    paid = buffer.rewards[:70, 0]
-    assert len(set(paid)) > 2
+    reward = model.replay_buffer.rewards[:70, 0]
+    assert len(set(reward)) > 2
     rows = np.array([0, 17, 18, 19, 66, 67, 68, 69])
-    found = buffer._get_samples(rows).rewards.numpy().ravel()
-    for row, value in zip(rows, found, strict=True):
-        end = min(row + 3, (row // STEPS_OF_TOY + 1) * STEPS_OF_TOY, 70)
-        assert value == pytest.approx(sum(0.5**k * paid[row + k] for k in range(end - row)))
+    returns = model.replay_buffer._get_samples(rows).rewards.numpy().ravel()
+    for t, return_ in zip(rows, returns, strict=True):
+        end = min(t + 3, (t // EPISODE_STEPS + 1) * EPISODE_STEPS, 70)
+        assert return_ == pytest.approx(sum(0.5**k * reward[t + k] for k in range(end - t)))
 
 
-def test_a_buffer_that_is_full_begins_anew():
-    env, _ = toys(3)
-    credit = assigner("ircr", capacity=99)
-    model = td3(env, credit, buffer_size=100)
+def test_full_buffer():
+    credit = make_assigner(capacity=99)
+    model = off_policy(make_envs(3)[0], credit, buffer_size=100)
     model.learn(250)
     buffer = model.replay_buffer
     assert buffer.full
@@ -489,146 +443,76 @@ def test_a_buffer_that_is_full_begins_anew():
     assert np.isfinite(buffer.sample(64).rewards.numpy()).all()
 
 
-def test_observations_may_be_stored_once():
-    credit = assigner()
-    saving = {"optimize_memory_usage": True, "extra": {"handle_timeout_termination": False}}
-    model = td3(toy(), credit, buffer_size=50, **saving)
+def test_optimize_memory_usage():
+    credit = make_assigner()
+    options = {"optimize_memory_usage": True, "buffer_options": {"handle_timeout_termination": False}}
+    model = off_policy(make_env(), credit, buffer_size=50, **options)
     model.learn(120)
     assert credit.metrics()["credit/episodes"] == 6
     assert np.isfinite(model.replay_buffer.sample(16).rewards.numpy()).all()
 
 
-ONE_AGENT = [row for row in METHODS.values() if row.has_proxy and not row.for_many_only]
-ALL_KINDS = {"rrdu", "bayes", "lare-bayes", "lare-rd", "lare-signs", "ircr", "llm-reward"}
-"""Methods of all kinds of features, fits and payments."""
+class GoalBuffer(CreditDictReplayBuffer, HerReplayBuffer):
+    pass
 
 
-@pytest.mark.parametrize("method", [row.name if row.name in ALL_KINDS else long(row.name) for row in ONE_AGENT])
-def test_every_method_pays(method, phi, reward):
-    row = METHODS[method]
-    function = (reward if row.kind == "reward" else phi) if row.latent else None
-    task = toy_spec() if row.latent else None
-    spaces = {} if row.latent else {"observation_space": 2, "action_space": 1}
-    credit = lare_rl.CreditAssigner(method, function, task=task, settings=SMALL, capacity=100, **spaces)
-    model = td3(toy(), credit, buffer_size=100)
-    model.learn(100)
-    paid = model.replay_buffer.rewards[:100, 0]
-    assert np.isfinite(paid).all()
-    assert np.abs(paid).max() > 0
+def learn_with_callback(env, credit):
+    on_policy(env).learn(32, callback=CreditCallback(credit))
 
 
-def refused(message):
-    return pytest.raises(LareError, match=f"^{re.escape(message)}$")
+@pytest.mark.parametrize(
+    ("create", "message"),
+    [
+        (lambda: TD3("MlpPolicy", make_env(), replay_buffer_class=CreditReplayBuffer), "needs an assigner"),
+        (lambda: off_policy(make_env(), make_assigner(capacity=99)), "capacity=300"),
+        (lambda: learn_with_callback(make_env(), make_assigner(capacity=31)), "capacity=32"),
+        (lambda: off_policy(make_env(), make_assigner(action_space=3)), "actions .* 1 numbers.* 3"),
+        (lambda: learn_with_callback(make_env(), make_assigner(observation_space=4)), "observations .* 2 numbers.* 4"),
+        (lambda: off_policy(make_env(), make_assigner("rd", agents=2, max_steps=20)), "agents=2.* has 1"),
+        (
+            lambda: off_policy(make_env(DictChase), make_assigner(env_class=DictChase), policy="MultiInputPolicy"),
+            "use CreditDictReplayBuffer",
+        ),
+        (lambda: off_policy(make_env(), make_assigner(), buffer=CreditDictReplayBuffer), "use CreditReplayBuffer"),
+        (
+            lambda: GoalBuffer(10, DictChase.observation_space, DictChase.action_space, credit=make_assigner()),
+            "GoalBuffer cannot relabel goals",
+        ),
+        (
+            lambda: off_policy(make_env(), make_assigner(), buffer_options={"n_sampled_goal": 4}),
+            "CreditReplayBuffer cannot relabel goals",
+        ),
+        (
+            lambda: TD3("MlpPolicy", make_env(), **SMALL_BUFFER).learn(10, callback=CreditCallback(make_assigner())),
+            r"TD3\(\.\.\., replay_buffer_class=CreditReplayBuffer",
+        ),
+        (
+            lambda: on_policy(make_env()).learn(32, callback=EveryNTimesteps(8, CreditCallback(make_assigner()))),
+            "saw 4 of the 32 steps",
+        ),
+    ],
+)
+def test_bad_arguments(create, message):
+    with pytest.raises(LareError, match=message):
+        create()
 
 
-def test_a_buffer_without_an_assigner():
-    with refused("CreditReplayBuffer needs an assigner: replay_buffer_kwargs={'credit': credit}"):
-        TD3("MlpPolicy", toy(), replay_buffer_class=CreditReplayBuffer)
-
-
-def test_an_assigner_that_is_too_small():
-    with refused("the assigner keeps 99 steps and the buffer 300: give the assigner capacity=300"):
-        td3(toy(), assigner(capacity=99))
-    with refused("the assigner keeps 31 steps and a rollout has 32: give the assigner capacity=32"):
-        ppo(toy()).learn(32, callback=CreditCallback(assigner(capacity=31)))
-
-
-def test_an_assigner_of_other_spaces():
-    with refused("action_space of the model has rows of 1 numbers, and that of the assigner of 3"):
-        td3(toy(), assigner(action_space=3))
-    with refused("observation_space of the model has rows of 2 numbers, and that of the assigner of 4"):
-        ppo(toy()).learn(32, callback=CreditCallback(assigner(observation_space=4)))
-    with refused("Stable-Baselines3 trains one agent, and the assigner has agents = 2"):
-        td3(toy(), assigner("rd", agents=2, max_steps=20))
-
-
-def test_a_buffer_of_another_class():
-    with refused(
-        f"CreditReplayBuffer does not store observations of {Named.observation_space}: take CreditDictReplayBuffer"
-    ):
-        td3(toy(of=Named), assigner(of=Named), policy="MultiInputPolicy")
-    with refused(
-        f"CreditDictReplayBuffer does not store observations of {Chase.observation_space}: take CreditReplayBuffer"
-    ):
-        td3(toy(), assigner(), CreditDictReplayBuffer)
-
-
-def test_goals_cannot_be_relabelled():
-    class Both(CreditDictReplayBuffer, HerReplayBuffer):
-        pass
-
-    message = "{} cannot relabel goals: their rewards come from compute_reward, not from an assigner"
-    with refused(message.format("Both")):
-        Both(10, Named.observation_space, Named.action_space, credit=assigner(of=Named))
-    with refused(message.format("CreditDictReplayBuffer")):
-        td3(
-            toy(of=Named),
-            assigner(of=Named),
-            CreditDictReplayBuffer,
-            policy="MultiInputPolicy",
-            extra={"n_sampled_goal": 4},
-        )
-
-
-def test_a_callback_where_there_is_a_buffer():
-    with refused(
-        "CreditCallback pays rollouts, and TD3 has a replay buffer: "
-        "TD3(..., replay_buffer_class=CreditReplayBuffer, replay_buffer_kwargs={'credit': credit})"
-    ):
-        TD3("MlpPolicy", toy(), **WITH_BUFFER).learn(10, callback=CreditCallback(assigner()))
-
-
-def test_a_callback_that_does_not_see_every_step():
-    with refused(
-        "CreditCallback saw 4 of the 32 steps of a rollout: "
-        "give it to learn() itself, or in a list, not within another callback"
-    ):
-        ppo(toy()).learn(32, callback=EveryNTimesteps(8, CreditCallback(assigner())))
-
-
-def test_a_model_that_learns_on_without_the_callback_learns_from_the_environment():
-    model = ppo(toy())
-    model.learn(32, callback=CreditCallback(assigner(), 1))
+def test_learn_without_callback_uses_true_rewards():
+    model = on_policy(make_env())
+    model.learn(32, callback=CreditCallback(make_assigner(), 1))
     model.learn(32)
     assert "compute_returns_and_advantage" not in vars(model.rollout_buffer)
     assert np.abs(model.rollout_buffer.rewards).max() > 0
 
 
-def test_a_number_that_is_not_finite():
-    env = gymnasium.make("toys/Broken-v0", fault="reward", disable_env_checker=True)
-    with pytest.raises(LareError, match="reward of row 0 holds nan"):
-        td3(env, assigner()).learn(60)
-
-
 @pytest.mark.parametrize(
-    ("begin", "message"),
+    ("line", "message"),
     [
-        (
-            "sys.modules['stable_baselines3'] = None",
-            f"lare_rl.integrations.sb3 needs an extra: {pip_install('sb3')}",
-        ),
-        (
-            "import stable_baselines3; stable_baselines3.__version__ = '2.8.0'",
-            "lare_rl.integrations.sb3 needs stable-baselines3 2.9 or later, and 2.8.0 is installed: "
-            f"{pip_install('sb3')} --upgrade",
-        ),
+        ("sys.modules['stable_baselines3'] = None", install_command("sb3")),
+        ("import stable_baselines3; stable_baselines3.__version__ = '2.8.0'", "2.8.0 is installed"),
     ],
 )
-def test_the_library_is_not_there(begin, message):
-    program = f"import sys\n{begin}\ntry:\n import lare_rl.integrations.sb3\nexcept Exception as error:\n print(error)"
-    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert printed == message + "\n"
-
-
-def test_the_page_runs(tmp_path, monkeypatch, phi):
-    page = Path(__file__).parents[2] / "docs" / "plugs" / "sb3.md"
-    blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(lare_rl, "load_task", lambda name: toy_spec(), raising=False)
-    phi.save(tmp_path / "phi.py")
-    names = {}
-    for block in blocks:
-        small = block.replace("HalfCheetah-v4", "toys/Chase-v0").replace("learn(1_000_000", "learn(150")
-        exec(small, names)
-    assert names["credit"].store.ended > 5
-    assert len(blocks) == 3
+def test_library_is_missing_or_old(line, message):
+    program = f"import sys\n{line}\ntry:\n import lare_rl.integrations.sb3\nexcept Exception as error:\n print(error)"
+    output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert message in output

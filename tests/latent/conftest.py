@@ -2,25 +2,17 @@ from dataclasses import replace
 
 import pytest
 
-from helpers.toys import PHI, toy_spec
-from lare_rl.latent import function as module
-from lare_rl.latent.function import LatentFunction, verified
-from lare_rl.latent.verify import Verdict
+from helpers.toy_envs import PHI, toy_spec
+from lare_rl.latent.function import LatentFunction, verify_function
 
 
 @pytest.fixture(scope="session")
-def sound() -> LatentFunction:
+def verified() -> LatentFunction:
     """The toy's function, verified once for all tests."""
-    return verified(PHI.strip("\n"), toy_spec())
+    return verify_function(PHI, toy_spec())
 
 
 @pytest.fixture
-def function(sound) -> LatentFunction:
+def function(verified) -> LatentFunction:
     exchanges = ({"stage": "candidate", "messages": [{"role": "user", "content": "Bitte ä"}], "replies": ["{}"]},)
-    return replace(sound, model="Somebody, draw 0", exchanges=exchanges)
-
-
-@pytest.fixture
-def trusting(monkeypatch, sound):
-    """Every source passes, for tests of files alone."""
-    monkeypatch.setattr(module, "verify", lambda source, task, kind, steps: Verdict(sound.checks, sound.graph))
+    return replace(verified, model="A model, draw 0", exchanges=exchanges)

@@ -1,4 +1,4 @@
-"""The artifact: its source, its graph and its factors."""
+"""The latent function: its source, its graph and its factors."""
 
 import hashlib
 import pickle
@@ -7,39 +7,34 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from helpers.toys import PHI, phi
+from helpers.toy_envs import PHI, phi_source
 from lare_rl.errors import LareError
 from lare_rl.latent.factors import LatentRewardError
-from lare_rl.latent.function import entries_text, normal, verified
+from lare_rl.latent.function import check_task, features_text, normalise_source, pair_with_roles, verify_function
 from lare_rl.latent.verify import Check
-from lare_rl.phi.graph import Refused
+from lare_rl.phi.limits import RefusedError
 
 SOURCE = PHI.strip("\n")
 
 
-def batch(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros((rows, 2), np.float32), np.ones((rows, 1), np.float32)
+def test_verify_function(verified, chase):
+    assert (verified.task, verified.kind, verified.source, verified.size) == ("Chase", "factors", SOURCE, 2)
+    assert verified.sizes == (2, 1)
+    assert (verified.model, verified.exchanges) == ("none: written by hand", ())
+    assert verified.checks == (Check("read", True, ""), Check("finite", True, ""))
+    assert verify_function(f"\n{PHI}\n", chase) == verified
 
 
-def test_verified(sound):
-    assert (sound.task, sound.kind, sound.source, sound.size) == ("Chase", "factors", SOURCE, 2)
-    assert sound.sizes == (2, 1)
-    assert (sound.model, sound.exchanges) == ("none: written by hand", ())
-    assert sound.checks == (Check("read", True, ""), Check("finite", True, ""))
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [(phi_source("x = [][0]\nreturn [x]"), "E-RUN line 2"), (phi_source("return [action]") + "\0", "E-SYNTAX line 2")],
+)
+def test_verify_function_refuses(chase, source, words):
+    with pytest.raises(LareError, match=f"'Chase': {words}"):
+        verify_function(source, chase)
 
 
-def test_blank_lines_around_a_source_do_not_count(chase, sound, trusting):
-    assert verified(f"\n{PHI}\n", chase) == sound
-
-
-def test_what_does_not_pass_is_no_function(chase):
-    with pytest.raises(
-        LareError, match=r"^the function does not fit task 'Chase': E-RUN line 2: IndexError: list index out of range"
-    ):
-        verified(phi("x = [][0]\nreturn [x]"), chase)
-
-
-def test_the_factors_of_a_batch(function):
+def test_factors(function):
     observation, action = np.array([[1, 9], [0.5, 9]], np.float32), np.array([[3], [-0.5]], np.float32)
     factors = function(observation, action)
     assert factors.dtype == np.float32
@@ -48,90 +43,93 @@ def test_the_factors_of_a_batch(function):
 
 
 @pytest.mark.parametrize(
-    ("observation", "action", "message"),
+    ("factor_inputs", "columns", "expected"),
     [
-        (np.zeros((3, 3)), np.zeros((3, 1)), r"observations must have the shape \(batch, 2\).* \(3, 3\)"),
-        (np.zeros((3, 2)), np.zeros(3), r"actions must have the shape \(batch, 1\).* \(3,\)"),
-        (np.zeros((3, 2)), np.zeros((4, 1)), "there are 3 observations and 4 actions"),
+        ("before", ["f_near", "f_effort"], [[-4, -9]]),
+        ("after", ["f_near", "f_effort"], [[-1, -9]]),
+        ("both", ["f_near (before)", "f_effort (before)", "f_near (after)", "f_effort (after)"], [[-4, -9, -1, -9]]),
+    ],
+)
+def test_step_factors(function, factor_inputs, columns, expected):
+    factors = function.step_factors([[1, 0]], [[3]], [[2, 0]], factor_inputs)
+    np.testing.assert_array_equal(factors, expected)
+    assert function.factor_columns(factor_inputs) == columns
+    assert function.n_factors(factor_inputs) == len(columns)
+
+
+@pytest.mark.parametrize(
+    ("observation", "action", "words"),
+    [
+        (np.zeros((3, 3)), np.zeros((3, 1)), r"observations .*\(batch, 2\).*\(3, 3\)"),
+        (np.zeros((3, 2)), np.zeros(3), r"actions .*\(batch, 1\).*\(3,\)"),
+        (np.zeros((3, 2)), np.zeros((4, 1)), "3 observations and 4 actions"),
         (np.zeros((3, 2)), [["a"]] * 3, "actions must be arrays of numbers"),
     ],
 )
-def test_arrays_of_other_sizes_are_refused(function, observation, action, message):
-    with pytest.raises(LareError, match=message):
+def test_arrays_of_other_sizes(function, observation, action, words):
+    with pytest.raises(LareError, match=words):
         function(observation, action)
 
 
-def test_a_function_that_fails_while_it_is_used(chase):
-    # It passes on the 256 recorded steps and on everything that was made up of them.
-    observation, action = batch(5)
+def test_factor_that_is_not_finite_in_use(chase):
+    # The function passes on the steps of its verification.
+    observation, action = np.zeros((5, 2), np.float32), np.ones((5, 1), np.float32)
     observation[4, 0] = -6000
-    function = verified(phi("near = np.sqrt(observation[:, 0:1] + 5000)\nreturn [action, near]"), chase)
-    with pytest.raises(LatentRewardError) as error:
+    function = verify_function(phi_source("near = np.sqrt(observation[:, 0:1] + 5000)\nreturn [action, near]"), chase)
+    with pytest.raises(LatentRewardError, match=r"'near' is nan .*-6000") as error:
         function(observation, action)
-    assert str(error.value) == "the latent function failed: factor 'near' is nan for the observation [-6000.     0.]"
     assert error.value.observation is observation
     assert error.value.action is action
 
 
-def test_names_and_meanings_are_read_off_the_source(function):
+def test_names_and_meanings(function):
     assert function.names == ["f_near", "f_effort"]
     assert function.meanings == ["how near the action comes", "effort"]
-    other = replace(
-        function, source=phi("# Factor 1: energy,\n# squared\nenergy = action**2\nreturn [-energy, energy]")
-    )
+    source = phi_source("# Factor 1: energy,\n# squared\nenergy = action**2\nreturn [-energy, energy]")
+    other = replace(function, source=source)
     assert other.names == ["factor_1", "energy"]
     assert other.meanings == ["", "energy, squared"]
 
 
-def test_entries_that_each_factor_reads(function):
-    assert function.entries_read == [
-        {"observation": [0], "action": [0]},
-        {"observation": [], "action": [0]},
-    ]
+def test_features_read(function):
+    assert function.features_read == [{"observation": [0], "action": [0]}, {"observation": [], "action": [0]}]
     assert function.reads == ["observation[0], action[0]", "action[0]"]
+    assert features_text({"observation": [], "action": []}) == "nothing"
+    indices = {"observation": [8, 9, 13], "action": [0, 1, 2, 3, 4, 5]}
+    assert features_text(indices) == "observation[8:10, 13], action[0:6]"
 
 
-@pytest.mark.parametrize(
-    ("observation", "action", "text"),
-    [
-        ([], [], "nothing"),
-        ([3], [], "observation[3]"),
-        ([8, 9, 13], [0, 1, 2, 3, 4, 5], "observation[8:10, 13], action[0:6]"),
-    ],
-)
-def test_entries_as_text(observation, action, text):
-    assert entries_text({"observation": observation, "action": action}) == text
-
-
-def test_a_source_that_cannot_be_read_has_no_graph(function):
-    with pytest.raises(Refused, match="E-FORM"):
+def test_unreadable_source_has_no_graph(function):
+    with pytest.raises(RefusedError, match="E-FORM"):
         _ = replace(function, source="x = 1").graph
 
 
-def test_a_function_in_another_process_is_the_same(function):
+def test_pickle(function):
+    observation, action = np.zeros((2, 2), np.float32), np.ones((2, 1), np.float32)
+    function(observation, action)
     other = pickle.loads(pickle.dumps(function))
     assert other == function
     assert "graph" not in other.__dict__
-    np.testing.assert_array_equal(other(*batch(2)), function(*batch(2)))
+    np.testing.assert_array_equal(other(observation, action), function(observation, action))
 
 
-def test_the_digest_is_the_sources(function):
+def test_digest(function):
     assert function.digest == hashlib.sha256(SOURCE.encode()).hexdigest()
     assert replace(function, source=SOURCE + " ").digest != function.digest
     assert replace(function, model="Another").digest == function.digest
 
 
-def test_null(chase):
-    with pytest.raises(LareError, match=r"E-SYNTAX line 2: '\\x00' is a character that no reader sees"):
-        verified(phi("return [action]") + "\0", chase)
+def test_normalise_source():
+    assert normalise_source("# lare: x\r\n\n  y\rz\x0c\x85\n\n") == "  y\nz\x0c\x85"
+    assert normalise_source("x  # \u26a0\ufe0f sign") == "x  # \u26a0 sign"
+    assert normalise_source("# lare: \n\n" * 60_000 + "\nx\n\n") == "x"  # quadratic time would take minutes
 
 
-def test_headers_beneath_headers_cost_no_time():
-    """In a square of them a function file would take minutes."""
-    assert normal("# lare: \n\n" * 60_000 + "\nx\n\n") == "x"
-
-
-def test_a_warning_sign_in_a_comment_is_welcome(chase):
-    function = verified(phi("# \u26a0\ufe0f mind the sign\nreturn [-action]"), chase)
-    assert "# \u26a0 mind" in function.source
-    assert "\ufe0f" not in function.source
+def test_function_of_another_task(function, chase):
+    other = chase.model_copy(update={"name": "Depot"})
+    check_task(function, chase)
+    with pytest.raises(LareError, match=r"'Chase', not for 'Depot'.*task='Depot'"):
+        check_task(function, other)
+    assert pair_with_roles([function], chase) == [(function, chase)]
+    with pytest.raises(LareError, match="each of Chase; 2 were given"):
+        pair_with_roles([function, function], chase)

@@ -1,30 +1,35 @@
-"""What a design may cost."""
+"""The budget of a design."""
 
 import pytest
 
-from lare_rl.llm.budget import Budget, BudgetSpent, most_tokens
+from lare_rl.llm.budget import Budget, BudgetExceededError, max_request_tokens
 
-ASKED = [{"role": "user", "content": "Grüße"}]
-
-
-def test_no_request_has_more_tokens_than_bytes_and_a_few_for_each_message():
-    assert most_tokens(ASKED) == 7 + 16
-    assert most_tokens(ASKED * 2) == 2 * most_tokens(ASKED)
+REQUEST = [{"role": "user", "content": "Grüße"}]
 
 
-def test_what_is_left_is_what_a_reply_may_have():
+def test_max_request_tokens_counts_bytes():
+    assert max_request_tokens(REQUEST) == 7 + 16
+    assert max_request_tokens(REQUEST * 2) == 2 * (7 + 16)
+
+
+def test_max_reply_tokens():
     budget = Budget(tokens=100, tokens_in=30, tokens_out=20)
-    assert budget.allow(ASKED) == 100 - 50 - 23
-    with pytest.raises(BudgetSpent, match=r"might exceed the budget of 100 tokens \(50 are used\)"):
-        budget.allow(ASKED * 3)
+    assert budget.max_reply_tokens(REQUEST) == 100 - 50 - 23
+    with pytest.raises(BudgetExceededError, match=r"100 tokens \(50 are used\)"):
+        budget.max_reply_tokens(REQUEST * 3)
 
 
-def test_no_request_is_allowed_beyond_the_last():
-    with pytest.raises(BudgetSpent, match="the budget of 2 requests is spent"):
-        Budget(requests=2, requests_made=2).allow(ASKED)
+def test_requests_are_limited():
+    with pytest.raises(BudgetExceededError, match="2 requests"):
+        Budget(requests=2, requests_used=2).max_reply_tokens(REQUEST)
 
 
-def test_costs_are_reckoned_by_given_prices():
-    budget = Budget(requests_made=2, tokens_in=1_000_000, tokens_out=500_000)
-    assert budget.summary() == "2 requests, 1,000,000 tokens in, 500,000 out"
-    assert budget.summary((3.0, 15.0)) == "2 requests, 1,000,000 tokens in, 500,000 out, 10.5000 by the given prices"
+@pytest.mark.parametrize(("seconds", "timeout_s"), [(60.0, 120.0), (900.0, 120.0), (3600.0, 450.0)])
+def test_reply_timeout(seconds, timeout_s):
+    assert Budget(seconds=seconds).reply_timeout_s == timeout_s
+
+
+def test_summary_with_prices():
+    budget = Budget(requests_used=2, tokens_in=1_000_000, tokens_out=500_000)
+    assert budget.summary().startswith("2 requests, 1,000,000 tokens in, 500,000 out")
+    assert "10.5000" in budget.summary((3.0, 15.0))

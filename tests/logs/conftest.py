@@ -8,7 +8,7 @@ from lare_rl.tasks.spec import TaskSpec
 
 @pytest.fixture
 def folder(tmp_path):
-    """Writes episodes to a directory of .npz files."""
+    """Return a function that writes episodes to a directory of .npz files."""
 
     def write(episodes, name="log"):
         path = tmp_path / name

@@ -1,13 +1,13 @@
-"""A first task file of a log."""
+"""The first task file of a log."""
 
 import lare_rl
-from helpers.logged import logged
-from lare_rl.logs.draft_from_log import draft_of_logs
+from helpers.toy_logs import logged_episodes
+from lare_rl.logs.draft_from_log import draft_log_task
 
 
-def test_sizes_are_those_of_the_arrays(folder, tmp_path):
-    drafted = draft_of_logs(folder(logged(1)))
-    assert (drafted.name, drafted.missing, drafted.of_logs) == ("log", ("description", "observation", "action"), True)
-    (tmp_path / "task.toml").write_text(drafted.toml.replace("FILL IN", "Filled in"))
+def test_draft_log_task(folder, tmp_path):
+    draft = draft_log_task(folder(logged_episodes(1)))
+    assert (draft.name, draft.missing_keys, draft.logs_only) == ("log", ("description", "observation", "action"), True)
+    (tmp_path / "task.toml").write_text(draft.toml.replace("FILL IN", "Filled in"))
     task = lare_rl.load_task(tmp_path / "task.toml")
     assert (task.observation_size, task.action_size, task.environment) == (2, 1, "none")

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
-from helpers.toys import Chase
+from helpers.toy_envs import Chase
 from lare_rl.envs.load import load_task
 from lare_rl.errors import LareError
-from lare_rl.latent.function import verified
+from lare_rl.latent.function import verify_function
 from lare_rl.llm.prompts import candidate
-from lare_rl.new_task.documentation import plain, without_clause
-from lare_rl.new_task.draft import bodies
-from lare_rl.new_task.single_agent import draft
+from lare_rl.new_task.documentation import plain_lines, remove_rewards
+from lare_rl.new_task.draft import text_lines
+from lare_rl.new_task.single_agent import draft_task
 from lare_rl.tasks.spec import FILL_IN
 
 CONTINUOUS = (
@@ -42,10 +42,10 @@ def load(tmp_path, text: str):
 
 
 @pytest.mark.parametrize("name", CONTINUOUS + DISCRETE)
-def test_gymnasiums_own_environments(tmp_path, name):
-    drafted = draft(name)
-    assert drafted.missing == ()
-    task = load(tmp_path, drafted.toml)
+def test_real_environments(tmp_path, name):
+    draft = draft_task(name)
+    assert draft.missing_keys == ()
+    task = load(tmp_path, draft.toml)
     assert (task.name, task.environment) == (name, name)
     assert (task.observation_size, task.action_size) == SIZES.get(name, (task.observation_size, task.action_size))
     request = " ".join(message["content"] for message in candidate(task)[1:]).lower()
@@ -54,8 +54,8 @@ def test_gymnasiums_own_environments(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1", "FrozenLake-v1"])
-def test_a_function_can_be_verified_on_a_draft(tmp_path, name):
-    assert verified(CONSTANT, load(tmp_path, draft(name).toml)).size == 1
+def test_draft_can_verify_a_function(tmp_path, name):
+    assert verify_function(CONSTANT, load(tmp_path, draft_task(name).toml)).size == 1
 
 
 class Told(Chase):
@@ -112,12 +112,12 @@ class Numbered(Told):
 gymnasium.register("toys/Numbered-v0", entry_point=Numbered, max_episode_steps=20)
 
 
-def test_entries_keep_their_lines_and_are_counted_once(tmp_path):
-    task = load(tmp_path, draft("toys/Numbered-v0").toml.replace("FILL IN", "one"))
+def test_numbered_entries_keep_their_lines(tmp_path):
+    task = load(tmp_path, draft_task("toys/Numbered-v0").toml.replace("FILL IN", "one"))
     assert task.observation == "3 entries.\n0: floor\n1 to 2: waiting people, by floor"
 
 
-def test_the_cells_of_a_table_have_the_titles_of_its_head():
+def test_plain_lines_of_a_table():
     text = """
     | Num | Observation | Min | Max | Reward |
     |:---:|-------------|-----|-----|--------|
@@ -126,63 +126,57 @@ def test_the_cells_of_a_table_have_the_titles_of_its_head():
     The rest.
     | 2 | no head |
     """
-    assert plain(text) == ["0: height; Min 0; Max 1; none", "1: speed; Max 3", "The rest.", "2: no head"]
+    assert plain_lines(text) == ["0: height; Min 0; Max 1; none", "1: speed; Max 3", "The rest.", "2: no head"]
 
 
-def test_a_size_that_the_text_states_is_not_repeated():
+def test_first_line_is_not_repeated():
     texts = {"observation": "3 entries: speeds", "action": "31 entries: forces"}
     heads = {"observation": "3 entries.", "action": "3 entries, each between -1 and 1."}
-    assert bodies(texts, heads) == [
+    assert text_lines(texts, heads) == [
         '\nobservation = """\n3 entries: speeds\n"""',
         '\naction = """\n3 entries, each between -1 and 1.\n31 entries: forces\n"""',
     ]
 
 
-def test_whatever_speaks_of_rewards_is_left_out(tmp_path):
-    drafted = draft("toys/Told-v0")
-    task = load(tmp_path, drafted.toml)
+def test_rewards_are_removed(tmp_path):
+    draft = draft_task("toys/Told-v0")
+    task = load(tmp_path, draft.toml)
     assert task.description == (
         "Tells of a chase.\nThe goal is to catch the *target*.\nSee the docs.\n1. Truncation: after 20 steps."
     )
     assert task.observation == "2 entries.\nA target.\nIt returns nothing."
     assert task.action == "1 entry, between -2 and 2.\n1: The second row; -"
-    assert drafted.left_out == (
+    assert draft.removed == (
         "You get a reward of 1 for each catch.",
         '0: guess a \\o/ """; no cost',
     )
-    assert "2 sentences or rows" in drafted.toml
-    assert drafted.unused == ("rewards",)
+    assert "2 sentences or rows" in draft.toml
+    assert draft.unused_sections == ("rewards",)
 
 
-def test_what_is_not_documented_must_be_filled_in(tmp_path):
-    drafted = draft("toys/Silent-v0")
-    assert drafted.missing == ("description", "observation", "action")
-    assert "Left out" not in drafted.toml
+def test_undocumented_texts_are_marked(tmp_path):
+    draft = draft_task("toys/Silent-v0")
+    assert draft.missing_keys == ("description", "observation", "action")
+    assert "Left out" not in draft.toml
     with pytest.raises(LareError, match=f"description still says '{FILL_IN}'"):
-        load(tmp_path, drafted.toml)
-    task = load(tmp_path, drafted.toml.replace(FILL_IN, "Say"))
+        load(tmp_path, draft.toml)
+    task = load(tmp_path, draft.toml.replace(FILL_IN, "Say"))
     assert (task.observation_size, task.action_size, task.max_episode_steps) == (6, 2, 1000)
     assert task.observation.startswith("6 entries, an array of shape (2, 3) row by row.")
 
 
 @pytest.mark.parametrize(
-    ("environment", "message"),
+    ("environment", "content"),
     [
-        (
-            "Nowhere-v0",
-            "environment 'Nowhere-v0' cannot be made: Environment `Nowhere` doesn't exist. (for an environment "
-            "of your own, write MODULE:Nowhere-v0, where MODULE registers it)",
-        ),
-        ("a b", "environment 'a b' cannot be made: "),
-        ("toys/Told-v0:x", "environment 'toys/Told-v0:x' cannot be made: "),
-        ("nowhere:Told-v0", "environment 'nowhere:Told-v0' cannot be made: No module named 'nowhere'."),
+        ("Nowhere-v0", "MODULE:Nowhere-v0"),
+        ("a b", "'a b' cannot be made"),
+        ("toys/Told-v0:x", "PYTHONPATH"),
+        ("nowhere:Told-v0", "No module named 'nowhere'.*PYTHONPATH"),
     ],
 )
-def test_an_environment_that_cannot_be_made(environment, message):
-    with pytest.raises(LareError) as error:
-        draft(environment)
-    assert str(error.value).startswith(message)
-    assert str(error.value).endswith(" (a module in this folder is found with PYTHONPATH=.)") == (":" in environment)
+def test_environment_that_cannot_be_made(environment, content):
+    with pytest.raises(LareError, match=content):
+        draft_task(environment)
 
 
 class Odd(Silent):
@@ -192,37 +186,26 @@ class Odd(Silent):
 
 
 @pytest.mark.parametrize(
-    ("name", "spaces", "message"),
+    ("name", "spaces", "content"),
     [
-        (
-            "toys/OddA-v0",
-            {"action_space": Tuple([Discrete(2)])},
-            "the action space of toys/OddA-v0 is Tuple(Discrete(2)), which is neither one row of bounded numbers (Box) nor one "
-            "choice (Discrete): of several choices, make one choice of all their combinations, or numbers that the environment "
-            "rounds",
-        ),
-        (
-            "toys/OddB-v0",
-            {"observation_space": gymnasium.spaces.Sequence(Discrete(2))},
-            "the observation space of toys/OddB-v0 is Sequence(Discrete(2), stack=False), which is no row of numbers",
-        ),
+        ("toys/OddA-v0", {"action_space": Tuple([Discrete(2)])}, "action space .* into one Discrete"),
+        ("toys/OddB-v0", {"observation_space": gymnasium.spaces.Sequence(Discrete(2))}, "cannot be flattened"),
     ],
 )
-def test_spaces_that_are_no_rows_of_numbers(name, spaces, message):
+def test_spaces_that_are_refused(name, spaces, content):
     gymnasium.register(name, entry_point=lambda: Odd(**spaces), disable_env_checker=True)
-    with pytest.raises(LareError) as error:
-        draft(name)
-    assert str(error.value) == message
+    with pytest.raises(LareError, match=content):
+        draft_task(name)
 
 
-def test_parts_of_an_observation_stand_behind_each_other():
+def test_dictionary_observation():
     parts = Dict({"place": Box(-1, 1, (2,), np.float32), "gear": Discrete(3)})
     gymnasium.register("toys/Parts-v0", entry_point=lambda: Odd(observation_space=parts), disable_env_checker=True)
-    assert "5 entries, Dict('gear': Discrete(3), 'place': Box(" in draft("toys/Parts-v0").toml
+    assert "5 entries, Dict('gear': Discrete(3), 'place': Box(" in draft_task("toys/Parts-v0").toml
 
 
 @pytest.mark.parametrize(
-    ("said", "kept"),
+    ("sentence", "expected"),
     [
         ("The agent gets a reward of 1 for each step.", ""),
         ("You earn 5 points.", ""),
@@ -241,80 +224,80 @@ def test_parts_of_an_observation_stand_behind_each_other():
         ("Stop at the mark on the floor.", "Stop at the mark on the floor."),
     ],
 )
-def test_what_speaks_of_rewards_and_what_does_not(said, kept):
-    assert without_clause(said) == kept
+def test_remove_rewards(sentence, expected):
+    assert remove_rewards([sentence])[0] == expected
 
 
-def test_a_draft_keeps_the_goal():
-    assert "swing it into an upright position" in draft("Pendulum-v1").toml
-    assert "run forward" in draft("HalfCheetah-v5").toml
+def test_goal_is_kept():
+    assert "swing it into an upright position" in draft_task("Pendulum-v1").toml
+    assert "run forward" in draft_task("HalfCheetah-v5").toml
 
 
-def test_an_id_without_a_version_is_written_with_it():
-    drafted = draft("CartPole")
-    assert 'environment = "CartPole-v1"' in drafted.toml
+def test_id_gets_its_version():
+    draft = draft_task("CartPole")
+    assert 'environment = "CartPole-v1"' in draft.toml
 
 
-def test_what_points_at_a_picture_is_left_out():
+def test_references_to_figures_are_removed():
     """Pendulum's documentation speaks of a diagram that no text shows."""
-    text = draft("Pendulum-v1").toml
+    text = draft_task("Pendulum-v1").toml
     assert "diagram" not in text
     assert "The system consists of a pendulum" in text
 
 
-def written(tmp_path, drafted):
-    for name, text in drafted.teams.items():
+def load_with_teams(tmp_path, draft):
+    for name, text in draft.teams.items():
         (tmp_path / name).write_text(text)
-    return load(tmp_path, drafted.toml)
+    return load(tmp_path, draft.toml)
 
 
-def test_agents_of_one_kind(tmp_path):
-    drafted = draft("pettingzoo/mpe2.simple_spread_v3:parallel_env")
-    assert (drafted.name, drafted.missing, drafted.teams) == ("simple_spread_v3", (), {})
-    task = written(tmp_path, drafted)
+def test_one_team(tmp_path):
+    draft = draft_task("pettingzoo/mpe2.simple_spread_v3:parallel_env")
+    assert (draft.name, draft.missing_keys, draft.teams) == ("simple_spread_v3", (), {})
+    task = load_with_teams(tmp_path, draft)
     assert (task.name, task.observation_size, task.action_size) == ("simple_spread_v3", 18, 5)
     assert task.description.endswith("agents must learn to cover all the landmarks while avoiding collisions.")
     assert task.observation.startswith("18 entries.\nAgent observations: [self_vel, self_pos")
     assert task.action.startswith("5 entries, all 0 but one: the action that is taken.\nAgent action space: [no_action")
-    first, *_, last = drafted.left_out
+    first, *_, last = draft.removed
     assert first.startswith("More specifically, all agents are globally rewarded based on how far")
-    assert (last, len(drafted.left_out)) == (
+    assert (last, len(draft.removed)) == (
         "The relative weights of these rewards can be controlled with the local_ratio parameter.",
         3,
     )
-    assert "\n# arguments = { N = 3, local_ratio = 0.5, max_cycles = 25, " in drafted.toml
+    assert "\n# arguments = { N = 3, local_ratio = 0.5, max_cycles = 25, " in draft.toml
 
 
-def test_agents_of_two_kinds_are_two_teams(tmp_path):
-    drafted = draft("pettingzoo/mpe2.simple_adversary_v3:parallel_env")
-    assert list(drafted.teams) == ["simple_adversary_v3-adversary.toml", "simple_adversary_v3-agent.toml"]
-    task = written(tmp_path, drafted)
-    bad, good = task.roles
+def test_two_teams(tmp_path):
+    draft = draft_task("pettingzoo/mpe2.simple_adversary_v3:parallel_env")
+    assert list(draft.teams) == ["simple_adversary_v3-adversary.toml", "simple_adversary_v3-agent.toml"]
+    task = load_with_teams(tmp_path, draft)
+    adversary, agent = task.roles
     assert [(role.name, role.agents) for role in task.roles] == [
         ("adversary", ("adversary_[0-9]*",)),
         ("agent", ("agent_[0-9]*",)),
     ]
-    assert bad.observation == (
+    assert adversary.observation == (
         "13 entries: 8 of adversary_0's own, then 2 zeros, then all 0 but one: which agent it is (adversary_0, agent_0, agent_1)."
         "\nAdversary observation space: [landmark_rel_position, other_agents_rel_positions]"
     )
-    assert good.observation.splitlines()[1].startswith("Agent observation space: [goal_rel_position")
+    assert agent.observation.splitlines()[1].startswith("Agent observation space: [goal_rel_position")
     for role in task.roles:
         request = " ".join(message["content"] for message in candidate(role)[1:]).lower()
         assert "reward" not in request
 
 
-def test_agents_of_a_continuous_environment_document_themselves_in_a_module():
-    drafted = draft("pettingzoo/pettingzoo.sisl.multiwalker_v9:parallel_env")
-    assert drafted.missing == ("action",)
-    assert 'action = """\n4 entries, each between -1 and 1.\nFILL IN' in drafted.toml
-    assert "0: Hull angle; Values [0, 2*pi]" in drafted.toml
-    assert "max_episode_steps" not in drafted.toml
+def test_documentation_of_a_module():
+    draft = draft_task("pettingzoo/pettingzoo.sisl.multiwalker_v9:parallel_env")
+    assert draft.missing_keys == ("action",)
+    assert 'action = """\n4 entries, each between -1 and 1.\nFILL IN' in draft.toml
+    assert "0: Hull angle; Values [0, 2*pi]" in draft.toml
+    assert "max_episode_steps" not in draft.toml
 
 
-def test_agents_that_document_little():
-    drafted = draft("pettingzoo/helpers.parallel_toys:Toy")
-    assert (drafted.name, drafted.missing) == ("Toy", ("action",))
-    assert "Agents count their steps, and their seed is what they observe first." in drafted.toml
-    assert "The seed, then the count." in drafted.toml
-    assert "reward" not in drafted.toml.split("description", 1)[1]
+def test_little_documentation():
+    draft = draft_task("pettingzoo/helpers.parallel_toy_envs:Toy")
+    assert (draft.name, draft.missing_keys) == ("Toy", ("action",))
+    assert "Agents count their steps, and their seed is what they observe first." in draft.toml
+    assert "The seed, then the count." in draft.toml
+    assert "reward" not in draft.toml.split("description", 1)[1]

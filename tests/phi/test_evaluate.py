@@ -5,36 +5,36 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.corpus import recorded, steps
-from helpers.toys import phi
+from helpers.phi_programs import random_inputs, recorded_programs
+from helpers.toy_envs import phi_source
 from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.read import read
 
-PROGRAMS = {p.name: p for p in recorded()[::60]}
+PROGRAMS = {p.name: p for p in recorded_programs()[::60]}
 
 
-def inputs_of(program, rows=24):
-    return dict(zip(("observation", "action"), steps(program.sizes, rows, dtype=np.float32), strict=True))
+def make_inputs(program, rows=24):
+    return dict(zip(("observation", "action"), random_inputs(program.sizes, rows, dtype=np.float32), strict=True))
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_rows_are_independent_in_any_batch_shape(name):
     program = PROGRAMS[name]
-    graph, inputs = read(program.source, *program.sizes), inputs_of(program)
+    graph, inputs = read(program.source, *program.sizes), make_inputs(program)
     factors = evaluate(graph, inputs)["factors"]
     shaped = evaluate(graph, {key: array.reshape(2, 3, 4, -1) for key, array in inputs.items()})["factors"]
     single = evaluate(graph, {key: array[5] for key, array in inputs.items()})["factors"]
     empty = evaluate(graph, {key: array[:0] for key, array in inputs.items()})["factors"]
     np.testing.assert_allclose(shaped.reshape(factors.shape), factors, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(single, factors[5], rtol=1e-5, atol=1e-5)
-    assert empty.shape == (0, graph.factor_count)
+    assert empty.shape == (0, graph.n_factors)
     assert factors.dtype == np.float32
 
 
 @pytest.mark.parametrize("name", list(PROGRAMS)[::2])
 def test_jax_transformations_agree(name):
     program = PROGRAMS[name]
-    graph, inputs = read(program.source, *program.sizes), inputs_of(program)
+    graph, inputs = read(program.source, *program.sizes), make_inputs(program)
 
     def factors(inputs):
         return evaluate(graph, inputs, jnp)["factors"]
@@ -46,7 +46,7 @@ def test_jax_transformations_agree(name):
 
 def test_gradient_flows_through_factors():
     graph = read(
-        "import numpy as np\n" + phi("return [np.sum(observation ** 2, axis=1, keepdims=True) * action]"), 3, 1
+        "import numpy as np\n" + phi_source("return [np.sum(observation ** 2, axis=1, keepdims=True) * action]"), 3, 1
     )
 
     def factor(observation):
@@ -65,7 +65,7 @@ def test_gradient_flows_through_factors():
     ],
 )
 def test_integers_never_fail(expression, value):
-    graph = read("import numpy as np\n" + phi(f"return [{expression}]"), 2, 1)
+    graph = read("import numpy as np\n" + phi_source(f"return [{expression}]"), 2, 1)
     inputs = {"observation": np.ones((2, 2), np.float32), "action": np.ones((2, 1), np.float32)}
     for xp in (np, jnp):
         np.testing.assert_array_equal(evaluate(graph, inputs, xp)["factors"], np.full((2, 1), value, np.float32))

@@ -12,9 +12,9 @@ import numpy as np
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from helpers.corpus import benign, execute, hostile, recorded, varied
+from helpers.phi_programs import benign_programs, execute_program, hostile_programs, recorded_programs, varied_programs
 from lare_rl.phi.evaluate import evaluate
-from lare_rl.phi.graph import Refused
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.read import read
 from phi.test_numpy_functions import CASES
 
@@ -86,11 +86,15 @@ def numpy_factors(source, observation, action):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            whole, part = (execute(source, observation[:rows], action[:rows]) for rows in (7, 5))
+            all_rows, first_rows = (execute_program(source, observation[:rows], action[:rows]) for rows in (7, 5))
     except Exception:  # whatever NumPy says of it
         return None
-    same = whole.shape == (7, 1) and part.shape == (5, 1) and np.allclose(whole[:5], part, equal_nan=True)
-    return whole if same else None
+    same = (
+        all_rows.shape == (7, 1)
+        and first_rows.shape == (5, 1)
+        and np.allclose(all_rows[:5], first_rows, equal_nan=True)
+    )
+    return all_rows if same else None
 
 
 @BUDGET
@@ -100,7 +104,7 @@ def test_grammar_is_refused_or_agrees_with_numpy(source, seed):
     observation, action = generator.standard_normal((7, 6)), generator.standard_normal((7, 3))
     try:
         graph = read(source, 6, 3)
-    except Refused as refusal:
+    except RefusedError as refusal:
         assert refusal.code != "E-BUG", str(refusal)  # noqa: PT017
         event("refused")
         return
@@ -114,7 +118,10 @@ def test_grammar_is_refused_or_agrees_with_numpy(source, seed):
     np.testing.assert_allclose(factors, expected, rtol=1e-2 if "b" in source.split("int)")[1] else 1e-8, atol=1e-8)
 
 
-SOURCES = [(p.source, p.sizes) for p in (*recorded()[::9], *benign(), *varied()[::5], *hostile())]
+SOURCES = [
+    (p.source, p.sizes)
+    for p in (*recorded_programs()[::9], *benign_programs(), *varied_programs()[::5], *hostile_programs())
+]
 WORDS = sorted({word for source, _ in SOURCES for word in re.findall(r"\w+|[^\w\s]", source)})
 
 
@@ -125,17 +132,17 @@ def mutants(draw):
     chance = random.Random(draw(st.integers(0, 2**32)))
     lines = source.split("\n")
     for _ in range(chance.randint(1, 3)):
-        place = chance.randrange(len(lines))
+        line_index = chance.randrange(len(lines))
         other = chance.choice(SOURCES)[0].split("\n")
         match chance.randrange(4):
             case 0:
-                lines.insert(place, chance.choice(other))
+                lines.insert(line_index, chance.choice(other))
             case 1:
-                lines = lines[:place] + other[chance.randrange(len(other)) :]
+                lines = lines[:line_index] + other[chance.randrange(len(other)) :]
             case _:
-                words = re.findall(r"\w+|\s+|[^\w\s]", lines[place]) or [""]
+                words = re.findall(r"\w+|\s+|[^\w\s]", lines[line_index]) or [""]
                 words[chance.randrange(len(words))] = chance.choice(WORDS)
-                lines[place] = "".join(words)
+                lines[line_index] = "".join(words)
     return "\n".join(lines), sizes
 
 
@@ -145,7 +152,7 @@ def test_mutant_is_refused_or_its_rows_are_independent(mutant):
     source, sizes = mutant
     try:
         graph = read(source, *sizes)
-    except Refused as refusal:
+    except RefusedError as refusal:
         assert refusal.code != "E-BUG", str(refusal)  # noqa: PT017
         event("refused")
         return

@@ -3,20 +3,22 @@
 import numpy as np
 import pytest
 
-from helpers.corpus import benign, steps, varied
-from helpers.toys import phi
-from lare_rl.latent.function import entries_text
+from helpers.phi_programs import benign_programs, random_inputs, varied_programs
+from helpers.toy_envs import phi_source
+from lare_rl.latent.function import features_text
+from lare_rl.phi.builder import Builder
 from lare_rl.phi.evaluate import evaluate
-from lare_rl.phi.graph import UNLIMITED, Builder, Limits, Refused
+from lare_rl.phi.inline import inline
+from lare_rl.phi.limits import UNLIMITED, GraphLimits, RefusedError
 from lare_rl.phi.read import read
 
-PROGRAMS = {p.name: p for p in (*benign()[:6], *varied()[::9])}
+PROGRAMS = {p.name: p for p in (*benign_programs()[:6], *varied_programs()[::9])}
 
 
 def read_or_skip(program):
     try:
         return read(program.source, *program.sizes)
-    except Refused:
+    except RefusedError:
         pytest.skip("it is refused")
 
 
@@ -53,13 +55,20 @@ def test_kind_is_that_of_numpy(op, kinds, result):
 
 
 def test_rearrangements_of_rearrangements_are_one_gather():
-    graph = read(phi("return [observation.reshape(-1, 2, 3).transpose(0, 2, 1)[:, 1, ::-1][:, :1]]"), 6, 1)
+    graph = read(phi_source("return [observation.reshape(-1, 2, 3).transpose(0, 2, 1)[:, 1, ::-1][:, :1]]"), 6, 1)
     assert [node.op for node in graph.operations] == ["gather"]
     assert graph.operations[0].option.slices == (slice(4, 5, 1),)
 
 
 @pytest.mark.parametrize(
-    "limits", [Limits(array=4), Limits(operations=3), Limits(chain=3), Limits(work=999), Limits(numbers=5)]
+    "limits",
+    [
+        GraphLimits(array=4),
+        GraphLimits(operations=3),
+        GraphLimits(chain=3),
+        GraphLimits(work=999),
+        GraphLimits(numbers=5),
+    ],
 )
 def test_limit_is_checked(limits):
     builder = Builder(limits)
@@ -70,7 +79,7 @@ def test_limit_is_checked(limits):
             x = builder.elementwise("sin", x)
         builder.finish({"y": x})
 
-    with pytest.raises(Refused, match=r"at most|too much"):
+    with pytest.raises(RefusedError, match=r"at most|too much"):
         build()
 
 
@@ -78,7 +87,7 @@ def test_limit_is_checked(limits):
 def test_entries_that_are_not_read_do_not_matter(name):
     program = PROGRAMS[name]
     graph = read_or_skip(program)
-    observation, action = steps(program.sizes, rows=5)
+    observation, action = random_inputs(program.sizes, rows=5)
     factors = evaluate(graph, {"observation": observation, "action": action}, dtype=np.float64)["factors"]
     for number, entries in enumerate(graph.entries_read("factors")):
         changed = {}
@@ -91,11 +100,11 @@ def test_entries_that_are_not_read_do_not_matter(name):
 
 
 def test_entries_read_are_exact_through_whole_arrays():
-    source = "import numpy as np\n" + phi(
+    source = "import numpy as np\n" + phi_source(
         "x = np.tanh(observation * 2)\nsorted_x = np.sort(x[:, 4:], axis=1)\n"
         "return [x[:, 2:3] + x[:, 5:6], sorted_x[:, :1] * action, np.where(x > 0, x, 1)[:, [0]]]"
     )
-    texts = [entries_text(entries) for entries in read(source, 7, 1).entries_read("factors")]
+    texts = [features_text(entries) for entries in read(source, 7, 1).entries_read("factors")]
     assert texts == ["observation[2, 5]", "observation[4:7], action[0]", "observation[0]"]
 
 
@@ -103,12 +112,12 @@ def test_entries_read_are_exact_through_whole_arrays():
 def test_inlined_graph_computes_each_of_several_rows(name):
     program = PROGRAMS[name]
     graph = read_or_skip(program)
-    observation, action = (array.reshape(4, 3, -1) for array in steps(program.sizes, rows=12))
+    observation, action = (array.reshape(4, 3, -1) for array in random_inputs(program.sizes, rows=12))
     builder = Builder(UNLIMITED)
     inputs = {
         key: builder.input(key, (3, size)) for key, size in zip(("observation", "action"), program.sizes, strict=True)
     }
-    outer = builder.finish(builder.inline(graph, inputs, rows=3))
+    outer = builder.finish(inline(builder, graph, inputs, rows=3))
     arrays = {"observation": observation, "action": action}
     for_rows = evaluate(outer, arrays, dtype=np.float64)["factors"]
     np.testing.assert_allclose(for_rows, evaluate(graph, arrays, dtype=np.float64)["factors"], rtol=1e-12, atol=1e-12)

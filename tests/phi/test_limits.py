@@ -5,15 +5,15 @@ import threading
 import pytest
 
 from helpers.attacks import ATTACKS
-from helpers.toys import phi
-from lare_rl.phi.graph import Refused
+from helpers.toy_envs import phi_source
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.parse import parse
 from lare_rl.phi.read import read
 
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attack_is_refused(name):
-    with pytest.raises(Refused) as refusal:
+    with pytest.raises(RefusedError) as refusal:
         read(ATTACKS[name], 17, 6)
     assert refusal.value.code not in ("E-BUG", "E-FORM")  # E-FORM: it ran to its end
 
@@ -25,7 +25,7 @@ def test_parser_survives_in_a_thread_with_a_small_stack(name):
     def attack():
         try:
             parse(ATTACKS[name])
-        except Refused as refusal:
+        except RefusedError as refusal:
             refusals.append(refusal)
 
     before = threading.stack_size(256 << 10)
@@ -39,10 +39,10 @@ def test_parser_survives_in_a_thread_with_a_small_stack(name):
 
 
 def test_refusal_cannot_be_caught():
-    source = phi(
+    source = phi_source(
         "try:\n    x = observation.mean(axis=0)\nexcept Exception:\n    x = 0\nfinally:\n    return [action[:, :1]]"
     )
-    with pytest.raises(Refused, match="E-ROWS"):
+    with pytest.raises(RefusedError, match="E-ROWS"):
         read(source, 17, 6)
 
 
@@ -61,4 +61,4 @@ assert "0x" not in text + str(A()) + str([A]) + repr(len) + f"{A}"
 def evaluation_func(observation, action):
     return [action[:, :1]]
 """
-    assert read(source, 17, 6).factor_count == 1
+    assert read(source, 17, 6).n_factors == 1

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from helpers.toys import PHI, phi
+from helpers.toy_envs import PHI, phi_source
 from lare_rl.phi.names import factor_meanings, factor_names
 
 
@@ -14,25 +14,29 @@ from lare_rl.phi.names import factor_meanings, factor_names
     ("source", "count", "names"),
     [
         (PHI, 2, ["f_near", "f_effort"]),
-        (phi("return [-action, action]"), 2, ["factor_1", "action"]),
-        (phi("return (action, -action)"), 2, ["action", "factor_2"]),
-        (phi("factors = [action, -action]\nreturn factors"), 2, ["action", "factor_2"]),
-        (phi("factors = [action, observation]\nreturn [f[:, :1] for f in factors]"), 2, ["action", "observation"]),
+        (phi_source("return [-action, action]"), 2, ["factor_1", "action"]),
+        (phi_source("return (action, -action)"), 2, ["action", "factor_2"]),
+        (phi_source("factors = [action, -action]\nreturn factors"), 2, ["action", "factor_2"]),
+        (
+            phi_source("factors = [action, observation]\nreturn [f[:, :1] for f in factors]"),
+            2,
+            ["action", "observation"],
+        ),
         # Where the list is not written out, or not once, or not at the end, or not as long, there are no names in it.
-        (phi("factors = [action]\nfactors = [action, -action]\nreturn factors"), 2, ["factor_1", "factor_2"]),
-        (phi("factors = [action]\nfactors.append(action)\nreturn factors"), 2, ["factor_1", "factor_2"]),
-        (phi("factors = [action]\nreturn [f for f in factors if True]"), 1, ["factor_1"]),
-        (phi("return [action] * 2"), 2, ["factor_1", "factor_2"]),
-        (phi("if True:\n    return [action]"), 1, ["factor_1"]),
-        (phi("return [x for x in (action, action)]"), 2, ["factor_1", "factor_2"]),
-        (phi("return action"), 1, ["factor_1"]),
+        (phi_source("factors = [action]\nfactors = [action, -action]\nreturn factors"), 2, ["factor_1", "factor_2"]),
+        (phi_source("factors = [action]\nfactors.append(action)\nreturn factors"), 2, ["factor_1", "factor_2"]),
+        (phi_source("factors = [action]\nreturn [f for f in factors if True]"), 1, ["factor_1"]),
+        (phi_source("return [action] * 2"), 2, ["factor_1", "factor_2"]),
+        (phi_source("if True:\n    return [action]"), 1, ["factor_1"]),
+        (phi_source("return [x for x in (action, action)]"), 2, ["factor_1", "factor_2"]),
+        (phi_source("return action"), 1, ["factor_1"]),
         (PHI, 3, ["factor_1", "factor_2", "factor_3"]),
-        (phi("return []"), 0, []),
+        (phi_source("return []"), 0, []),
         ("x = 1", 1, ["factor_1"]),
         ("not (Python", 1, ["factor_1"]),
         # Another function's list is not this one's.
         (
-            "def helper(a, b):\n    return [a, b]\n\n" + phi("return [observation, action]"),
+            "def helper(a, b):\n    return [a, b]\n\n" + phi_source("return [observation, action]"),
             2,
             ["observation", "action"],
         ),
@@ -57,16 +61,16 @@ def test_factor_names(source, count, names):
     ],
 )
 def test_factor_meanings_comment_above_an_assignment(lines, meaning):
-    assert factor_meanings(phi(f"{lines}\nx = action\nreturn [x]"), ["x"]) == [meaning]
+    assert factor_meanings(phi_source(f"{lines}\nx = action\nreturn [x]"), ["x"]) == [meaning]
 
 
 def test_factor_meanings_of_other_comments():
-    source = phi("# not this one\n\nx = action\ny = action  # nor this\nx[0] = 1\n# nor that\nreturn [x, y]")
+    source = phi_source("# not this one\n\nx = action\ny = action  # nor this\nx[0] = 1\n# nor that\nreturn [x, y]")
     assert factor_meanings(source, ["x", "y"]) == ["", ""]
 
 
 def test_factor_meanings_of_the_last_assignment():
-    assert factor_meanings(phi("# first\nx = action\n# then\nx = -x\nreturn [x]"), ["x"]) == ["then"]
+    assert factor_meanings(phi_source("# first\nx = action\n# then\nx = -x\nreturn [x]"), ["x"]) == ["then"]
 
 
 def test_factor_meanings_of_several():
@@ -77,13 +81,13 @@ def test_factor_meanings_of_several():
 def test_factor_meanings_above_the_first_of_several_lines():
     """Such a comment must be numbered."""
     body = "# 1. how near\nd = action\nx = -d\n# 2. effort\ny = action\nz = x\n# not numbered\ne = x\nw = e\nreturn [x, y, z, w]"
-    assert factor_meanings(phi(body), ["x", "y", "z", "w"]) == ["how near", "effort", "", ""]
+    assert factor_meanings(phi_source(body), ["x", "y", "z", "w"]) == ["how near", "effort", "", ""]
 
 
 def test_factor_names_in_threads():
     """As several candidates are read. JAX has such a hook in the garbage collector too."""
-    source = phi("\n".join(["action = action + (1 + (2 + (3 + (4 + action))))"] * 20) + "\nreturn [action]")
-    usual = gc.get_threshold()
+    source = phi_source("\n".join(["action = action + (1 + (2 + (3 + (4 + action))))"] * 20) + "\nreturn [action]")
+    threshold = gc.get_threshold()
     threads = ThreadPoolExecutor(8)
 
     def let_another_go_on(phase, info):
@@ -94,7 +98,7 @@ def test_factor_names_in_threads():
     try:
         names = list(threads.map(lambda _: factor_names(source, 1), range(200)))
     finally:
-        gc.set_threshold(*usual)
+        gc.set_threshold(*threshold)
         gc.callbacks.remove(let_another_go_on)
         threads.shutdown()
     assert names == [["action"]] * 200

@@ -6,7 +6,7 @@ Expressions are separated by | and by the ends of lines; ¦ stands for the opera
 import numpy as np
 import pytest
 
-from helpers.corpus import execute, steps
+from helpers.phi_programs import execute_program, random_inputs
 from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.numpy_functions import FUNCTIONS
 from lare_rl.phi.read import read
@@ -173,10 +173,10 @@ CASES = [
 @pytest.mark.parametrize("expression", CASES)
 def test_function_agrees_with_numpy(expression):
     expression = expression.replace("¦", "|")
-    observation, action = steps((6, 3), rows=9)
+    observation, action = random_inputs((6, 3), rows=9)
     width = (
         np.size(
-            execute(
+            execute_program(
                 SETUP.format(expression, 1).replace(
                     "np.sum(z.reshape(len(x), -1) * np.arange(1, 1 + 1), axis=1, keepdims=True)",
                     "z.reshape(len(x), -1)",
@@ -189,14 +189,16 @@ def test_function_agrees_with_numpy(expression):
     )
     source = SETUP.format(expression, width)
     result = evaluate(read(source, 6, 3), {"observation": observation, "action": action}, dtype=np.float64)["factors"]
-    np.testing.assert_allclose(result, execute(source, observation, action), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(result, execute_program(source, observation, action), rtol=1e-9, atol=1e-9)
 
 
 def test_every_function_is_tried():
     """Each registered name, or another name of the same function, is in an expression above or in a program of the corpus."""
-    from helpers.corpus import benign, recorded, varied
+    from helpers.phi_programs import benign_programs, recorded_programs, varied_programs
 
-    text = "\n".join([*EXPRESSIONS.values(), *(p.source for p in (*recorded(), *benign(), *varied()))])
+    text = "\n".join(
+        [*EXPRESSIONS.values(), *(p.source for p in (*recorded_programs(), *benign_programs(), *varied_programs()))]
+    )
     names_by_function = {}
     for name, function in FUNCTIONS.items():
         names_by_function.setdefault(function, []).append(name)

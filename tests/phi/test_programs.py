@@ -5,10 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.corpus import benign, execute, mended, recorded, steps, varied
-from helpers.tiers import long
+from helpers.long_tests import long_case
+from helpers.phi_programs import (
+    benign_programs,
+    execute_program,
+    random_inputs,
+    recorded_programs,
+    repaired_programs,
+    varied_programs,
+)
 from lare_rl.phi.evaluate import evaluate
-from lare_rl.phi.graph import Refused
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.read import read
 
 REFUSED = {
@@ -25,8 +32,8 @@ REFUSED = {
     "c_hospital_beds_beginner": "a loop over the rows",
 }
 """Varied programs that are refused, and why."""
-PROGRAMS = {p.name: p for p in (*benign(), *varied(), *recorded()) if p.name not in REFUSED}
-IN_SHORT = {p.name for p in (*benign(), *varied(), *recorded()[::8])}
+PROGRAMS = {p.name: p for p in (*benign_programs(), *varied_programs(), *recorded_programs()) if p.name not in REFUSED}
+IN_SHORT = {p.name for p in (*benign_programs(), *varied_programs(), *recorded_programs()[::8])}
 SINGLE = ("float32", "single", "float16")
 """Programs with these words compute in single precision here and there. Graphs do not follow that."""
 
@@ -37,14 +44,16 @@ def check_equal(result, expected, tolerance):
     assert same.all(), (result[~same][:3], expected[~same][:3])
 
 
-@pytest.mark.parametrize("name", [name if name in IN_SHORT else long(name) for name in PROGRAMS])
+@pytest.mark.parametrize("name", [name if name in IN_SHORT else long_case(name) for name in PROGRAMS])
 def test_program_agrees_with_numpy(name):
     program = PROGRAMS[name]
     graph = read(program.source, *program.sizes)
     for seed, scale in ((0, 1.0), (1, 10.0), (2, 0.0)):
-        observation, action = (np.float32(scale) * array for array in steps(program.sizes, seed=seed, dtype=np.float32))
+        observation, action = (
+            np.float32(scale) * array for array in random_inputs(program.sizes, seed=seed, dtype=np.float32)
+        )
         exact = evaluate(graph, {"observation": observation, "action": action}, dtype=np.float64)["factors"]
-        expected = execute(program.source, observation.astype(np.float64), action.astype(np.float64))
+        expected = execute_program(program.source, observation.astype(np.float64), action.astype(np.float64))
         check_equal(exact, expected, 1e-6 if any(word in program.source for word in SINGLE) else 1e-9)
 
 
@@ -52,7 +61,7 @@ def test_program_agrees_with_numpy(name):
 def test_program_agrees_in_jax(name):
     program = PROGRAMS[name]
     graph = read(program.source, *program.sizes)
-    inputs = dict(zip(("observation", "action"), steps(program.sizes, dtype=np.float32), strict=True))
+    inputs = dict(zip(("observation", "action"), random_inputs(program.sizes, dtype=np.float32), strict=True))
     compiled = jax.jit(lambda inputs: evaluate(graph, inputs, jnp)["factors"])
     expected = evaluate(graph, inputs)["factors"]
     result = np.asarray(compiled(inputs))
@@ -64,17 +73,17 @@ def test_program_agrees_in_jax(name):
 
 @pytest.mark.parametrize("name", sorted(REFUSED))
 def test_program_is_refused(name):
-    program = next(p for p in varied() if p.name == name)
-    with pytest.raises(Refused, match=r"^E-[A-Z]+ line \d+: "):
+    program = next(p for p in varied_programs() if p.name == name)
+    with pytest.raises(RefusedError, match=r"^E-[A-Z]+ line \d+: "):
         read(program.source, *program.sizes)
 
 
-@pytest.mark.parametrize("name", [entry["name"] for entry in mended()])
+@pytest.mark.parametrize("name", [entry["name"] for entry in repaired_programs()])
 def test_refusal_was_enough_to_mend_the_program(name):
     """A language model that saw a refused program and the errors, and nothing else, wrote `mended.json`, each at the first try."""
-    entry = next(entry for entry in mended() if entry["name"] == name)
-    program = next(p for p in varied() if p.name == name)
+    entry = next(entry for entry in repaired_programs() if entry["name"] == name)
+    program = next(p for p in varied_programs() if p.name == name)
     graph = read(entry["code"], *program.sizes)
-    observation, action = steps(program.sizes)
+    observation, action = random_inputs(program.sizes)
     factors = evaluate(graph, {"observation": observation, "action": action}, dtype=np.float64)["factors"]
-    check_equal(factors, execute(program.source, observation, action), 1e-6)
+    check_equal(factors, execute_program(program.source, observation, action), 1e-6)

@@ -9,7 +9,7 @@ import operator
 import numpy as np
 import pytest
 
-from helpers.toys import phi
+from helpers.toy_envs import phi_source
 from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.read import read
 
@@ -42,7 +42,7 @@ EXPRESSIONS = """
 @pytest.mark.parametrize("expression", [e.strip() for e in EXPRESSIONS.replace("\n", "|").split("|") if e.strip()])
 def test_number_is_that_of_python(expression):
     imports = "".join(f"import {name}\n" for name in MODULES)
-    graph = read(imports + phi(f"return [observation[:, :1] * 0 + {expression}]"), 17, 6)
+    graph = read(imports + phi_source(f"return [observation[:, :1] * 0 + {expression}]"), 17, 6)
     inputs = {"observation": np.ones((2, 17)), "action": np.ones((2, 6))}
     factors = evaluate(graph, inputs, dtype=np.float64)["factors"]
     np.testing.assert_allclose(factors, float(eval(expression, dict(MODULES))), rtol=1e-15)

@@ -1,52 +1,58 @@
-"""What pictures show of long episodes."""
-
 import re
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from lare_rl.compare.statistics import Band
-from lare_rl.report import figures
-from lare_rl.report.figures import window
+from lare_rl.report.figures import (
+    add_white_background,
+    draw_band_panels,
+    draw_bands,
+    draw_credit,
+    draw_curves,
+    visible_steps,
+)
+from lare_rl.util.statistics import Band
+
+X = np.arange(3.0)
 
 
 @pytest.mark.parametrize(
-    ("steps", "first", "end"), [(1, 0, 1), (30, 0, 30), (100, 0, 100), (101, 0, 100), (1000, 450, 550)]
+    ("length", "first", "end"), [(1, 0, 1), (30, 0, 30), (100, 0, 100), (101, 0, 100), (1000, 450, 550)]
 )
-def test_as_many_steps_as_can_be_told_apart(steps, first, end):
-    assert window(steps) == slice(first, end)
+def test_visible_steps(length, first, end):
+    assert visible_steps(length) == slice(first, end)
 
 
-def test_a_long_legend_makes_the_picture_higher_not_its_curves_smaller():
+def test_long_legend_makes_figure_higher():
+    """It does not make the curves smaller."""
+
     def size(labels):
-        x = np.arange(3.0)
-        drawn = figures.bands(dict.fromkeys(labels, Band(x, x, x, x)), "x", "y")
-        return [float(found) for found in re.search(r'viewBox="0 0 (\S+) (\S+)"', drawn).groups()]
+        svg = draw_bands(dict.fromkeys(labels, Band(X, X, X, X)), "x", "y")
+        return [float(number) for number in re.search(r'viewBox="0 0 (\S+) (\S+)"', svg).groups()]
 
-    short, long = (
-        size(["a", "b"]),
-        size([f"a method that is told apart by all of its settings, number {n}" for n in range(12)]),
-    )
+    short = size(["a", "b"])
+    long = size([f"a method whose label lists all of its settings one after the other, number {n}" for n in range(12)])
     assert long[0] == pytest.approx(short[0], rel=0.05)
     assert long[1] > short[1] + 100
 
 
-def test_a_picture_of_a_page_has_a_background():
-    """Readers of a dark page see it too. The rest of the drawing stays the same."""
-    drawn = figures.curves({"a": (np.arange(3.0), np.zeros((1, 3)))}, "return")
-    white = figures.on_white(drawn)
-    root, background, *others = ElementTree.fromstring(white).iter()
+def test_white_background():
+    """The rest of the drawing stays the same."""
+    svg = draw_curves({"a": (X, np.zeros((1, 3)))}, "return")
+    root, background, *rest = ElementTree.fromstring(add_white_background(svg)).iter()
     assert (background.tag.rpartition("}")[2], background.attrib["fill"]) == ("rect", "#ffffff")
-    parts = [root, *others]
-    assert [(part.tag, part.attrib) for part in parts] == [
-        (part.tag, part.attrib) for part in ElementTree.fromstring(drawn).iter()
-    ]
+    elements = [(element.tag, element.attrib) for element in (root, *rest)]
+    assert elements == [(element.tag, element.attrib) for element in ElementTree.fromstring(svg).iter()]
 
 
-def test_panels_share_their_names_and_have_their_titles():
-    x = np.arange(3.0)
-    panels = {title: {"one": Band(x, x, x, x), "other": Band(x, 2 * x, x, 3 * x)} for title in ("td3", "sac", "ppo")}
-    drawn = figures.bands_side_by_side(panels, "environment steps", "true return")
+def test_panels_share_legend_and_labels():
+    panels = {title: {"one": Band(X, X, X, X), "other": Band(X, 2 * X, X, 3 * X)} for title in ("td3", "sac", "ppo")}
+    svg = draw_band_panels(panels, "environment steps", "true return")
     for text in (*panels, "one", "other", "environment steps", "true return"):
-        assert drawn.count(f">{text}</text>") == 1, text
+        assert svg.count(f">{text}</text>") == 1, text
+
+
+def test_credit_without_true_rewards():
+    assert ">true reward</text>" not in draw_credit(None, X)
+    assert ">true reward</text>" in draw_credit(X, X, uncertainty=X)

@@ -1,33 +1,60 @@
-"""What a run's files say of it."""
+"""The run directory: latent functions of old runs, metrics, and locks."""
 
 import json
+import os
 
+import numpy as np
 import pytest
 
-from helpers.toys import pick_spec, toy_spec
-from lare_rl.config.resolve import decide
+from helpers.toy_envs import PHI, toy_spec
+from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
-from lare_rl.runs.directory import Run, describe
+from lare_rl.latent.function import verify_function
+from lare_rl.runs.directory import RunBusyError, as_run, create_run, lock_run, open_run
+from lare_rl.runs.metrics_file import append_metrics, read_metrics, truncate_metrics
 
-QMIX = "the policy has not been updated in 90 steps: qmix needs 128 finished episodes for its first update (qmix.batch_size)"
-RANDOM = "all 50 steps so far were random (td3.warmup is 60)"
+
+@pytest.fixture
+def run(tmp_path):
+    settings = resolve(Settings(method="lare-rrdu", steps=100), toy_spec())
+    return create_run(tmp_path / "run", toy_spec(), settings, [verify_function(PHI, toy_spec())])
 
 
-@pytest.mark.parametrize(
-    ("settings", "step", "loss", "said"),
-    [
-        ({"td3": {"warmup": 60}}, 50, {}, RANDOM),
-        ({"td3": {"warmup": 60}}, 50, {"critic/loss": None}, RANDOM),
-        ({"td3": {"warmup": 60}}, 90, {"critic/loss": 0.0}, None),
-        ({"algorithm": "qmix", "method": "dense"}, 90, {}, QMIX),
-        ({"algorithm": "qmix", "method": "dense"}, 90, {"critic/loss/prey": 2.0}, None),
-    ],
-)
-def test_why_a_policy_has_not_been_updated(tmp_path, settings, step, loss, said):
-    spec = pick_spec() if "algorithm" in settings else toy_spec()
-    run = Run(tmp_path, describe(spec, decide(Settings(**{"method": "dense", "steps": 100} | settings), spec), ()), ())
-    assert run.untrained is None  # nothing is known yet
-    (tmp_path / "metrics.jsonl").write_text(
-        json.dumps({"step": step, "seed": 0, "evaluation/return": 1.0, **loss}) + "\n"
-    )
-    assert run.untrained == said
+def test_open_run_equals_created(run):
+    opened = open_run(run.directory)
+    assert opened.config == run.config
+    assert opened.function.digest == run.function.digest
+    assert as_run(run) is run
+
+
+def test_function_that_was_replaced_during_run(run):
+    """Format 4 had runs that replaced phi. The checkpoint has the hash of the one in use."""
+    new = verify_function(PHI.replace("near", "close"), toy_spec())
+    new.save(run.directory / "latent_function-600.py")
+    assert open_run(run.directory).function.digest == run.function.digest
+    (run.directory / "checkpoint").mkdir()
+    host = {"step": 900, "functions_since": 600, "function_sha256": [new.digest]}
+    np.savez(run.checkpoint / "state.npz", host=np.array(json.dumps(host)))
+    assert open_run(run.directory).function.digest == new.digest
+
+
+def test_metrics_are_parsed_once_per_file_state(run, monkeypatch):
+    line = {"step": 50, "seed": 0, "evaluation/return": 1.0}
+    n_bytes = append_metrics(run.directory, [line])
+    first, second = run.metrics(), run.metrics()
+    assert first == second == [line]
+    assert first[0] is second[0]
+    append_metrics(run.directory, [line | {"step": 100}])
+    assert [line["step"] for line in run.metrics()] == [50, 100]
+    truncate_metrics(run.directory, n_bytes)
+    assert run.metrics() == [line]
+    path = run.directory / "metrics.jsonl"
+    stat = path.stat()
+    path.write_text(json.dumps(line | {"evaluation/return": 2.0}) + "\n")  # of the same size
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns + 1))
+    assert read_metrics(run.directory)[0]["evaluation/return"] == 2.0
+
+
+def test_lock_refuses_second_process(run):
+    with lock_run(run), pytest.raises(RunBusyError, match="another process"), lock_run(run):
+        pass

@@ -1,4 +1,4 @@
-"""Episodes are predicted before they are learned from; sums are those from scratch, whatever the scales have been."""
+"""Returns are predicted before they are learned from, and sufficient statistics are those from scratch."""
 
 from dataclasses import replace
 from functools import partial
@@ -8,173 +8,188 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.recipes import (
+from helpers.long_tests import long_case
+from helpers.small_configs import (
     LENGTHS,
-    RIVALS,
-    TOGETHER,
-    config_of,
-    every_step,
-    factors_for,
+    ONE_TEAM,
+    TWO_TEAMS,
+    add_steps,
     jitted,
-    paid_by,
-    steps_of,
-    stored,
-    untrained,
-    with_steps,
+    learner_with_episodes,
+    random_factors,
+    random_steps,
+    reward_state,
+    small_config,
+    stored_steps,
+    untrained_learner,
 )
-from helpers.tiers import long
 from lare_rl.credit import closed_form, decomposition, returns
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.returns import FormFound
+from lare_rl.credit.score_type import ScoreTypeEstimate
 from lare_rl.data import replay
 from lare_rl.training import episodes
-from lare_rl.training import learner as common
-from lare_rl.training.episodes import learn_returns, sum_again
+from lare_rl.training.decoder_inputs import decoder_inputs
+from lare_rl.training.episodes import learn_returns
+from lare_rl.training.rewards import rewards
 
 LONG = LENGTHS * 8
 """Lengths of many episodes."""
 
 
-def grown(steps, factor):
-    """Observations that get larger, as those of a policy that learns do."""
+def with_growing_observations(steps, factor):
+    """Return steps whose observations get larger, as those of a policy that learns do."""
     growth = np.linspace(1, factor, len(steps.ended))[:, None, None, None]
 
-    def larger(shown):
-        return shown._replace(observation=(shown.observation * growth).astype(np.float32))
+    def scale(timestep):
+        return timestep._replace(observation=(timestep.observation * growth).astype(np.float32))
 
-    return steps._replace(before=larger(steps.before), after=larger(steps.after))
+    return steps._replace(timestep=scale(steps.timestep), next_timestep=scale(steps.next_timestep))
 
 
-def in_pieces(config, steps, factors, pieces):
-    """A learner that has met steps in so many pieces; what it was after each."""
-    learner = untrained(config)
-    for rows in np.array_split(np.arange(len(steps.ended)), pieces):
-        rows_of = jax.tree.map(lambda leaf, rows=rows: leaf[rows], steps)
-        learner = with_steps(learner, config, rows_of, factors[rows], tell=True)
+def learn_in_chunks(config, steps, factors, n_chunks):
+    """Yield the learner after each chunk of the steps."""
+    learner = untrained_learner(config)
+    for rows in np.array_split(np.arange(len(steps.ended)), n_chunks):
+        chunk = jax.tree.map(lambda leaf, rows=rows: leaf[rows], steps)
+        learner = add_steps(learner, config, chunk, factors[rows], learn=True)
         yield learner
 
 
-added_up = jax.jit(closed_form.whole)
+to_float64 = jax.jit(closed_form.to_float64)
 
 
-def whole(learner):
+def statistics_of_decoder(learner):
     with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, added_up(learner.credit[0].closed.summed))
+        return jax.tree.map(np.asarray, to_float64(learner.credit[0].closed_form.sufficient_statistics))
 
 
-def from_scratch(learner, config):
-    """The sums over all stored episodes, of features standardised as the learner's are."""
-    one = learner.credit[0]
-    empty = one._replace(closed=one.closed._replace(summed=jax.tree.map(jnp.zeros_like, one.closed.summed)))
+def statistics_from_scratch(learner, config):
+    """Return sums over all stored episodes, of features standardised as the learner's are."""
+    decoder = learner.credit[0]
+    empty = decoder._replace(
+        closed_form=decoder.closed_form._replace(
+            sufficient_statistics=jax.tree.map(jnp.zeros_like, decoder.closed_form.sufficient_statistics)
+        )
+    )
     with jax.enable_x64(True):
-        summed = jitted(add_all, config)((empty,), learner.replay)
-        return added_up(summed[0].closed.summed)
+        rebuilt = jitted(add_all, config)((empty,), learner.replay)
+        return to_float64(rebuilt[0].closed_form.sufficient_statistics)
 
 
-def add_all(credit, buffer, config):
-    return episodes.pieces(credit, buffer, jnp.zeros_like(buffer.oldest), returns.add_episodes, config)
+def add_all(decoders, buffer, config):
+    return episodes.fold_episodes(decoders, buffer, jnp.zeros_like(buffer.oldest), returns.add_episodes, config)
 
 
 @pytest.mark.parametrize(
-    "env", [pytest.param(None, marks=pytest.mark.long, id="one"), pytest.param(TOGETHER, id="many")]
+    "env", [pytest.param(None, marks=pytest.mark.long, id="one"), pytest.param(ONE_TEAM, id="many")]
 )
-@pytest.mark.parametrize("method", ["lare-bayes", long("rd-linear")])
-def test_sums_are_those_from_scratch_whatever_the_scales_have_been(method, env):
-    """Observations grow a hundredfold while they come in."""
-    config = config_of(method, capacity=1000) if env is None else config_of(method, "ippo", env, capacity=1000)
-    steps = grown(steps_of(config.env, lengths=LONG), 100)
-    taken = set()
-    for learner in in_pieces(config, steps, factors_for(config, steps), 40):
-        closed = learner.credit[0].closed
-        taken.add(float(closed.steps))
-        assert float(closed.steps) >= float(learner.credit[0].statistics.rows) / closed_form.GROWTH_OF_SUMS - 3 * 12
-        for a, b in zip(whole(learner), from_scratch(learner, config), strict=True):
+@pytest.mark.parametrize("method", ["lare-bayes", long_case("rd-linear")])
+def test_learn_returns_keeps_the_statistics_from_scratch(method, env):
+    config = small_config(method, capacity=1000) if env is None else small_config(method, "ippo", env, capacity=1000)
+    steps = with_growing_observations(random_steps(config.env, lengths=LONG), 100)
+    n_steps = set()
+    for learner in learn_in_chunks(config, steps, random_factors(config, steps), 40):
+        closed = learner.credit[0].closed_form
+        n_steps.add(float(closed.n_steps))
+        assert (
+            float(closed.n_steps) >= float(learner.credit[0].statistics.n_rows) / closed_form.STATISTICS_GROWTH - 3 * 12
+        )
+        for a, b in zip(statistics_of_decoder(learner), statistics_from_scratch(learner, config), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)  # features are of float32
-    assert float(whole(learner).episodes) == len(LONG)
-    assert 5 < len(taken) < 25
+    assert float(statistics_of_decoder(learner).n_episodes) == len(LONG)
+    assert 5 < len(n_steps) < 25
 
 
-def test_summing_again_takes_new_scales():
-    config = config_of("rd-linear")
-    learner = stored(config)
+def test_rebuild_statistics_standardises_by_the_newest_statistics():
+    config = small_config("rd-linear")
+    learner = learner_with_episodes(config)
     statistics = learner.credit[0].statistics
     credit = (learner.credit[0]._replace(statistics=statistics._replace(mean=statistics.mean + 1)),)
     with jax.enable_x64(True):
-        summed = jax.jit(partial(sum_again, config=config))(credit, learner.replay, jnp.array(True))
-        same = jax.jit(partial(sum_again, config=config))(credit, learner.replay, jnp.array(False))
-    np.testing.assert_allclose(summed[0].closed.decoder.mean, statistics.mean + 1)
-    moved = np.asarray(1 / summed[0].closed.decoder.deviation)
-    before, after = whole(learner), whole(learner._replace(credit=summed))
-    np.testing.assert_allclose(after.mean[:-2], before.mean[:-2] - moved, atol=1e-5)
+        rebuilt = jax.jit(partial(episodes._rebuild_statistics, config=config))(credit, learner.replay, jnp.array(True))
+        same = jax.jit(partial(episodes._rebuild_statistics, config=config))(credit, learner.replay, jnp.array(False))
+    np.testing.assert_allclose(rebuilt[0].closed_form.decoder.mean, statistics.mean + 1)
+    shift = np.asarray(1 / rebuilt[0].closed_form.decoder.std)
+    before, after = map(statistics_of_decoder, (learner, learner._replace(credit=rebuilt)))
+    np.testing.assert_allclose(after.mean[:-2], before.mean[:-2] - shift, atol=1e-5)
     for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(credit), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_the_replay_may_have_forgotten_what_the_sums_know():
-    """Where rows have run out, only what is still stored is summed again."""
-    config = config_of("lare-linear", capacity=60)
-    steps = steps_of(lengths=LONG)
-    learner = list(in_pieces(config, steps, factors_for(config, steps), 40))[-1]
-    assert 3 <= float(whole(learner).episodes) < len(LONG)
-    assert learner.counted.tolist() == [len(LONG)]
+def test_learn_returns_rebuilds_from_stored_episodes_only():
+    config = small_config("lare-linear", capacity=60)
+    steps = random_steps(lengths=LONG)
+    learner = list(learn_in_chunks(config, steps, random_factors(config, steps), 40))[-1]
+    assert 3 <= float(statistics_of_decoder(learner).n_episodes) < len(LONG)
+    assert learner.n_learned.tolist() == [len(LONG)]
 
 
-def features_from(buffer, begin, config):
-    """Of twelve steps, the most that an episode has; where there are no more steps, of others."""
-    number = begin + jnp.arange(12)
-    return common.features(replay.read(buffer, replay.Index(jnp.zeros_like(number), number)), config, 0)
+def inputs_from(buffer, start, config):
+    """Return the decoder's inputs of the next twelve steps, as many as the longest episode has."""
+    number = start + jnp.arange(12)
+    return decoder_inputs(replay.read(buffer, replay.Index(jnp.zeros_like(number), number)), config, 0)
 
 
-@pytest.mark.parametrize("method", [long("lare-linear"), "lare-rd", "bayes", "lare-signs"])
-def test_returns_are_predicted_before_they_are_learned_from(method):
-    """The first episodes are not: nothing has been fitted yet. A decoder that descends learns nothing here at all."""
-    config, lengths = config_of(method, capacity=1000), (5, 12) * 3
-    steps = steps_of(lengths=lengths)
-    factors = factors_for(config, steps)
-    ends, learner, remembered = np.cumsum(lengths), untrained(config), []
-    for begin, end in zip([0, *ends], ends, strict=False):
-        rows = jax.tree.map(lambda leaf, begin=begin, end=end: leaf[begin:end], steps)
+@pytest.mark.parametrize("method", [long_case("lare-linear"), "lare-rd", "bayes", "lare-signs"])
+def test_learn_returns_predicts_first(method):
+    # The first episodes are not predicted, because nothing is fitted yet. Gradient updates are not made here at all.
+    config, lengths = small_config(method, capacity=1000), (5, 12) * 3
+    steps = random_steps(lengths=lengths)
+    factors = random_factors(config, steps)
+    ends, learner, predictions = np.cumsum(lengths), untrained_learner(config), []
+    for start, end in zip([0, *ends], ends, strict=False):
+        rows = jax.tree.map(lambda leaf, start=start, end=end: leaf[start:end], steps)
         before = learner.credit[0]
-        learner = with_steps(learner, config, rows, factors[begin:end], tell=True)
-        known = learner.credit[0].predictions
-        if int(known.episodes) > int(before.predictions.episodes):
-            place = int(known.episodes) - 1
-            seen = jitted(features_from, config)(learner.replay, begin)[: end - begin]
-            r_hat = decomposition.proxy_rewards(before, seen, config.credit, jnp.full(end - begin, end - begin))
-            remembered.append((float(known.predicted[place, 0]), float(r_hat.sum())))
-            assert float(known.returns[place]) == pytest.approx(steps.after.reward[begin:end].sum(), rel=1e-4)
-    assert len(remembered) == (0 if method == "lare-rd" else 4)
-    for predicted, said in remembered:
-        assert predicted == pytest.approx(said, rel=1e-3, abs=1e-4)
+        learner = add_steps(learner, config, rows, factors[start:end], learn=True)
+        after = learner.credit[0].predictions
+        if int(after.n_episodes) > int(before.predictions.n_episodes):
+            i = int(after.n_episodes) - 1
+            inputs = jitted(inputs_from, config)(learner.replay, start)[: end - start]
+            r_hat = decomposition.proxy_rewards(before, inputs, config.credit, jnp.full(end - start, end - start))
+            predictions.append((float(after.predicted[i, 0]), float(r_hat.sum())))
+            assert float(after.returns[i]) == pytest.approx(steps.next_timestep.reward[start:end].sum(), rel=1e-4)
+    assert len(predictions) == (0 if method == "lare-rd" else 4)
+    for predicted, expected in predictions:
+        assert predicted == pytest.approx(expected, rel=1e-3, abs=1e-4)
 
 
-def scored(learner_config, score, count=60, seed=0):
-    """Episodes of 3 to 30 steps whose score is a sum over the steps or an average."""
+def scored_episodes(learner_config, score, count=60, seed=0):
+    """Return episodes of 3 to 12 steps whose score is a sum over the steps or an average."""
     random = np.random.default_rng(seed)
     lengths = tuple(int(T) for T in random.integers(3, 13, size=count))
-    steps = steps_of(learner_config.env, lengths=lengths, seed=seed)
+    steps = random_steps(learner_config.env, lengths=lengths, seed=seed)
     factors = random.normal(size=(len(steps.ended), 1, 1, 2)).astype(np.float32)
-    mood = np.repeat(random.normal(size=(count, 2)), lengths, axis=0)[:, None, None]
-    factors += mood.astype(np.float32)
-    of_step = factors @ np.array([1.0, -0.5], np.float32) + 2.0
+    offset = np.repeat(random.normal(size=(count, 2)), lengths, axis=0)[:, None, None]
+    factors += offset.astype(np.float32)
+    step_score = factors @ np.array([1.0, -0.5], np.float32) + 2.0
     ends = np.cumsum(lengths)
-    reward = np.zeros_like(steps.after.reward)
-    for begin, end in zip([0, *ends], ends, strict=False):
-        total = of_step[begin:end].sum()
-        reward[end - 1, 0, 0] = total if score == "sum" else total / (end - begin)
-    return steps._replace(after=steps.after._replace(reward=reward)), factors, of_step, np.array(lengths)
+    reward = np.zeros_like(steps.next_timestep.reward)
+    for start, end in zip([0, *ends], ends, strict=False):
+        total = step_score[start:end].sum()
+        reward[end - 1, 0, 0] = total if score == "sum" else total / (end - start)
+    return (
+        steps._replace(next_timestep=steps.next_timestep._replace(reward=reward)),
+        factors,
+        step_score,
+        np.array(lengths),
+    )
 
 
-@pytest.mark.parametrize("method", [long("lare-linear"), "lare-bayes", "lare-rd"])
+@pytest.mark.parametrize("method", [long_case("lare-linear"), "lare-bayes", "lare-rd"])
 @pytest.mark.parametrize("score", ["sum", "average"])
-def test_the_form_of_the_score_is_found_out(method, score):
-    config = config_of(method, capacity=2000)
-    steps, factors, _, _ = scored(config, score)
-    *_, last = in_pieces(config, steps, factors, 6)
-    assert bool(last.credit[0].average) == (score == "average")
-    assert returns.form_found(untrained(config).credit[0]) is None
-    assert returns.form_found(last.credit[0]) == FormFound(score == "average", decided=True)
-    assert returns.form_found(untrained(config_of(method, credit=CreditSettings(score=score))).credit[0]) is None
+def test_learn_returns_finds_the_score_type(method, score):
+    config = small_config(method, capacity=2000)
+    steps, factors, _, _ = scored_episodes(config, score)
+    *_, last = learn_in_chunks(config, steps, factors, 6)
+    assert bool(last.credit[0].is_mean) == (score == "average")
+    assert returns.estimate_score_type(untrained_learner(config).credit[0]) is None
+    assert returns.estimate_score_type(last.credit[0]) == ScoreTypeEstimate(score == "average", is_certain=True)
+    assert (
+        returns.estimate_score_type(
+            untrained_learner(small_config(method, credit=CreditSettings(score=score))).credit[0]
+        )
+        is None
+    )
 
 
 @pytest.mark.parametrize(
@@ -184,70 +199,68 @@ def test_the_form_of_the_score_is_found_out(method, score):
         (False, (0.9, 1.0), True),
         (False, (1.0, 0.97), False),
         (False, (0.97, 1.0), False),
-        (True, (0.9, 1.0), False),  # the last returns show another form than those before the last fit
+        (True, (0.9, 1.0), False),  # the last returns show another type than those before the last fit
         (False, (1.0, 1.0), None),
     ],
 )
-def test_the_form_is_the_decoders_and_decided_by_errors(average, errors, decided, monkeypatch):
-    """Equal errors: all episodes have one length, and the form makes no difference."""
+def test_estimate_score_type_is_decided_by_errors(average, errors, decided, monkeypatch):
     monkeypatch.setattr(returns, "errors_told_apart", lambda _: np.array(errors))
-    state = untrained(config_of("lare-linear")).credit[0]._replace(average=np.array(average))
-    assert returns.form_found(state) == (None if decided is None else FormFound(average, decided))
+    state = untrained_learner(small_config("lare-linear")).credit[0]._replace(is_mean=np.array(average))
+    assert returns.estimate_score_type(state) == (None if decided is None else ScoreTypeEstimate(average, decided))
 
 
-@pytest.mark.parametrize("given", ["auto", "sum", "average"])
+@pytest.mark.parametrize("setting", ["auto", "sum", "average"])
 @pytest.mark.parametrize("score", ["sum", "average"])
-def test_proxy_rewards_of_either_form_add_up_to_the_return(score, given):
-    """Where the form is the right one."""
-    config = config_of("lare-linear", capacity=2000, credit=CreditSettings(score=given))
-    steps, factors, of_step, lengths = scored(config, score)
-    learner = list(in_pieces(config, steps, factors, 6))[-1]
-    got = np.asarray(jitted(common.rewards, config)(every_step(learner), paid_by(learner)))[:, 0]
-    each = np.split(got, np.cumsum(lengths)[:-1])
-    total, paid = np.array([one.sum() for one in each]), steps.after.reward[np.cumsum(lengths) - 1, 0, 0]
-    right = given in ("auto", score)
-    assert (np.abs(total - paid).max() < 0.05 * paid.std()) == right
-    if right:
-        want = of_step[:, 0, 0] / np.repeat(lengths if score == "average" else np.ones_like(lengths), lengths)
-        np.testing.assert_allclose(got, want, atol=0.05)
+def test_proxy_rewards_of_the_right_score_type_add_up_to_the_return(score, setting):
+    config = small_config("lare-linear", capacity=2000, credit=CreditSettings(score=setting))
+    steps, factors, step_score, lengths = scored_episodes(config, score)
+    learner = list(learn_in_chunks(config, steps, factors, 6))[-1]
+    r_hat = np.asarray(jitted(rewards, config)(stored_steps(learner), reward_state(learner)))[:, 0]
+    ends = np.cumsum(lengths)
+    total = np.array([episode.sum() for episode in np.split(r_hat, ends[:-1])])
+    score_of_episode = steps.next_timestep.reward[ends - 1, 0, 0]
+    is_right = setting in ("auto", score)
+    assert (np.abs(total - score_of_episode).max() < 0.05 * score_of_episode.std()) == is_right
+    if is_right:
+        expected = step_score[:, 0, 0] / np.repeat(lengths if score == "average" else np.ones_like(lengths), lengths)
+        np.testing.assert_allclose(r_hat, expected, atol=0.05)
 
 
-def test_one_form_is_fitted_where_it_makes_no_difference():
-    fixed = replace(config_of("lare-linear").env, fixed_length=True)
-    assert config_of("lare-linear").forms == (0, 1)
-    assert config_of("lare-linear", env=fixed).forms == (0,)
-    assert config_of("lare-linear", credit=CreditSettings(score="average")).forms == (1,)
-    assert config_of("lare-signs").forms == config_of("dense").forms == (0,)
+def test_score_types_that_are_fitted():
+    fixed = replace(small_config("lare-linear").env, fixed_length=True)
+    assert small_config("lare-linear").score_types == (0, 1)
+    assert small_config("lare-linear", env=fixed).score_types == (0,)
+    assert small_config("lare-linear", credit=CreditSettings(score="average")).score_types == (1,)
+    assert small_config("lare-signs").score_types == small_config("dense").score_types == (0,)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", ["lare-bayes", "lare-rd"])
-def test_seeds_in_lockstep_are_seeds_alone(method):
-    """Whose episodes end at other times, so that their turns come at other times."""
-    config = config_of(method, "ippo", RIVALS, environments=2, capacity=400)
-    learners, told = [], []
+def test_learn_returns_of_seeds_in_lockstep(method):
+    config = small_config(method, "ippo", TWO_TEAMS, n_envs=2, capacity=400)
+    learners, n_learned = [], []
     for seed, lengths in enumerate((LENGTHS * 3, (12, 12, 12, 5) * 3)):
-        steps = steps_of(RIVALS, 2, seed, lengths)
-        learners.append(with_steps(untrained(config, seed), config, steps, tell=True))
-        told.append(learners[-1].counted.tolist())
-    fresh = [one._replace(counted=0 * one.counted) for one in learners]
-    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[(x.credit, x.replay, x.counted) for x in fresh])
+        steps = random_steps(TWO_TEAMS, 2, seed, lengths)
+        learners.append(add_steps(untrained_learner(config, seed), config, steps, learn=True))
+        n_learned.append(learners[-1].n_learned.tolist())
+    fresh = [learner._replace(n_learned=0 * learner.n_learned) for learner in learners]
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[(x.credit, x.replay, x.n_learned) for x in fresh])
     with jax.enable_x64(True):
         learn = jitted(learn_returns, config)
-        credit, counted = learn(*together)
-        alone = [learn(*jax.tree.map(lambda leaf: leaf[None], (x.credit, x.replay, x.counted))) for x in fresh]
-    assert counted.tolist() == told
-    for place, (one, _) in enumerate(alone):
-        for a, b in zip(jax.tree.leaves(credit), jax.tree.leaves(one), strict=True):
-            np.testing.assert_allclose(np.asarray(a)[place], np.asarray(b)[0], rtol=1e-2, atol=1e-3)
+        decoders, n_together = learn(*together)
+        alone = [learn(*jax.tree.map(lambda leaf: leaf[None], (x.credit, x.replay, x.n_learned))) for x in fresh]
+    assert n_together.tolist() == n_learned
+    for i, (single, _) in enumerate(alone):
+        for a, b in zip(jax.tree.leaves(decoders), jax.tree.leaves(single), strict=True):
+            np.testing.assert_allclose(np.asarray(a)[i], np.asarray(b)[0], rtol=1e-2, atol=1e-3)
 
 
-def test_a_few_short_episodes_are_waited_for():
-    config = config_of("lare-linear", capacity=2000)
-    steps = steps_of(lengths=(3,) * 200)
-    factors = factors_for(config, steps)
-    counts = [int(learner.counted[0]) for learner in in_pieces(config, steps, factors, 200)]
+def test_learn_returns_waits_for_enough_short_episodes():
+    config = small_config("lare-linear", capacity=2000)
+    steps = random_steps(lengths=(3,) * 200)
+    factors = random_factors(config, steps)
+    counts = [int(learner.n_learned[0]) for learner in learn_in_chunks(config, steps, factors, 200)]
     assert counts[:40] == list(range(1, 41))
     waits = np.diff(np.flatnonzero(np.diff(counts[100:])))
     assert waits.min() >= 2
-    assert counts[-1] >= 200 / (1 + returns.GROWTH) - 1
+    assert counts[-1] >= 200 / (1 + returns.MIN_GROWTH) - 1

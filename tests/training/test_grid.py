@@ -1,113 +1,96 @@
-"""Every method, and every kind of method with an algorithm of each kind: they train and report, or are refused in one line."""
+"""Every method, and every kind of method with every kind of algorithm: it trains and reports, or is refused in one line."""
 
 import jax
 import numpy as np
 import pytest
 
 import lare_rl
-from helpers.tiers import long
-from helpers.toys import pick_spec, toy_spec
-from lare_rl.algorithms.table import ALGORITHMS
+from helpers.long_tests import long_case
+from helpers.toy_envs import pick_spec, toy_spec
+from helpers.training_runs import train_quietly
+from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
-from lare_rl.latent.function import verified
-from lare_rl.training import session as sessions
+from lare_rl.latent.function import verify_function
+from lare_rl.training.saved_state import load_learner
 
 GRID = [("td3", method) for method in METHODS]
 GRID += [("ippo", method) for method in ("lare-bayes", "arel")]
-GRID += [long("ippo", method) for method in ("dense", "episodic", "diaster", "rrdu", "lare-rd-shared")]
+GRID += [long_case("ippo", method) for method in ("dense", "episodic", "diaster", "rrdu", "lare-rd-shared")]
 GRID += [("qmix", "lare-rd")]
-GRID += [long("qmix", method) for method in ("dense", "ircr", "rrdu", "diaster", "lare-bayes", "llm-reward", "stas")]
+GRID += [
+    long_case("qmix", method) for method in ("dense", "ircr", "rrdu", "diaster", "lare-bayes", "llm-reward", "stas")
+]
 GRID += [("ppo", method) for method in ("arel", "lare-linear")]
-GRID += [long("ppo", method) for method in ("dense", "rrdu", "diaster")]
-"""Every method runs with one algorithm, the cheapest. The other rows are pairs: each kind of reward (as paid, by a decoder, by the
-function itself), each way to fit, raw features and factors meet each way to consume steps. The methods of one kind differ only
-in decoder and features, and these do not depend on the algorithm; `test_learner.py` tests them with many agents. ppo is ippo with
-one agent."""
+GRID += [long_case("ppo", method) for method in ("dense", "rrdu", "diaster")]
+GRID += [long_case("ddpg", "rrdu"), long_case("sac", "lare-rrdu"), ("sac", "diaster"), ("vdn", "lare-rd")]
+"""Every method runs with one algorithm, the cheapest. The other rows are pairs, so that each kind of reward, each way to fit, and raw
+features and factors meet each way to consume steps. Methods of one kind differ only in decoder and features, which do not depend on
+the algorithm."""
+
+STATE_GRID = [long_case("observation", "lare-rrdu"), ("observation", "arel")]
+STATE_GRID += [
+    long_case("state", "lare-linear"),
+    long_case("state", "rrdu"),
+    ("state", "stas"),
+    ("state", "lare-rd-shared"),
+]
 
 
-def task_of(kind):
-    match kind:
-        case "ppo":
-            return pick_spec()
-        case "ippo" | "qmix" | "vdn":
-            return read_task("CN-6")
-        case _:
-            return toy_spec()
-
-
-def given_for(row, task):
-    """A function of the kind that the method takes, or none."""
-    rows = "o[:, 0:1] * np.sum(a, axis=1, keepdims=True)"
-    factors = [rows, "o[:, 1:2]"] if row.kind == "factors" else [rows]
+def make_phi(method, task):
+    if not method.needs_phi:
+        return None
+    factors = ["o[:, 0:1] * np.sum(a, axis=1, keepdims=True)", "o[:, 1:2]"][: 2 if method.phi_kind == "factors" else 1]
     source = f"def evaluation_func(o, a):\n    return [{', '.join(factors)}]\n"
-    return verified(source, task, row.kind) if row.latent else None
+    return verify_function(source, task, method.phi_kind)
 
 
-def trained(kind, method, small, small_many, out):
-    many = ALGORITHMS[kind].many_agents
-    row, task = METHODS[method], task_of(kind)
-    settings = (small_many if many else small)(
-        method=method, algorithm=kind, seeds=1, **({} if many else {"steps": 120})
-    )
-    return lare_rl.train(task, settings, function=given_for(row, task), out=out, listeners=[])
+@pytest.mark.parametrize(("algorithm", "method_name"), GRID)
+def test_method_trains_or_is_refused(algorithm, method_name, small, small_many, tmp_path):
+    method, multi_agent = METHODS[method_name], ALGORITHMS[algorithm].multi_agent
+    task = {"ppo": pick_spec, "ippo": lambda: read_task("CN-6"), "qmix": lambda: read_task("CN-6")}
+    task = task.get("qmix" if algorithm == "vdn" else algorithm, toy_spec)()
+    settings = {"method": method_name, "algorithm": algorithm, "seeds": 1}
+    settings = small_many(**settings) if multi_agent else small(**settings, steps=120)
 
+    def train():
+        return train_quietly(task, settings, tmp_path / "run", make_phi(method, task))
 
-def fits(kind, row):
-    many = ALGORITHMS[kind].many_agents
-    return not (row.for_one_only if many else row.for_many_only)
-
-
-@pytest.mark.parametrize(("kind", "method"), GRID)
-def test_every_method_trains_and_reports_or_is_refused(method, kind, small, small_many, tmp_path):
-    row = METHODS[method]
-    if not fits(kind, row):
-        with pytest.raises(LareError, match=f"^{method} assigns credit (to a single agent|among agents), and [^\n]*$"):
-            trained(kind, method, small, small_many, tmp_path / "run")
+    if method.single_agent_only if multi_agent else method.multi_agent_only:
+        with pytest.raises(LareError, match=f"^{method_name} assigns credit (to a single agent|among agents)"):
+            train()
         assert not (tmp_path / "run").exists()
         return
-    run = trained(kind, method, small, small_many, tmp_path / "run")
+    run = train()
     lines = run.metrics()
-    assert [line["step"] for line in lines] == ([60, 120] if kind in ("td3", "ppo") else [100, 200])
+    assert [line["step"] for line in lines] == ([100, 200] if multi_agent else [60, 120])
     assert all(np.isfinite(line["evaluation/return"]) for line in lines)
-    learner = sessions.load_learner(run)[1]
+    learner = load_learner(run).learner
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((learner.algorithm, learner.credit)))
-    assert ("credit/correlation" in lines[-1]) == row.has_proxy
-    assert ("credit/error" in lines[-1]) == row.in_reward_units
-    assert ("credit/loss" in lines[-1]) == row.descends
-    assert "critic/loss" in lines[-1]
-    assert (run.directory / "latent_function.py").exists() == row.latent
-    if (kind, method) == ("td3", "lare-rrdu"):
+    assert ("credit/correlation" in lines[-1]) == method.has_proxy_rewards
+    assert ("credit/error" in lines[-1]) == method.calibrated
+    assert ("credit/loss" in lines[-1]) == method.uses_gradient
+    assert np.isfinite(lines[-1]["critic/loss"])
+    assert (run.directory / "latent_function.py").exists() == method.needs_phi
+    if (algorithm, method_name) == ("td3", "lare-rrdu"):
         assert lare_rl.write_report([run.directory]).read_text().count("<svg") >= 1
 
 
-@pytest.mark.parametrize(
-    ("kind", "method"), [long("ddpg", "rrdu"), long("sac", "lare-rrdu"), ("sac", "diaster"), ("vdn", "lare-rd")]
-)
-def test_the_other_algorithms(kind, method, small, small_many, tmp_path):
-    line = trained(kind, method, small, small_many, tmp_path / "run").metrics()[-1]
-    assert np.isfinite(line["critic/loss"])
-
-
-OF_STATE = [long("observation", "lare-rrdu"), ("observation", "arel")]
-OF_STATE += [long("state", "lare-linear"), long("state", "rrdu"), ("state", "stas"), ("state", "lare-rd-shared")]
-
-
-@pytest.mark.parametrize(("judged_from", "method"), OF_STATE)
-def test_methods_where_agents_leave(judged_from, method, small_many, echo, tmp_path):
-    row = METHODS[method]
-    sizes = {"judged_from": "state", "observation_size": 9, "action_size": 9} if judged_from == "state" else {}
-    task = echo.model_copy(update=sizes)
-    settings = small_many(method=method, algorithm="qmix", seeds=1, steps=100, rollout_steps=25)
+@pytest.mark.parametrize(("judged_from", "method_name"), STATE_GRID)
+def test_method_with_agents_that_leave(judged_from, method_name, small_many, echo, tmp_path):
+    method, from_state = METHODS[method_name], judged_from == "state"
+    changes = {"judged_from": "state", "observation_size": 9, "action_size": 9} if from_state else {}
+    task = echo.model_copy(update=changes)
+    settings = small_many(method=method_name, algorithm="qmix", seeds=1, steps=100, rollout_steps=25)
 
     def train():
-        return lare_rl.train(task, settings, function=given_for(row, task), out=tmp_path / "run", listeners=[])
+        return train_quietly(task, settings, tmp_path / "run", make_phi(method, task))
 
-    if row.whole_episodes or (row.for_many_only and judged_from == "state"):
-        with pytest.raises(LareError, match=rf"^{method} (looks at whole episodes|assigns credit among agents)[^\n]*$"):
+    if method.needs_whole_episodes or (method.multi_agent_only and from_state):
+        with pytest.raises(LareError, match=f"^{method_name} (looks at whole episodes|assigns credit among agents)"):
             train()
         return
     line = train().metrics()[-1]
     assert np.isfinite(line["critic/loss"])
-    assert ("credit/error" in line) == row.in_reward_units
+    assert ("credit/error" in line) == method.calibrated

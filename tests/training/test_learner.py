@@ -1,4 +1,4 @@
-"""What each method reads and is rewarded with: of one agent, of many, of teams, and of those who are still there."""
+"""The decoder's inputs, fits and rewards of each method: for one agent, for many, for teams, and with agents that leave."""
 
 from dataclasses import replace
 from functools import partial
@@ -8,559 +8,586 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.recipes import (
-    ALONE,
+from helpers.long_tests import long_case
+from helpers.small_configs import (
     LENGTHS,
-    RIVALS,
-    TOGETHER,
+    ONE_AGENT,
+    ONE_TEAM,
     TOTAL,
-    config_of,
-    every_step,
-    factors_for,
+    TWO_TEAMS,
+    add_steps,
     jitted,
-    paid_by,
+    learner_with_episodes,
+    random_factors,
+    random_steps,
     read,
-    steps_of,
-    stored,
-    untrained,
-    with_steps,
+    reward_state,
+    small_config,
+    stored_steps,
+    untrained_learner,
 )
-from helpers.tiers import long
 from lare_rl.credit import closed_form, returns
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import LinearDecoder
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import TABLE, Fit, Reward
+from lare_rl.credit.methods import METHODS, Fit, Reward
 from lare_rl.data import replay
-from lare_rl.data.sampling import sample_parts
+from lare_rl.data.sampling import sample_drawn
 from lare_rl.envs.interface import EnvSpec, Team
-from lare_rl.nn.normalise import magnitude
-from lare_rl.training import learner as common
+from lare_rl.nn.normalise import root_mean_square
+from lare_rl.training.decoder_fits import fit_decoders, fit_repeatedly, sample_credit
+from lare_rl.training.decoder_inputs import alive_agents, decoder_inputs
+from lare_rl.training.learner import abandon_episodes
+from lare_rl.training.rewards import assess, rewards
+from lare_rl.training.rewards import proxy_rewards as team_proxy_rewards
 
 ENDS = np.cumsum(LENGTHS)[:-1]
-MANY = partial(config_of, algorithm="ippo", env=TOGETHER)
-TEAMS = partial(config_of, algorithm="ippo", env=RIVALS)
+MANY = partial(small_config, algorithm="ippo", env=ONE_TEAM)
+TEAMS = partial(small_config, algorithm="ippo", env=TWO_TEAMS)
 
 
-def close(one, other, rtol=1e-4, atol=1e-5):
-    jax.tree.map(partial(np.testing.assert_allclose, rtol=rtol, atol=atol), one, other)
+def assert_close(a, b, rtol=1e-4, atol=1e-5):
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=rtol, atol=atol), a, b)
 
 
-def proxy_rewards(steps, paid, config):
-    return common.proxy_rewards(steps, paid, config, 0)
+def proxy_rewards(steps, state, config):
+    return team_proxy_rewards(steps, state, config, 0)
 
 
-def fitted(learner, config, key=0):
-    """One update of the decoders on what is drawn by a key, and what it measured."""
-    draw = common.sample_credit(learner.replay, jax.random.key(key), 1, config)
-    draw = jax.tree.map(lambda leaf: leaf[0], draw)
-    return jitted(common.fit, config)(learner.credit, learner.replay, draw, jax.random.key(1))
+def update_once(learner, config, key=0):
+    """Return the decoders after one update, and its metrics."""
+    samples = sample_credit(learner.replay, jax.random.key(key), 1, config)
+    sample = jax.tree.map(lambda leaf: leaf[0], samples)
+    return jitted(fit_decoders, config)(learner.credit, learner.replay, sample, jax.random.key(1))
 
 
-# A single agent.
+# A single agent
 
 
-def test_store_keeps_statistics_of_what_came():
-    config = config_of("lare-rrdu")
-    learner, steps = stored(config), steps_of()
-    factors = factors_for(config, steps)
+def test_store_updates_statistics():
+    config = small_config("lare-rrdu")
+    learner, steps = learner_with_episodes(config), random_steps()
+    factors = random_factors(config, steps)
     np.testing.assert_allclose(learner.credit[0].statistics.mean, factors.mean(axis=(0, 1, 2)), rtol=1e-4)
-    assert float(learner.credit[0].statistics.rows) == TOTAL
-    means = [part.mean() for part in np.split(steps.after.reward.ravel(), ENDS)]
+    assert float(learner.credit[0].statistics.n_rows) == TOTAL
+    means = [episode.mean() for episode in np.split(steps.next_timestep.reward.ravel(), ENDS)]
     assert float(learner.scale[0].mean_square) == pytest.approx(np.mean(np.square(means)), rel=1e-4)
     np.testing.assert_array_equal(learner.scale[0], learner.credit[0].scale)
 
 
-def test_raw_features_are_s_a_and_the_change():
-    config = config_of("rrdu")
-    drawn = every_step(stored(config))
-    s, a, n = drawn.before["observation"], drawn.before["action"], drawn.after["observation"]
-    taken = np.clip(a, -1, 1)
-    assert (taken != a).any()
-    want = np.concatenate([s, taken, s - n], axis=-1)
-    np.testing.assert_array_equal(common.features(drawn, config, 0), want)
-    assert want.shape[-1] == config.bases[0].inputs == 8
+def test_decoder_inputs_raw():
+    config = small_config("rrdu")
+    stored = stored_steps(learner_with_episodes(config))
+    s, a, n = stored.columns["observation"], stored.columns["action"], stored.next_columns["observation"]
+    clipped = np.clip(a, -1, 1)
+    assert (clipped != a).any()
+    expected = np.concatenate([s, clipped, s - n], axis=-1)
+    np.testing.assert_array_equal(decoder_inputs(stored, config, 0), expected)
+    assert expected.shape[-1] == config.credit_specs[0].basis.n_inputs == 8
 
 
-def test_state_and_action_alone():
-    config = config_of("diaster")
-    drawn = every_step(stored(config))
-    want = np.concatenate([drawn.before["observation"], np.clip(drawn.before["action"], -1, 1)], axis=-1)
-    np.testing.assert_array_equal(common.features(drawn, config, 0), want)
-    assert want.shape[-1] == config.bases[0].inputs == 5
+def test_decoder_inputs_observation_action():
+    config = small_config("diaster")
+    stored = stored_steps(learner_with_episodes(config))
+    expected = np.concatenate([stored.columns["observation"], np.clip(stored.columns["action"], -1, 1)], axis=-1)
+    np.testing.assert_array_equal(decoder_inputs(stored, config, 0), expected)
+    assert expected.shape[-1] == config.credit_specs[0].basis.n_inputs == 5
 
 
-@pytest.mark.parametrize("judges", ["before", long("after"), "both"])
-@pytest.mark.parametrize("method", [long("rd-linear"), "bayes", long("lare-linear"), "lare-bayes"])
-def test_closed_forms_see_the_factors_and_the_states_that_the_task_judges(method, judges):
-    config, steps = config_of(method, judges=judges), steps_of()
-    drawn = every_step(stored(config))
-    states = {"before": [drawn.before], "after": [drawn.after], "both": [drawn.before, drawn.after]}[judges]
-    want = [factors_for(config, steps)[:, 0]] if "lare" in method else []
+@pytest.mark.parametrize("judges", ["before", long_case("after"), "both"])
+@pytest.mark.parametrize("method", [long_case("rd-linear"), "bayes", long_case("lare-linear"), "lare-bayes"])
+def test_decoder_inputs_of_closed_forms(method, judges):
+    config, steps = small_config(method, factor_inputs=judges), random_steps()
+    stored = stored_steps(learner_with_episodes(config))
+    states = {
+        "before": [stored.columns],
+        "after": [stored.next_columns],
+        "both": [stored.columns, stored.next_columns],
+    }[judges]
+    expected = [random_factors(config, steps)[:, 0]] if "lare" in method else []
     if method != "lare-linear":
-        want += [*(state["observation"] for state in states), np.clip(drawn.before["action"], -1, 1)]
-    want = np.concatenate(want, axis=-1)
-    np.testing.assert_array_equal(common.features(drawn, config, 0), want)
-    assert want.shape[-1] == config.bases[0].inputs
-    assert config.bases[0].extended == (method in ("bayes", "lare-bayes"))
+        expected += [*(state["observation"] for state in states), np.clip(stored.columns["action"], -1, 1)]
+    expected = np.concatenate(expected, axis=-1)
+    np.testing.assert_array_equal(decoder_inputs(stored, config, 0), expected)
+    assert expected.shape[-1] == config.credit_specs[0].basis.n_inputs
+    assert config.credit_specs[0].basis.extended == (method in ("bayes", "lare-bayes"))
 
 
-@pytest.mark.parametrize("drawn", [4, 10])
-def test_the_unbiased_loss_has_the_expectation_of_the_full_one_for_episodes_of_any_length(drawn):
-    """Lengths from 3 to 12: with K = 10, three of the five episodes are shorter. RRD's loss is larger."""
+@pytest.mark.parametrize("n_steps", [4, 10])
+def test_unbiased_loss_has_the_expectation_of_the_full_loss(n_steps):
+    # Lengths are 3 to 12: with K = 10, three of the five episodes are shorter. RRD's loss is larger.
     losses = {}
     for name in ("rrd", "rrdu"):
-        config = config_of(name)
-        learner = stored(config)
-        steep = jax.tree.map(lambda weight: 6 * weight, learner.credit[0].decoder)  # steps that differ
+        config = small_config(name)
+        learner = learner_with_episodes(config)
+        steep = jax.tree.map(
+            lambda weight: 6 * weight, learner.credit[0].decoder
+        )  # so that the rewards of steps differ
         learner = learner._replace(credit=(learner.credit[0]._replace(decoder=steep),))
-        draws = sample_parts(learner.replay, jax.random.key(3), 1, 40_000, drawn)
+        draws = sample_drawn(learner.replay, jax.random.key(3), 1, 40_000, n_steps)
         first = jax.tree.map(lambda leaf: leaf[0], draws)
-        _, measured = jitted(common.fit, config)(learner.credit, learner.replay, first, jax.random.key(0))
-        losses[name] = float(measured["credit/loss"])
-    every, unit = every_step(learner), float(magnitude(learner.credit[0].scale))
-    r_hat = np.asarray(jitted(proxy_rewards, config)(every, paid_by(learner)))[:, 0] / unit
-    r = np.asarray(every.before["reward"])[:, 0] / unit
+        _, metrics = jitted(fit_decoders, config)(learner.credit, learner.replay, first, jax.random.key(0))
+        losses[name] = float(metrics["credit/loss"])
+    steps, unit = stored_steps(learner), float(root_mean_square(learner.credit[0].scale))
+    r_hat = np.asarray(jitted(proxy_rewards, config)(steps, reward_state(learner)))[:, 0] / unit
+    r = np.asarray(steps.columns["reward"])[:, 0] / unit
     errors = [(a.mean() - b.mean()) ** 2 for a, b in zip(np.split(r_hat, ENDS), np.split(r, ENDS), strict=True)]
     chosen = np.bincount(np.searchsorted(ENDS, draws.episodes.first.number[0], side="right"), minlength=5) / 40_000
-    want = float(chosen @ errors)
-    assert losses["rrdu"] == pytest.approx(want, rel=0.02)
-    assert losses["rrd"] > 1.025 * want
+    expected = float(chosen @ errors)
+    assert losses["rrdu"] == pytest.approx(expected, rel=0.02)
+    assert losses["rrd"] > 1.025 * expected
 
 
-@pytest.mark.parametrize("method", ["rd", long("rrd"), "rrdu", long("vib-rd"), long("vib-rrdu")])
-def test_padding_counts_for_nothing(method):
-    config = config_of(method)
-    learner = stored(config)
-    draws = jax.tree.map(lambda one: one[0], common.sample_credit(learner.replay, jax.random.key(2), 1, config))
-    padding = np.asarray(draws.episode) >= len(draws.episodes.length)
+@pytest.mark.parametrize("method", ["rd", long_case("rrd"), "rrdu", long_case("vib-rd"), long_case("vib-rrdu")])
+def test_fit_ignores_padding(method):
+    config = small_config(method)
+    learner = learner_with_episodes(config)
+    sample = jax.tree.map(lambda leaf: leaf[0], sample_credit(learner.replay, jax.random.key(2), 1, config))
+    padding = np.asarray(sample.episode) >= len(sample.episodes.length)
     assert padding.any()
-    elsewhere = draws._replace(steps=draws.steps._replace(number=jnp.where(padding, 40, draws.steps.number)))
-    assert (np.asarray(draws.steps.number) != elsewhere.steps.number).any()
-    one, other = (
-        jitted(common.fit, config)(learner.credit, learner.replay, each, jax.random.key(0))
-        for each in (draws, elsewhere)
+    changed = sample._replace(steps=sample.steps._replace(number=jnp.where(padding, 40, sample.steps.number)))
+    assert (np.asarray(sample.steps.number) != changed.steps.number).any()
+    updates = (
+        jitted(fit_decoders, config)(learner.credit, learner.replay, batch, jax.random.key(0))
+        for batch in (sample, changed)
     )
-    close(one, other, 1e-5, 1e-7)
+    assert_close(*updates, 1e-5, 1e-7)
 
 
 @pytest.mark.parametrize("method", ["dense", "episodic", "lare-rrdu", "ircr", "llm-reward"])
 @pytest.mark.parametrize("scale_rewards", [False, True])
 def test_rewards(method, scale_rewards):
-    config = config_of(method, scale_rewards=scale_rewards)
-    learner, steps = stored(config), steps_of()
-    got, unit = jitted(common.rewards, config)(every_step(learner), paid_by(learner)), magnitude(learner.scale[0])
-    assert got.shape == (TOTAL, 1)
-    got = np.asarray(got)[:, 0] * (unit if scale_rewards else 1)
-    true, ended = steps.after.reward.ravel(), steps.ended.ravel()
+    config = small_config(method, scale_rewards=scale_rewards)
+    learner, steps = learner_with_episodes(config), random_steps()
+    reward, unit = (
+        jitted(rewards, config)(stored_steps(learner), reward_state(learner)),
+        root_mean_square(learner.scale[0]),
+    )
+    assert reward.shape == (TOTAL, 1)
+    reward = np.asarray(reward)[:, 0] * (unit if scale_rewards else 1)
+    true, ended = steps.next_timestep.reward.ravel(), steps.ended.ravel()
     match config.method.reward:
         case Reward.TRUE:
-            np.testing.assert_allclose(got, true, rtol=1e-5)
+            np.testing.assert_allclose(reward, true, rtol=1e-5)
         case Reward.EPISODIC:
-            returns = [part.sum() for part in np.split(true, ENDS)]
-            np.testing.assert_allclose(got[ended], returns, rtol=1e-4, atol=1e-6)
-            assert not got[~ended].any()
+            returns = [episode.sum() for episode in np.split(true, ENDS)]
+            np.testing.assert_allclose(reward[ended], returns, rtol=1e-4, atol=1e-6)
+            assert not reward[~ended].any()
         case Reward.DESIGNED:
-            np.testing.assert_allclose(got, factors_for(config, steps)[:, 0, 0, 0], rtol=1e-5)
+            np.testing.assert_allclose(reward, random_factors(config, steps)[:, 0, 0, 0], rtol=1e-5)
         case Reward.UNIFORM:
-            means = np.array([part.mean() for part in np.split(true, ENDS)])
-            want = np.repeat((means - means.min()) / (means.max() - means.min()), LENGTHS)
-            np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
+            means = np.array([episode.mean() for episode in np.split(true, ENDS)])
+            expected = np.repeat((means - means.min()) / (means.max() - means.min()), LENGTHS)
+            np.testing.assert_allclose(reward, expected, rtol=1e-4, atol=1e-5)
         case Reward.PROXY:
-            assert got.std() > 0
+            assert reward.std() > 0
 
 
-def begun(config):
-    """With an episode of two steps that goes on, and a learner without."""
-    learner, steps = stored(config), jax.tree.map(lambda rows: rows[:2], steps_of())
-    return with_steps(learner, config, steps), learner
+def with_running_episode(config):
+    """Return a learner with a running episode of two steps, and the learner without it."""
+    learner, steps = learner_with_episodes(config), jax.tree.map(lambda rows: rows[:2], random_steps())
+    return add_steps(learner, config, steps), learner
 
 
-def test_an_episode_under_way_is_worth_half_as_much_as_the_best():
-    config = config_of("ircr")
-    learner, _ = begun(config)
-    got = jitted(common.rewards, config)(every_step(learner), paid_by(learner))[:, 0]
-    np.testing.assert_array_equal(got[-2:], [0.5, 0.5])
-    assert float(got[0]) != 0.5
+def test_ircr_pays_half_until_an_episode_ends():
+    config = small_config("ircr")
+    learner, _ = with_running_episode(config)
+    reward = jitted(rewards, config)(stored_steps(learner), reward_state(learner))[:, 0]
+    np.testing.assert_array_equal(reward[-2:], [0.5, 0.5])
+    assert float(reward[0]) != 0.5
 
 
 def check_closed_form(credit, z, reward):
-    """Sums over episodes, weighted by their steps, of standardised factors, of R/T and of R; in NumPy. NaN: nobody was there."""
-    decoder = credit.closed.decoder
-    standard = [np.nan_to_num((one - np.asarray(decoder.mean)) / np.asarray(decoder.deviation)) for one in z]
-    v = [[*one.mean(axis=0), paid.mean(), paid.sum()] for one, paid in zip(standard, reward, strict=True)]
-    length = np.array([len(one) for one in z])
+    """Check the sums over episodes, weighted by their steps, of standardised factors, R/T and R. NaN: no agent was alive."""
+    decoder = credit.closed_form.decoder
+    standard = [np.nan_to_num((rows - np.asarray(decoder.mean)) / np.asarray(decoder.std)) for rows in z]
+    v = [[*rows.mean(axis=0), r.mean(), r.sum()] for rows, r in zip(standard, reward, strict=True)]
+    length = np.array([len(rows) for rows in z])
     centred = np.array(v) - np.average(v, axis=0, weights=length)
     with jax.enable_x64(True):
-        sums = closed_form.whole(credit.closed.summed)
-    assert (float(sums.episodes), float(sums.steps)) == (len(z), length.sum())
+        sums = closed_form.to_float64(credit.closed_form.sufficient_statistics)
+    assert (float(sums.n_episodes), float(sums.n_steps)) == (len(z), length.sum())
     np.testing.assert_allclose(sums.mean, np.average(v, axis=0, weights=length), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(sums.products, (length * centred.T) @ centred, rtol=1e-3, atol=1e-4)
 
 
-def test_closed_forms_sum_over_the_episodes_that_have_ended():
-    config = config_of("lare-linear")
-    factors, steps = factors_for(config, steps_of()), steps_of()
-    learner, _ = begun(config)
-    check_closed_form(learner.credit[0], np.split(factors[:, 0, 0], ENDS), np.split(steps.after.reward[:, 0, 0], ENDS))
+def test_closed_form_sums_finished_episodes():
+    config = small_config("lare-linear")
+    factors, steps = random_factors(config, random_steps()), random_steps()
+    learner, _ = with_running_episode(config)
+    check_closed_form(
+        learner.credit[0], np.split(factors[:, 0, 0], ENDS), np.split(steps.next_timestep.reward[:, 0, 0], ENDS)
+    )
 
 
 @pytest.mark.parametrize("method", ["lare-linear", "rd-linear"])
-def test_forgetting_the_episode_under_way_leaves_the_fit(method):
-    config = config_of(method)
-    longer, learner = begun(config)
-    back = common.forget_episodes(longer, jnp.array([True]))
-    jax.tree.map(np.testing.assert_array_equal, back.credit[0].closed, learner.credit[0].closed)
-    assert back.replay.transitions.tolist() == learner.replay.transitions.tolist()
+def test_abandon_episodes_does_not_change_the_fit(method):
+    config = small_config(method)
+    longer, learner = with_running_episode(config)
+    shorter = abandon_episodes(longer, jnp.array([True]))
+    jax.tree.map(np.testing.assert_array_equal, shorter.credit[0].closed_form, learner.credit[0].closed_form)
+    assert shorter.replay.transitions.tolist() == learner.replay.transitions.tolist()
 
 
-def test_every_fit_has_a_method():
-    assert {method.fit for method in TABLE} >= set(Fit)
+def test_methods_have_all_fits():
+    assert {method.fit for method in METHODS.values()} >= set(Fit)
 
 
-def test_accuracy_is_of_the_newest_steps():
-    """A decoder that says its factor, which is the true reward of the newest ten steps and nothing like that before."""
-    config, steps = config_of("lare-linear", factors=(1,), rollout_steps=10), steps_of()
-    away = np.where(np.arange(TOTAL) < TOTAL - 10, 7.0, 0.5).astype(np.float32)
-    factors = steps.after.reward[..., None] + away[:, None, None, None]
-    learner = with_steps(untrained(config), config, steps, factors)
-    learner = says_its_factor(learner, [1.0])
-    # Episodes of one length: those of the newest iteration. Of any length: as many steps as are measured, or as there are.
+def test_assess_reads_the_newest_steps():
+    # The factor is the true reward of the newest ten steps, and far from it before.
+    config, steps = small_config("lare-linear", n_factors=(1,), rollout_steps=10), random_steps()
+    offset = np.where(np.arange(TOTAL) < TOTAL - 10, 7.0, 0.5).astype(np.float32)
+    factors = steps.next_timestep.reward[..., None] + offset[:, None, None, None]
+    learner = add_steps(untrained_learner(config), config, steps, factors)
+    learner = with_factor_decoders(learner, [1.0])
+    # With a fixed length, only the newest iteration is measured.
     same_length = replace(config, env=replace(config.env, fixed_length=True))
-    newest, every = jitted(common.assess, same_length)(learner), jitted(common.assess, config)(learner)
+    newest, recent = jitted(assess, same_length)(learner), jitted(assess, config)(learner)
     assert float(newest["credit/error"]) == pytest.approx(0.5, rel=1e-5)
     assert float(newest["credit/correlation"]) == pytest.approx(1, rel=1e-4)
-    assert float(every["credit/error"]) == pytest.approx((7 * (TOTAL - 10) + 5) / TOTAL, rel=1e-5)
+    assert float(recent["credit/error"]) == pytest.approx((7 * (TOTAL - 10) + 5) / TOTAL, rel=1e-5)
 
 
-def says_its_factor(learner, signs):
-    """With decoders that say the number that stands in their only factor, each with a sign of its own."""
-    credit = tuple(
-        one._replace(
+def with_factor_decoders(learner, signs):
+    """Return the learner with decoders whose output is their only factor, times a sign for each team."""
+    decoders = tuple(
+        team._replace(
             decoder=LinearDecoder(Basis(1, 0, False), *(jnp.array([x]) for x in (0.0, 1.0, sign)), jnp.zeros(()))
         )
-        for one, sign in zip(learner.credit, signs, strict=True)
+        for team, sign in zip(learner.credit, signs, strict=True)
     )
-    return learner._replace(credit=credit)
+    return learner._replace(credit=decoders)
 
 
-# Several environments.
+# Several environments
 
 
-@pytest.mark.parametrize("method", [*map(long, ("rd", "rrdu", "lare-rd")), "lare-linear", "ircr"])
-def test_two_environments_are_one_twice_as_long(method):
-    """The same episodes, collected side by side or one after the other: the same statistics, the same rewards, the same fit."""
-    wide, long = config_of(method, environments=2), config_of(method)
-    steps = steps_of(envs=2)
-    factors = factors_for(wide, steps)
+@pytest.mark.parametrize("method", [*map(long_case, ("rd", "rrdu", "lare-rd")), "lare-linear", "ircr"])
+def test_two_environments_equal_one_twice_as_long(method):
+    wide, long = small_config(method, n_envs=2), small_config(method)
+    steps = random_steps(envs=2)
+    factors = random_factors(wide, steps)
 
-    def in_a_row(rows):
+    def join_envs(rows):
         return np.swapaxes(rows, 0, 1).reshape(2 * TOTAL, 1, *rows.shape[2:])
 
-    one = with_steps(untrained(wide), wide, steps, factors)
-    other = with_steps(untrained(long), long, jax.tree.map(in_a_row, steps), in_a_row(factors))
-    close(one.credit, other.credit, 1e-3, 1e-4)
-    close(one.scale, other.scale)
+    first = add_steps(untrained_learner(wide), wide, steps, factors)
+    second = add_steps(untrained_learner(long), long, jax.tree.map(join_envs, steps), join_envs(factors))
+    assert_close(first.credit, second.credit, 1e-3, 1e-4)
+    assert_close(first.scale, second.scale)
     number = jnp.broadcast_to(jnp.arange(TOTAL), (2, TOTAL))
     env = jnp.broadcast_to(jnp.arange(2)[:, None], (2, TOTAL))
-    rewards = []
+    r_hats = []
     for learner, config, index in (
-        (one, wide, replay.Index(env, number)),
-        (other, long, replay.Index(0 * env, number + TOTAL * env)),
+        (first, wide, replay.Index(env, number)),
+        (second, long, replay.Index(0 * env, number + TOTAL * env)),
     ):
-        rewards.append(jitted(common.rewards, config)(read(learner.replay, index), paid_by(learner)))
-    close(*rewards, 1e-3, 1e-4)
+        r_hats.append(jitted(rewards, config)(read(learner.replay, index), reward_state(learner)))
+    assert_close(*r_hats, 1e-3, 1e-4)
 
 
-# Many agents.
+# Many agents
 
 
-@pytest.mark.parametrize("method", ["rd", long("stas"), "lare-rd"])
-def test_what_decoders_see_of_many(method):
-    """RD and AREL what each agent met after the step, STAS what it met before it and did, LaRe the factors."""
+@pytest.mark.parametrize("method", ["rd", long_case("stas"), "lare-rd"])
+def test_decoder_inputs_of_many_agents(method):
     config = MANY(method)
-    drawn, steps = every_step(stored(config)), steps_of(TOGETHER)
-    want = {
-        "rd": drawn.after.get("observation"),
-        "stas": np.concatenate([steps.before.observation, steps.action], axis=-1)[:, 0],
-        "lare-rd": factors_for(config, steps)[:, 0],
+    stored, steps = stored_steps(learner_with_episodes(config)), random_steps(ONE_TEAM)
+    expected = {
+        "rd": stored.next_columns.get("observation"),
+        "stas": np.concatenate([steps.timestep.observation, steps.action], axis=-1)[:, 0],
+        "lare-rd": random_factors(config, steps)[:, 0],
     }[method]
-    np.testing.assert_array_equal(common.features(drawn, config, 0), want)
-    assert config.bases[0].inputs == want.shape[-1]
+    np.testing.assert_array_equal(decoder_inputs(stored, config, 0), expected)
+    assert config.credit_specs[0].basis.n_inputs == expected.shape[-1]
 
 
-def test_each_team_has_a_decoder_and_a_return_of_its_own():
-    config, steps = TEAMS("lare-rd"), steps_of(RIVALS)
-    learner = stored(config)
+def test_teams_have_separate_decoders_and_returns():
+    config, steps = TEAMS("lare-rd"), random_steps(TWO_TEAMS)
+    learner = learner_with_episodes(config)
     assert [credit.statistics.mean.shape for credit in learner.credit] == [(2,), (3,)]
-    for place, (credit, team) in enumerate(zip(learner.credit, RIVALS.teams, strict=True)):
-        earned = earnings(steps, team)
-        means = np.array([part.mean() for part in np.split(earned, ENDS)])
+    for i, (credit, team) in enumerate(zip(learner.credit, TWO_TEAMS.teams, strict=True)):
+        means = np.array([episode.mean() for episode in np.split(team_rewards(steps, team), ENDS)])
         assert float(credit.scale.mean_square) == pytest.approx(float((means**2).mean()), rel=1e-4)
-        np.testing.assert_array_equal(credit.scale, learner.scale[place])
-    after, _ = fitted(learner, config)
-    for before, now in zip(learner.credit, after, strict=True):
-        assert not jax.tree.all(jax.tree.map(jnp.array_equal, before.decoder, now.decoder))
+        np.testing.assert_array_equal(credit.scale, learner.scale[i])
+    updated, _ = update_once(learner, config)
+    for before, after in zip(learner.credit, updated, strict=True):
+        assert not jax.tree.all(jax.tree.map(jnp.array_equal, before.decoder, after.decoder))
 
 
-def earnings(steps, team, env=0):
-    """Of a team by each step: the mean over those of its agents who acted, by a loop."""
-    found = []
-    for paid, alive in zip(steps.after.reward[:, env], steps.before.alive[:, env], strict=True):
-        own = [paid[agent] for agent in range(team.start, team.stop) if alive[agent]]
-        found.append(np.mean(own) if own else 0.0)
-    return np.array(found)
+def team_rewards(steps, team, env=0):
+    """Return the team's reward of each step: the mean over its agents that are alive, by a loop."""
+    means = []
+    for reward, alive in zip(steps.next_timestep.reward[:, env], steps.timestep.alive[:, env], strict=True):
+        values = [reward[agent] for agent in range(team.start, team.stop) if alive[agent]]
+        means.append(np.mean(values) if values else 0.0)
+    return np.array(means)
 
 
 @pytest.mark.parametrize("method", ["dense", "episodic", "ircr"])
 def test_rewards_of_teams(method):
-    config, steps = TEAMS(method), steps_of(RIVALS)
-    learner, alive = stored(config), steps.before.alive[:, 0]
-    got = np.asarray(jitted(common.rewards, config)(every_step(learner), paid_by(learner)))
+    config, steps = TEAMS(method), random_steps(TWO_TEAMS)
+    learner, alive = learner_with_episodes(config), steps.timestep.alive[:, 0]
+    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), reward_state(learner)))
     assert not alive.all()
-    for team in RIVALS.teams:
-        of_team = np.split(earnings(steps, team), ENDS)
+    for team in TWO_TEAMS.teams:
+        episode_rewards = np.split(team_rewards(steps, team), ENDS)
         if method == "dense":
-            want = steps.after.reward[:, 0, team.agents]
+            expected = steps.next_timestep.reward[:, 0, team.agents]
         elif method == "episodic":
-            want = np.where(steps.ended, np.repeat([one.sum() for one in of_team], LENGTHS)[:, None], 0)
+            expected = np.where(
+                steps.ended, np.repeat([episode.sum() for episode in episode_rewards], LENGTHS)[:, None], 0
+            )
         else:
-            means = np.array([one.mean() for one in of_team])
-            want = np.repeat((means - means.min()) / (means.max() - means.min()), LENGTHS)[:, None]
-        np.testing.assert_allclose(got[:, team.agents], want * alive[:, team.agents], rtol=1e-3, atol=1e-5)
+            means = np.array([episode.mean() for episode in episode_rewards])
+            expected = np.repeat((means - means.min()) / (means.max() - means.min()), LENGTHS)[:, None]
+        np.testing.assert_allclose(reward[:, team.agents], expected * alive[:, team.agents], rtol=1e-3, atol=1e-5)
 
 
-def numbered():
-    """Two teams whose decoders say their only factor, which is another number at every row, the second one with a minus."""
-    config, steps = TEAMS("lare-linear", factors=(1, 1)), steps_of(RIVALS)
+def with_numbered_factors():
+    """Return two teams whose r_hat is a different number for each row, negative for the second team."""
+    config, steps = TEAMS("lare-linear", n_factors=(1, 1)), random_steps(TWO_TEAMS)
     number = np.arange(TOTAL * 5, dtype=np.float32).reshape(TOTAL, 1, 5)
-    learner = says_its_factor(with_steps(untrained(config), config, steps, number[..., None]), [1.0, -1.0])
+    learner = with_factor_decoders(add_steps(untrained_learner(config), config, steps, number[..., None]), [1.0, -1.0])
     return config, learner, steps, number[:, 0] * np.repeat([1.0, -1.0], [3, 2])
 
 
-def test_every_agent_has_the_proxy_rewards_of_its_own_steps():
-    config, learner, steps, own = numbered()
-    got = jitted(common.rewards, config)(every_step(learner), paid_by(learner))
-    np.testing.assert_array_equal(got, own * steps.before.alive[:, 0])
+def test_rewards_of_each_agent():
+    config, learner, steps, r_hat = with_numbered_factors()
+    reward = jitted(rewards, config)(stored_steps(learner), reward_state(learner))
+    np.testing.assert_array_equal(reward, r_hat * steps.timestep.alive[:, 0])
 
 
-def test_shared_credit_is_the_mean_over_the_agents_who_are_there():
-    config, learner, steps, own = numbered()
+def test_rewards_shared_among_agents_that_are_alive():
+    config, learner, steps, r_hat = with_numbered_factors()
     shared = replace(config, method=replace(config.method, shared=True))
-    got = np.asarray(jitted(common.rewards, shared)(every_step(learner), paid_by(learner)))
-    alive = steps.before.alive[:, 0]
-    for row, there, numbers in zip(got, alive, own, strict=True):
-        for team in RIVALS.teams:
-            some = there[team.agents]
-            want = numbers[team.agents][some].mean() if some.any() else 0
-            np.testing.assert_allclose(row[team.agents], want * some, rtol=1e-5)
+    reward = np.asarray(jitted(rewards, shared)(stored_steps(learner), reward_state(learner)))
+    alive = steps.timestep.alive[:, 0]
+    for row, row_alive, row_r_hat in zip(reward, alive, r_hat, strict=True):
+        for team in TWO_TEAMS.teams:
+            mask = row_alive[team.agents]
+            expected = row_r_hat[team.agents][mask].mean() if mask.any() else 0
+            np.testing.assert_allclose(row[team.agents], expected * mask, rtol=1e-5)
 
 
-def test_every_team_is_measured_by_itself_and_by_those_who_are_there():
-    """Decoders that say the true reward, and its negative; of who has left, something else."""
-    config, steps = TEAMS("lare-linear", factors=(1, 1)), steps_of(RIVALS)
-    alive = steps.before.alive
-    factors = np.where(alive, steps.after.reward, 1e3)[..., None]
-    learner = says_its_factor(with_steps(untrained(config), config, steps, factors), [1.0, -1.0])
-    found = jitted(common.assess, config)(learner)
-    assert {name: round(float(value), 3) for name, value in found.items() if "correlation" in name} == {
+def test_assess_measures_each_team():
+    # r_hat is the true reward in the first team and its negative in the second; of dead agents, another number.
+    config, steps = TEAMS("lare-linear", n_factors=(1, 1)), random_steps(TWO_TEAMS)
+    alive = steps.timestep.alive
+    factors = np.where(alive, steps.next_timestep.reward, 1e3)[..., None]
+    learner = with_factor_decoders(add_steps(untrained_learner(config), config, steps, factors), [1.0, -1.0])
+    results = jitted(assess, config)(learner)
+    assert {name: round(float(value), 3) for name, value in results.items() if "correlation" in name} == {
         "credit/correlation": 1,
         "credit/correlation_first": 1,
         "credit/correlation_second": -1,
     }
-    assert float(found["credit/error"]) == float(found["credit/error_first"]) == pytest.approx(0, abs=1e-6)
-    true, there = steps.after.reward[..., 3:], alive[..., 3:]
-    assert float(found["credit/error_second"]) == pytest.approx(2 * np.abs(true[there]).mean(), rel=1e-4)
+    assert float(results["credit/error"]) == float(results["credit/error_first"]) == pytest.approx(0, abs=1e-6)
+    true, mask = steps.next_timestep.reward[..., 3:], alive[..., 3:]
+    assert float(results["credit/error_second"]) == pytest.approx(2 * np.abs(true[mask]).mean(), rel=1e-4)
 
 
-def test_a_closed_form_takes_the_mean_over_steps_and_over_agents_who_are_there():
-    config, steps = TEAMS("lare-linear"), steps_of(RIVALS)
-    factors, learner = factors_for(config, steps), stored(config)
-    for credit, team, size in zip(learner.credit, RIVALS.teams, config.factors, strict=True):
+def test_closed_form_sums_means_over_alive_agents():
+    config, steps = TEAMS("lare-linear"), random_steps(TWO_TEAMS)
+    factors, learner = random_factors(config, steps), learner_with_episodes(config)
+    for credit, team, size in zip(learner.credit, TWO_TEAMS.teams, config.n_factors, strict=True):
         rows = []
-        for of_step, alive in zip(
-            factors[:, 0, team.agents, :size], steps.before.alive[:, 0, team.agents], strict=True
+        for factors_t, alive in zip(
+            factors[:, 0, team.agents, :size], steps.timestep.alive[:, 0, team.agents], strict=True
         ):
-            rows.append(of_step[alive].mean(axis=0) if alive.any() else np.full(size, np.nan))
-        check_closed_form(credit, np.split(np.array(rows), ENDS), np.split(earnings(steps, team), ENDS))
+            rows.append(factors_t[alive].mean(axis=0) if alive.any() else np.full(size, np.nan))
+        check_closed_form(credit, np.split(np.array(rows), ENDS), np.split(team_rewards(steps, team), ENDS))
 
 
-@pytest.mark.parametrize("method", ["lare-rd", long("lare-rrdu")])
-@pytest.mark.parametrize("fixed_length", [False, long(True)])
-def test_must_learn_who_earned_what(method, fixed_length):
-    """Of two factors one is the true reward of the agent; the decoder is told the mean over agents and steps."""
+@pytest.mark.parametrize("method", ["lare-rd", long_case("lare-rrdu")])
+@pytest.mark.parametrize("fixed_length", [False, long_case(True)])
+def test_must_learn_which_agent_earned_the_reward(method, fixed_length):
+    # One of two factors is the true reward of the agent. The decoder is fitted to the mean over agents and steps.
     env = EnvSpec((Team("all", 0, 3),), 3, 4, True, 12, agents_leave=not fixed_length, fixed_length=fixed_length)
     config = MANY(
         method,
         env=env,
-        environments=8,
+        n_envs=8,
         fit_updates=500,
         credit=CreditSettings(hidden=(16,), learning_rate=1e-2, steps=200, drawn_steps=6),
         capacity=200,
         rollout_steps=60,
     )
     lengths = (12,) * 5 if fixed_length else LENGTHS
-    steps = steps_of(env, 8, lengths=lengths)
-    noise = np.random.default_rng(0).normal(size=steps.after.reward.shape).astype(np.float32)
-    learner = with_steps(untrained(config), config, steps, np.stack([steps.after.reward, noise], axis=-1))
-    credit, _ = jax.jit(partial(common.fit_often, config=config))(learner, jax.random.key(2))
-    found = jitted(common.assess, config)(learner._replace(credit=credit))
-    assert float(found["credit/correlation"]) > 0.9
-    assert float(found["credit/error"]) < 0.35  # untrained, it is 0.8 and more
+    steps = random_steps(env, 8, lengths=lengths)
+    noise = np.random.default_rng(0).normal(size=steps.next_timestep.reward.shape).astype(np.float32)
+    learner = add_steps(
+        untrained_learner(config), config, steps, np.stack([steps.next_timestep.reward, noise], axis=-1)
+    )
+    decoders, _ = jax.jit(partial(fit_repeatedly, config=config))(learner, jax.random.key(2))
+    results = jitted(assess, config)(learner._replace(credit=decoders))
+    assert float(results["credit/correlation"]) > 0.9
+    assert float(results["credit/error"]) < 0.35  # untrained, it is 0.8 and more
 
 
-# Who has left.
+# Agents that leave
 
 FITTED = ["rd", "rrdu", "vib-rd", "lare-rd", "lare-rrdu", "lare-linear", "lare-signs", "lare-rd-shared", "llm-reward"]
 
 
 @pytest.mark.parametrize("method", FITTED)
-def test_what_stands_where_an_agent_has_left_changes_nothing(method):
-    config, steps = MANY(method), steps_of(TOGETHER)
-    gone, factors = ~steps.before.alive, factors_for(config, steps)
-    assert 0.1 < gone.mean() < 0.5
-    # What an agent's own last step led to is of its last step.
-    long_gone = gone & np.roll(gone, 1, axis=0) & ~np.roll(steps.ended, 1, axis=0)[..., None]
-    assert long_gone.any()
-    spoilt = steps._replace(
-        before=steps.before._replace(observation=np.where(long_gone[..., None], 99, steps.before.observation)),
-        after=steps.after._replace(
-            observation=np.where(gone[..., None], 99, steps.after.observation),
-            reward=np.where(gone, 99, steps.after.reward),
+def test_values_of_dead_agents_change_nothing(method):
+    config, steps = MANY(method), random_steps(ONE_TEAM)
+    dead, factors = ~steps.timestep.alive, random_factors(config, steps)
+    assert 0.1 < dead.mean() < 0.5
+    # The next observation of an agent's last step still counts.
+    long_dead = dead & np.roll(dead, 1, axis=0) & ~np.roll(steps.ended, 1, axis=0)[..., None]
+    assert long_dead.any()
+    changed = steps._replace(
+        timestep=steps.timestep._replace(observation=np.where(long_dead[..., None], 99, steps.timestep.observation)),
+        next_timestep=steps.next_timestep._replace(
+            observation=np.where(dead[..., None], 99, steps.next_timestep.observation),
+            reward=np.where(dead, 99, steps.next_timestep.reward),
         ),
-        action=np.where(gone[..., None], np.eye(4, dtype=np.float32)[0], steps.action),
+        action=np.where(dead[..., None], np.eye(4, dtype=np.float32)[0], steps.action),
     )
-    found = []
-    for given, z in ((steps, factors), (spoilt, np.where(gone[..., None], 99, factors).astype(np.float32))):
-        learner = with_steps(untrained(config), config, given, z)
-        rewards = jitted(common.rewards, config)(every_step(learner), paid_by(learner))
-        assert not np.asarray(rewards)[gone[:, 0]].any()
-        update = fitted(learner, config) if config.method.descends else ()
-        found.append((learner.credit, learner.scale, rewards, update, jitted(common.assess, config)(learner)))
-    close(*found)
+    results = []
+    for trajectory, z in ((steps, factors), (changed, np.where(dead[..., None], 99, factors).astype(np.float32))):
+        learner = add_steps(untrained_learner(config), config, trajectory, z)
+        reward = jitted(rewards, config)(stored_steps(learner), reward_state(learner))
+        assert not np.asarray(reward)[dead[:, 0]].any()
+        update = update_once(learner, config) if config.method.uses_gradient else ()
+        results.append((learner.credit, learner.scale, reward, update, jitted(assess, config)(learner)))
+    assert_close(*results)
 
 
 @pytest.mark.parametrize(
     "method",
-    ["dense", "ircr", long("rd"), "rrdu", "lare-rd", "lare-linear", *map(long, ("episodic", "lare-rd-shared"))],
+    [
+        "dense",
+        "ircr",
+        long_case("rd"),
+        "rrdu",
+        "lare-rd",
+        "lare-linear",
+        *map(long_case, ("episodic", "lare-rd-shared")),
+    ],
 )
-def test_an_agent_that_was_never_there_is_as_none(method):
-    """Three agents of whom one never acts, and the same two alone."""
-    two = replace(TOGETHER, teams=(Team("all", 0, 2),))
+def test_agent_that_never_acts_changes_nothing(method):
+    two = replace(ONE_TEAM, teams=(Team("all", 0, 2),))
     many, few = MANY(method), MANY(method, env=two)
-    steps = steps_of(TOGETHER)
-    factors = factors_for(many, steps)
+    steps = random_steps(ONE_TEAM)
+    factors = random_factors(many, steps)
 
-    def never(shown):
-        alive = shown.alive & (np.arange(3) < 2)
-        return shown._replace(alive=alive, reward=shown.reward * (np.arange(3) < 2))
+    def without_third_agent(timestep):
+        alive = timestep.alive & (np.arange(3) < 2)
+        return timestep._replace(alive=alive, reward=timestep.reward * (np.arange(3) < 2))
 
-    def without(shown):
-        return shown._replace(
-            **{name: getattr(shown, name)[:, :, :2] for name in ("observation", "available", "alive", "reward")}
+    def first_two_agents(timestep):
+        return timestep._replace(
+            **{name: getattr(timestep, name)[:, :, :2] for name in ("observation", "available", "alive", "reward")}
         )
 
-    there = steps._replace(before=never(steps.before), after=never(steps.after))
-    alone = there._replace(
-        before=without(there.before),
-        after=without(there.after),
-        action=steps.action[:, :, :2],
-        taken=steps.taken[:, :, :2],
+    padded = steps._replace(
+        timestep=without_third_agent(steps.timestep), next_timestep=without_third_agent(steps.next_timestep)
     )
-    start = untrained(many)
-    one = with_steps(start, many, there, factors)
-    other = with_steps(untrained(few)._replace(credit=start.credit), few, alone, factors[:, :, :2])
-    assert jax.tree.structure(one.credit) == jax.tree.structure(other.credit)
-    found = []
-    for learner, config in ((one, many), (other, few)):
-        rewards = jitted(common.rewards, config)(every_step(learner), paid_by(learner))[:, :2]
-        update = fitted(learner, config) if config.method.descends else ()
-        found.append((learner.credit, learner.scale, rewards, update, jitted(common.assess, config)(learner)))
-    close(*found, 1e-3, 1e-4)
+    alone = padded._replace(
+        timestep=first_two_agents(padded.timestep),
+        next_timestep=first_two_agents(padded.next_timestep),
+        action=steps.action[:, :, :2],
+        env_action=steps.env_action[:, :, :2],
+    )
+    start = untrained_learner(many)
+    first = add_steps(start, many, padded, factors)
+    second = add_steps(untrained_learner(few)._replace(credit=start.credit), few, alone, factors[:, :, :2])
+    assert jax.tree.structure(first.credit) == jax.tree.structure(second.credit)
+    results = []
+    for learner, config in ((first, many), (second, few)):
+        reward = jitted(rewards, config)(stored_steps(learner), reward_state(learner))[:, :2]
+        update = update_once(learner, config) if config.method.uses_gradient else ()
+        results.append((learner.credit, learner.scale, reward, update, jitted(assess, config)(learner)))
+    assert_close(*results, 1e-3, 1e-4)
 
 
-# Judged from the global state.
+# Credit to whole teams, by the global state
 
 
-def judged_by_state(method, **changes):
-    return MANY(method, judged_from="state", **changes)
+def team_level_config(method, **changes):
+    return MANY(method, credit_scope="state", **changes)
 
 
-@pytest.mark.parametrize("method", [long("rd"), "rrdu", "rd-linear", long("lare-rd"), "lare-linear", "llm-reward"])
-def test_credit_of_the_state_is_one_row_a_step_and_pays_all_who_are_there_alike(method):
-    config, steps = judged_by_state(method, factors=(2,) if method[0] == "l" else ()), steps_of(TOGETHER)
-    learner = stored(config)
-    assert config.judged_rows == 1
-    drawn = every_step(learner)
-    rows = common.features(drawn, config, 0) if config.method.fit else drawn.before["factors"]
-    want = factors_for(config, steps)[:, 0] if config.method.latent else drawn.after["state"][:, None]
+@pytest.mark.parametrize(
+    "method", [long_case("rd"), "rrdu", "rd-linear", long_case("lare-rd"), "lare-linear", "llm-reward"]
+)
+def test_team_level_rewards_are_the_same_for_all_alive_agents(method):
+    config, steps = team_level_config(method, n_factors=(2,) if method[0] == "l" else ()), random_steps(ONE_TEAM)
+    learner = learner_with_episodes(config)
+    assert config.credit_rows == 1
+    stored = stored_steps(learner)
+    rows = decoder_inputs(stored, config, 0) if config.method.fit else stored.columns["factors"]
+    expected = random_factors(config, steps)[:, 0] if config.method.needs_phi else stored.next_columns["state"][:, None]
     if method == "rd-linear":
-        want = np.concatenate([want, np.clip(drawn.before["action"], -1, 1).reshape(TOTAL, 1, -1)], axis=-1)
-    np.testing.assert_array_equal(rows, want)
+        expected = np.concatenate([expected, np.clip(stored.columns["action"], -1, 1).reshape(TOTAL, 1, -1)], axis=-1)
+    np.testing.assert_array_equal(rows, expected)
     assert rows.shape[:2] == (TOTAL, 1)
-    got = np.asarray(jitted(common.rewards, config)(drawn, paid_by(learner)))
-    alive = steps.before.alive[:, 0]
-    of_step = got.sum(axis=1) / np.maximum(alive.sum(axis=1), 1)
-    np.testing.assert_allclose(got, of_step[:, None] * alive, rtol=1e-5, atol=1e-6)
-    assert of_step[alive.any(axis=1)].std() > 0
+    reward = np.asarray(jitted(rewards, config)(stored, reward_state(learner)))
+    alive = steps.timestep.alive[:, 0]
+    team_reward = reward.sum(axis=1) / np.maximum(alive.sum(axis=1), 1)
+    np.testing.assert_allclose(reward, team_reward[:, None] * alive, rtol=1e-5, atol=1e-6)
+    assert team_reward[alive.any(axis=1)].std() > 0
     if learner.credit:
-        assert float(learner.credit[0].statistics.rows) == TOTAL
-        if config.method.descends:
-            _, measured = fitted(learner, config)
-            assert np.isfinite(float(measured["credit/loss"]))
+        assert float(learner.credit[0].statistics.n_rows) == TOTAL
+        if config.method.uses_gradient:
+            _, metrics = update_once(learner, config)
+            assert np.isfinite(float(metrics["credit/loss"]))
 
 
-def test_what_is_stored_of_the_state_is_what_it_was():
-    config, steps = judged_by_state("rd"), steps_of(TOGETHER)
-    drawn = every_step(stored(config))
-    np.testing.assert_array_equal(drawn.before["state"], steps.before.state[:, 0])
-    np.testing.assert_array_equal(drawn.after["state"], steps.after.state[:, 0])
-    assert "observation" not in drawn.before
+def test_team_level_stores_the_state():
+    config, steps = team_level_config("rd"), random_steps(ONE_TEAM)
+    stored = stored_steps(learner_with_episodes(config))
+    np.testing.assert_array_equal(stored.columns["state"], steps.timestep.state[:, 0])
+    np.testing.assert_array_equal(stored.next_columns["state"], steps.next_timestep.state[:, 0])
+    assert "observation" not in stored.columns
 
 
-def test_the_closed_form_of_the_state_against_numpy():
-    config, steps = judged_by_state("lare-linear"), steps_of(TOGETHER)
-    factors = factors_for(config, steps)
-    team = TOGETHER.teams[0]
-    credit = stored(config).credit[0]
-    check_closed_form(credit, np.split(factors[:, 0, 0], ENDS), np.split(earnings(steps, team), ENDS))
+def test_team_level_closed_form():
+    config, steps = team_level_config("lare-linear"), random_steps(ONE_TEAM)
+    factors = random_factors(config, steps)
+    team = ONE_TEAM.teams[0]
+    decoder = learner_with_episodes(config).credit[0]
+    check_closed_form(decoder, np.split(factors[:, 0, 0], ENDS), np.split(team_rewards(steps, team), ENDS))
 
 
-def test_credit_of_the_state_is_measured_against_what_the_team_earned():
-    config, steps = judged_by_state("lare-linear", factors=(1,)), steps_of(TOGETHER)
-    earned = earnings(steps, TOGETHER.teams[0]).astype(np.float32)
-    learner = with_steps(untrained(config), config, steps, 0.5 + earned[:, None, None, None])
-    found = jitted(common.assess, config)(says_its_factor(learner, [1.0]))
-    assert float(found["credit/error"]) == pytest.approx(0.5, rel=1e-4)
-    assert float(found["credit/correlation"]) == pytest.approx(1, rel=1e-4)
+def test_team_level_assess():
+    config, steps = team_level_config("lare-linear", n_factors=(1,)), random_steps(ONE_TEAM)
+    reward = team_rewards(steps, ONE_TEAM.teams[0]).astype(np.float32)
+    learner = add_steps(untrained_learner(config), config, steps, 0.5 + reward[:, None, None, None])
+    results = jitted(assess, config)(with_factor_decoders(learner, [1.0]))
+    assert float(results["credit/error"]) == pytest.approx(0.5, rel=1e-4)
+    assert float(results["credit/correlation"]) == pytest.approx(1, rel=1e-4)
 
 
-@pytest.mark.parametrize(("env", "score"), [(ALONE, "sum"), long(TOGETHER, "average")])
-def test_optimism_adds_deviations_to_what_is_paid_and_to_nothing_else(env, score):
-    algorithm = "td3" if env is ALONE else "ippo"
-    plain, hopeful = (
-        config_of("lare-bayes", algorithm, env, credit=CreditSettings(score=score, optimism=optimism))
+@pytest.mark.parametrize(("env", "score"), [(ONE_AGENT, "sum"), long_case(ONE_TEAM, "average")])
+def test_optimism_adds_deviations_to_training_rewards_only(env, score):
+    algorithm = "td3" if env is ONE_AGENT else "ippo"
+    plain, optimistic = (
+        small_config("lare-bayes", algorithm, env, credit=CreditSettings(score=score, optimism=optimism))
         for optimism in (0.0, 2.0)
     )
-    one, other = stored(plain), stored(hopeful)
-    steps, paid = every_step(one), paid_by(other)
-    before = np.asarray(jitted(common.rewards, plain)(steps, paid_by(one)))
-    after = np.asarray(jitted(common.rewards, hopeful)(steps, paid))
-    features = common.features(steps, hopeful, 0)
+    first, second = learner_with_episodes(plain), learner_with_episodes(optimistic)
+    steps, state = stored_steps(first), reward_state(second)
+    before = np.asarray(jitted(rewards, plain)(steps, reward_state(first)))
+    after = np.asarray(jitted(rewards, optimistic)(steps, state))
+    features = decoder_inputs(steps, optimistic, 0)
     with jax.enable_x64(True):
         rows = features.reshape(-1, features.shape[-1])
-        deviation = np.asarray(returns.deviation(other.credit[0], rows, hopeful.forms)).reshape(before.shape)
-    parts = np.where(other.credit[0].average, np.asarray(steps.length), 1).reshape(-1, 1)
-    alive = np.asarray(common.alive(steps, hopeful))
-    np.testing.assert_allclose(after, np.where(alive, before + 2 * deviation / parts, 0), rtol=1e-3, atol=1e-5)
+        deviation = np.asarray(returns.reward_std(second.credit[0], rows, optimistic.score_types)).reshape(before.shape)
+    divisor = np.where(second.credit[0].is_mean, np.asarray(steps.length), 1).reshape(-1, 1)
+    alive = np.asarray(alive_agents(steps, optimistic))
+    np.testing.assert_allclose(after, np.where(alive, before + 2 * deviation / divisor, 0), rtol=1e-3, atol=1e-5)
     assert (after[alive] > before[alive]).all()
-    np.testing.assert_array_equal(np.where(alive, jitted(proxy_rewards, hopeful)(steps, paid), 0), before)
-    for name, value in jitted(common.assess, plain)(one).items():
-        np.testing.assert_array_equal(jitted(common.assess, hopeful)(other)[name], value)
+    np.testing.assert_array_equal(np.where(alive, jitted(proxy_rewards, optimistic)(steps, state), 0), before)
+    for name, value in jitted(assess, plain)(first).items():
+        np.testing.assert_array_equal(jitted(assess, optimistic)(second)[name], value)
 
 
-def test_optimism_waits_for_two_returns():
-    config = config_of("bayes", credit=CreditSettings(optimism=2.0))
-    learner = untrained(config)
-    paid = jitted(common.rewards, config)(every_step(stored(config)), paid_by(learner))
-    np.testing.assert_array_equal(paid, 0)
+def test_optimism_before_two_returns():
+    config = small_config("bayes", credit=CreditSettings(optimism=2.0))
+    learner = untrained_learner(config)
+    reward = jitted(rewards, config)(stored_steps(learner_with_episodes(config)), reward_state(learner))
+    np.testing.assert_array_equal(reward, 0)

@@ -1,4 +1,4 @@
-"""The updates of TD3 in one compiled call."""
+"""The training step of algorithms that consume transitions."""
 
 from functools import partial
 
@@ -7,94 +7,94 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.recipes import (
-    ALONE,
-    config_of,
-    factors_for,
+from helpers.small_configs import (
+    ONE_AGENT,
+    add_steps,
     jitted,
-    paid_by,
+    learner_with_episodes,
+    random_factors,
+    random_steps,
     read,
-    steps_of,
+    reward_state,
+    small_config,
     store_seeds,
-    stored,
-    untrained,
-    with_steps,
+    untrained_learner,
 )
-from lare_rl.algorithms import td3
+from lare_rl.algorithms.td3 import td3
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.data import replay
-from lare_rl.training import learner as common
 from lare_rl.training import off_policy
-from lare_rl.training.compiled import compiled
+from lare_rl.training.compiled import compile_functions
+from lare_rl.training.rewards import RewardState, rewards
 
 
-def test_relabelling_is_by_the_newest_decoder():
-    """One update: the critic's loss is that of the rewards of the decoder after its step, not before."""
+def test_train_step_relabels_by_the_newest_decoder():
     credit = CreditSettings(hidden=(8,), drawn_steps=4, steps=24, learning_rate=0.3)
-    config = config_of("lare-rrdu", rollout_steps=1, credit=credit)
-    learner = stored(config)
-    after, metrics = jitted(off_policy.improve_one, config)(learner, steps_of(), jax.random.key(0), jnp.array(0))
-    draw_key, _, noise_key = jax.random.split(jax.random.key(0), 3)
-    index = jax.tree.map(lambda leaf: leaf[0], off_policy.sample(learner.replay, draw_key, 1, config).batch)
-    batch, losses = read(learner.replay, index), []
+    config = small_config("lare-rrdu", rollout_steps=1, credit=credit)
+    learner = learner_with_episodes(config)
+    updated, metrics = jitted(off_policy._train_seed, config)(learner, jax.random.key(0), jnp.array(0))
+    sample_key, _, noise_key = jax.random.split(jax.random.key(0), 3)
+    sample = off_policy._sample(learner.replay, sample_key, 1, config)
+    steps, losses = read(learner.replay, jax.tree.map(lambda leaf: leaf[0], sample.batch)), []
     update = jax.jit(partial(td3.update, settings=config.hyperparameters))
-    for decoder in (learner.credit, after.credit):
-        reward = jitted(common.rewards, config)(batch, common.Paid(decoder, learner.scale))
+    for decoders in (learner.credit, updated.credit):
+        reward = jitted(rewards, config)(steps, RewardState(decoders, learner.scale))
         _, key = jax.random.split(jax.random.split(noise_key, 1)[0])
-        seen = off_policy.transitions(batch, reward)
-        _, measured = update(learner.algorithm, seen, key, jnp.array(0))
-        losses.append(float(measured["critic/loss"]))
+        _, update_metrics = update(learner.algorithm, off_policy._transitions(steps, reward), key, jnp.array(0))
+        losses.append(float(update_metrics["critic/loss"]))
     assert float(metrics["critic/loss"]) == pytest.approx(losses[1], rel=1e-4)
     assert losses[0] != pytest.approx(losses[1], rel=1e-2)
 
 
 @pytest.mark.parametrize("envs", [1, 2])
-def test_an_update_for_each_step_and_nothing_is_expected_after_a_termination(envs, monkeypatch):
-    config, given, batches = config_of("dense", rollout_steps=3, environments=envs), steps_of(envs=envs), []
-    ends = np.argwhere(given.ended)
-    given.after.terminated[tuple(ends[::2].T)] = True
-    learner = with_steps(untrained(config), config, given)
+def test_train_step_updates_once_for_each_step(envs, monkeypatch):
+    config, steps, batches = small_config("dense", rollout_steps=3, n_envs=envs), random_steps(envs=envs), []
+    steps.next_timestep.terminated[tuple(np.argwhere(steps.ended)[::2].T)] = True
+    learner, td3_update = add_steps(untrained_learner(config), config, steps), td3.update
 
-    def update(algorithm, batch, key, number, settings):
-        jax.debug.callback(lambda *rows: batches.append(rows), number, *batch)
-        return td3_update(algorithm, batch, key, number, settings)
+    def update(state, batch, key, update_index, settings):
+        jax.debug.callback(lambda *arrays: batches.append(arrays), update_index, *batch)
+        return td3_update(state, batch, key, update_index, settings)
 
-    td3_update = td3.update
     monkeypatch.setattr(td3, "update", update)
-    off_policy.improve_one(learner, given, jax.random.key(0), jnp.array(10), config)
+    off_policy._train_seed(learner, jax.random.key(0), jnp.array(10), config)
     jax.effects_barrier()
-    assert sorted(int(number) for number, *_ in batches) == list(range(10, 10 + 3 * envs))
-    seen, flat = 0, [rows.reshape(-1, *rows.shape[2:]) for rows in (given.before.observation, given.after.observation)]
-    terminated, reward = given.after.terminated.ravel(), given.after.reward.ravel()
-    for _, observation, action, paid, led_to, continues in batches:
-        rows = [int(np.argmin(np.abs(flat[0][:, 0] - one).sum(axis=1))) for one in observation]
-        np.testing.assert_array_equal(continues, 1.0 - terminated[rows])
-        np.testing.assert_array_equal(led_to, flat[1][rows, 0])
-        np.testing.assert_array_equal(action, given.action.reshape(-1, ALONE.action_size)[rows])
-        np.testing.assert_array_equal(paid, reward[rows])
-        seen += terminated[rows].sum()
-    assert seen
+    assert sorted(int(update_index) for update_index, *_ in batches) == list(range(10, 10 + 3 * envs))
+
+    def merge_envs(rows):
+        return rows.reshape(-1, *rows.shape[2:])
+
+    observation, next_observation = map(merge_envs, (steps.timestep.observation, steps.next_timestep.observation))
+    terminated, reward = steps.next_timestep.terminated.ravel(), steps.next_timestep.reward.ravel()
+    n_terminated = 0
+    for _, *batch in batches:
+        batch = td3.Transitions(*batch)
+        rows = [int(np.argmin(np.abs(observation[:, 0] - row).sum(axis=1))) for row in batch.observation]
+        np.testing.assert_array_equal(batch.terminated, terminated[rows])
+        np.testing.assert_array_equal(batch.next_observation, next_observation[rows, 0])
+        np.testing.assert_array_equal(batch.action, steps.action.reshape(-1, ONE_AGENT.action_size)[rows])
+        np.testing.assert_array_equal(batch.reward, reward[rows])
+        n_terminated += terminated[rows].sum()
+    assert n_terminated
 
 
-def test_scaled_rewards_are_those_in_units_of_the_mean_return():
-    plain, scaled = config_of("dense"), config_of("dense", scale_rewards=True)
-    learner = stored(plain)
-    draw = replay.read(learner.replay, off_policy.sample(learner.replay, jax.random.key(0), 1, plain).batch)
-    one, other = (jitted(common.rewards, config)(draw, paid_by(learner)) for config in (plain, scaled))
-    np.testing.assert_allclose(other, one / jnp.sqrt(learner.scale[0].mean_square), rtol=1e-5)
+def test_scale_rewards_divides_by_the_scale_of_returns():
+    plain, scaled = small_config("dense"), small_config("dense", scale_rewards=True)
+    learner = learner_with_episodes(plain)
+    steps = read(learner.replay, off_policy._sample(learner.replay, jax.random.key(0), 1, plain).batch)
+    reward, scaled_reward = (jitted(rewards, config)(steps, reward_state(learner)) for config in (plain, scaled))
+    np.testing.assert_allclose(scaled_reward, reward / jnp.sqrt(learner.scale[0].mean_square), rtol=1e-5)
 
 
-def test_seeds_in_lockstep_are_seeds_alone():
-    config = config_of("lare-rrdu")
-    functions = compiled(config)
+def test_train_step_of_seeds_in_lockstep():
+    config = small_config("lare-rrdu")
+    functions = compile_functions(config)
     keys = jax.vmap(jax.random.key)(jnp.arange(3))
-    start, steps = functions.init(keys), steps_of()
-    many, factors = (
-        jax.tree.map(lambda leaf: np.stack([leaf] * 3), part) for part in (steps, factors_for(config, steps))
-    )
+    start, steps = functions.init(keys), random_steps()
+    stacked = jax.tree.map(lambda leaf: np.stack([leaf] * 3), (steps, random_factors(config, steps)))
     alone = jax.tree.map(lambda leaf: np.asarray(leaf)[1], start)
-    together, _ = functions.improve(functions.learn_returns(store_seeds(config)(start, many, factors)), many, keys, 0)
-    alone = with_steps(alone, config, steps, tell=True)
-    alone, _ = jax.jit(partial(off_policy.improve_one, config=config))(alone, steps, keys[1], jnp.array(0))
+    together = functions.learn_returns(store_seeds(config)(start, *stacked))
+    together, _ = functions.train_step(together, stacked[0], keys, 0)
+    alone = add_steps(alone, config, steps, learn=True)
+    alone, _ = jax.jit(partial(off_policy._train_seed, config=config))(alone, keys[1], jnp.array(0))
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
         np.testing.assert_allclose(np.asarray(a)[1], b, rtol=1e-4, atol=1e-5)

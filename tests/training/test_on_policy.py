@@ -1,4 +1,4 @@
-"""The training step of PPO, for one agent and for many."""
+"""The training step of algorithms that consume rollouts, for one agent and for many."""
 
 from dataclasses import replace
 from functools import partial
@@ -8,216 +8,210 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.recipes import (
-    ALONE,
+from helpers.long_tests import long_case
+from helpers.small_configs import (
     LENGTHS,
-    QUICK,
-    RIVALS,
-    TOGETHER,
+    ONE_AGENT,
+    ONE_TEAM,
+    SMALL_SETTINGS,
     TOTAL,
-    config_of,
-    every_step,
-    factors_for,
+    TWO_TEAMS,
+    add_steps,
     jitted,
-    paid_by,
-    steps_of,
+    random_factors,
+    random_steps,
+    reward_state,
+    small_config,
     store_seeds,
-    untrained,
-    with_steps,
+    stored_steps,
+    untrained_learner,
 )
-from helpers.tiers import long
+from lare_rl.algorithms.ppo import ppo
 from lare_rl.nn.normalise import standardise
-from lare_rl.training import learner as common
 from lare_rl.training import on_policy
-from lare_rl.training.compiled import compiled
+from lare_rl.training.compiled import compile_functions
+from lare_rl.training.decoder_fits import fit_repeatedly
+from lare_rl.training.rewards import rewards
 
-ppo = partial(config_of, algorithm="ppo", rollout_steps=20)
-ippo = partial(config_of, algorithm="ippo", rollout_steps=20)
+ppo_config = partial(small_config, algorithm="ppo", rollout_steps=20)
+ippo_config = partial(small_config, algorithm="ippo", rollout_steps=20)
 
 
 def newest(steps, count=20):
     return jax.tree.map(lambda rows: jnp.asarray(rows[-count:]), steps)
 
 
-def taken(config, steps, factors=None):
-    """A learner that has met some steps, and the rollout of the last 20."""
-    learner = with_steps(untrained(config), config, steps, factors)
-    return learner, jitted(on_policy.rollout, config)(learner, newest(steps))
+def store_and_roll_out(config, steps, factors=None):
+    """Return a learner that has stored steps, and the rollout of the last 20."""
+    learner = add_steps(untrained_learner(config), config, steps, factors)
+    return learner, jitted(on_policy._rollout, config)(learner, newest(steps))
 
 
 @pytest.mark.parametrize("method", ["dense", "episodic", "lare-rrdu"])
-def test_the_rollout_is_the_newest_steps_with_what_the_method_pays(method):
-    config, steps = ppo(method), steps_of()
-    learner, rollout = taken(config, steps)
+def test_rollout_has_the_newest_steps_with_the_rewards_of_the_method(method):
+    config, steps = ppo_config(method), random_steps()
+    learner, rollout = store_and_roll_out(config, steps)
     last = newest(steps)
-    np.testing.assert_array_equal(rollout.observation, last.before.observation[:, 0])
-    np.testing.assert_array_equal(rollout.next_observation, last.after.observation[:, 0])
+    np.testing.assert_array_equal(rollout.observation, last.timestep.observation[:, 0])
+    np.testing.assert_array_equal(rollout.next_observation, last.next_timestep.observation[:, 0])
     np.testing.assert_array_equal(rollout.action, last.action[:, 0])
-    np.testing.assert_array_equal(rollout.ended, last.ended)
-    want = jitted(common.rewards, config)(every_step(learner), paid_by(learner))[-20:]
-    np.testing.assert_allclose(rollout.reward, want, rtol=1e-5)
+    np.testing.assert_array_equal(rollout.done, last.ended)
+    expected = jitted(rewards, config)(stored_steps(learner), reward_state(learner))[-20:]
+    np.testing.assert_allclose(rollout.reward, expected, rtol=1e-5)
     if method == "episodic":
-        returns = [part.sum() for part in np.split(steps.after.reward.ravel(), np.cumsum(LENGTHS)[:-1])]
-        np.testing.assert_allclose(rollout.reward[last.ended], returns[-2:], rtol=1e-4)
+        episodes = np.split(steps.next_timestep.reward.ravel(), np.cumsum(LENGTHS)[:-1])
+        np.testing.assert_allclose(rollout.reward[last.ended], [e.sum() for e in episodes[-2:]], rtol=1e-4)
     assert rollout.mask is rollout.available is None
 
 
-def test_what_terminated_is_told_from_what_ran_out_of_time():
-    """The last two episodes end: the first of them is out of time, the second terminated."""
-    config, steps = ppo("dense"), steps_of()
-    steps.after.terminated[-1] = True
-    _, rollout = taken(config, steps)
-    assert rollout.ended.sum() == 2
-    np.testing.assert_array_equal(rollout.continues[:, 0], [1.0] * 19 + [0.0])
+def test_rollout_tells_termination_from_truncation():
+    config, steps = ppo_config("dense"), random_steps()
+    steps.next_timestep.terminated[-1] = True  # the episode before is truncated
+    _, rollout = store_and_roll_out(config, steps)
+    assert rollout.done.sum() == 2
+    np.testing.assert_array_equal(rollout.terminated[:, 0], [0.0] * 19 + [1.0])
 
 
-def test_without_discounting_a_time_limit_is_an_end():
-    """What would follow it has no finite value. The step is cut off from what comes next as if it had terminated."""
-    undiscounted = QUICK["ppo"].model_copy(update={"gamma": 1.0})
-    _, rollout = taken(ppo("dense", hyperparameters=undiscounted), steps_of())
-    assert rollout.ended.sum() == 2
-    np.testing.assert_array_equal(rollout.continues, 1 - rollout.ended)
+def test_rollout_without_discount_terminates_at_a_time_limit():
+    undiscounted = SMALL_SETTINGS["ppo"].model_copy(update={"gamma": 1.0})
+    _, rollout = store_and_roll_out(ppo_config("dense", hyperparameters=undiscounted), random_steps())
+    assert rollout.done.sum() == 2
+    np.testing.assert_array_equal(rollout.terminated, rollout.done)
 
 
-def test_an_episode_that_goes_on_has_not_ended():
-    steps = jax.tree.map(lambda rows: rows[:-3], steps_of())
-    _, rollout = taken(ppo("dense"), steps)
-    np.testing.assert_array_equal(rollout.ended, steps.ended[-20:])
-    assert not rollout.ended[-1, 0]
+def test_rollout_of_a_running_episode():
+    steps = jax.tree.map(lambda rows: rows[:-3], random_steps())
+    _, rollout = store_and_roll_out(ppo_config("dense"), steps)
+    np.testing.assert_array_equal(rollout.done, steps.ended[-20:])
+    assert not rollout.done[-1, 0]
 
 
-def test_annealing_goes_by_what_is_left(monkeypatch):
-    config, remaining = ppo("dense", steps=100), []
+def test_train_step_hands_on_the_remaining_progress(monkeypatch):
+    config, progress = ppo_config("dense", steps=100), []
 
-    def update(algorithm, rollout, key, progress_remaining, settings):
-        remaining.append(float(progress_remaining))
-        return algorithm, {}
+    def update(state, rollout, key, remaining, settings):
+        progress.append(float(remaining))
+        return state, {}
 
-    monkeypatch.setattr(on_policy.ppo, "update", update)
-    learner, _ = taken(config, steps_of())
-    for done in (0, 20, 80):
-        on_policy.improve_one(learner, newest(steps_of()), jax.random.key(0), jnp.array(done), config)
-    assert remaining == pytest.approx([1.0, 0.8, 0.2])
+    monkeypatch.setattr(ppo, "update", update)
+    learner, _ = store_and_roll_out(config, random_steps())
+    for env_steps in (0, 20, 80):
+        on_policy._train_seed(learner, newest(random_steps()), jax.random.key(0), jnp.array(env_steps), config)
+    assert progress == pytest.approx([1.0, 0.8, 0.2])
 
 
-def test_observations_are_normalised_by_what_was_known_when_acting():
-    config, steps = ppo("dense"), steps_of()
-    learner, rollout = taken(config, steps)
-    assert float(learner.algorithm.observations.rows) == 0
-    improve = jax.jit(partial(on_policy.improve_one, config=config))
-    learner, _ = improve(learner, newest(steps), jax.random.key(0), jnp.array(0))
-    known = learner.algorithm.observations
-    np.testing.assert_allclose(known.mean, steps.before.observation[-20:, 0, 0].mean(axis=0), rtol=1e-3, atol=1e-5)
-    actor, shown = on_policy.actor(learner, 0, config), jnp.asarray(steps.before.observation[0])
-    action, _ = on_policy.act(actor, (), shown, jnp.ones((1, 1, 2), bool), None, config)
-    np.testing.assert_allclose(action, actor.policy.mode(standardise(known, shown)), rtol=1e-4, atol=1e-5)
-    prepared = on_policy.ppo.prepare(learner.algorithm, rollout, config.hyperparameters)[0]
-    np.testing.assert_allclose(
-        prepared.observation, standardise(known, rollout.observation[:, 0]), rtol=1e-4, atol=1e-5
-    )
+def test_act_normalises_by_the_statistics_of_earlier_rollouts():
+    config, steps = ppo_config("dense"), random_steps()
+    learner, rollout = store_and_roll_out(config, steps)
+    assert float(learner.algorithm.observations.n_rows) == 0
+    train = jax.jit(partial(on_policy._train_seed, config=config))
+    learner, _ = train(learner, newest(steps), jax.random.key(0), jnp.array(0))
+    statistics = learner.algorithm.observations
+    expected = steps.timestep.observation[-20:, 0, 0].mean(axis=0)
+    np.testing.assert_allclose(statistics.mean, expected, rtol=1e-3, atol=1e-5)
+    actor, observation = on_policy.get_actor(learner, 0, config), jnp.asarray(steps.timestep.observation[0])
+    action, _ = on_policy.act(actor, (), observation, jnp.ones((1, 1, 2), bool), None, config)
+    np.testing.assert_allclose(action, actor.policy.mode(standardise(statistics, observation)), rtol=1e-4, atol=1e-5)
+    prepared = ppo.prepare_batch(learner.algorithm, rollout, config.hyperparameters)[0]
+    expected = standardise(statistics, rollout.observation[:, 0])
+    np.testing.assert_allclose(prepared.observation, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("discrete", [False, True])
-def test_acting(discrete):
-    config = ppo("dense", env=replace(ALONE, discrete=discrete))
-    actor = on_policy.actor(untrained(config), 0, config)
-    noise = (
-        np.random.default_rng(0).gumbel(size=(20, 1, 2))
-        if discrete
-        else np.random.default_rng(0).normal(size=(20, 1, 2))
-    )
-    noise, shown, available = jnp.asarray(noise, jnp.float32), jnp.ones((20, 1, 3)), jnp.ones((20, 1, 2), bool)
-    drawn, memory = on_policy.act(actor, (), shown, available, noise, config)
+def test_act_with_and_without_noise(discrete):
+    config = ppo_config("dense", env=replace(ONE_AGENT, discrete=discrete))
+    actor, random = on_policy.get_actor(untrained_learner(config), 0, config), np.random.default_rng(0)
+    noise = random.gumbel(size=(20, 1, 2)) if discrete else random.normal(size=(20, 1, 2))
+    noise, observation, available = jnp.asarray(noise, jnp.float32), jnp.ones((20, 1, 3)), jnp.ones((20, 1, 2), bool)
+    explored, memory = on_policy.act(actor, (), observation, available, noise, config)
     assert memory == ()
-    best = on_policy.act(actor, (), shown, available, None, config)[0]
+    greedy = on_policy.act(actor, (), observation, available, None, config)[0]
     if discrete:
-        np.testing.assert_array_equal(np.sort(drawn, axis=-1), np.broadcast_to([0, 1], drawn.shape))
-        assert 0 < drawn[..., 0].sum() < len(drawn)
-        np.testing.assert_array_equal(best, np.broadcast_to(best[:1], best.shape))
+        np.testing.assert_array_equal(np.sort(explored, axis=-1), np.broadcast_to([0, 1], explored.shape))
+        assert 0 < explored[..., 0].sum() < len(explored)
+        np.testing.assert_array_equal(greedy, np.broadcast_to(greedy[:1], greedy.shape))
     else:
-        np.testing.assert_allclose(drawn - best, noise, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(explored - greedy, noise, rtol=1e-4, atol=1e-5)
 
 
-def test_only_what_is_available_is_chosen():
-    config = ippo("dense", env=TOGETHER)
-    actor, steps = on_policy.actor(untrained(config), 0, config), steps_of(TOGETHER)
-    noise = jax.random.gumbel(jax.random.key(0), steps.action.shape)
-    for given in (noise, None):
-        shown = (jnp.asarray(part) for part in (steps.before.observation, steps.before.available))
-        chosen, _ = on_policy.act(actor, (), *shown, given, config)
-        assert (steps.before.available & (np.asarray(chosen) > 0)).sum(axis=-1).all()
+def test_act_chooses_available_actions():
+    config = ippo_config("dense", env=ONE_TEAM)
+    actor, steps = on_policy.get_actor(untrained_learner(config), 0, config), random_steps(ONE_TEAM)
+    observation, available = map(jnp.asarray, (steps.timestep.observation, steps.timestep.available))
+    for noise in (jax.random.gumbel(jax.random.key(0), steps.action.shape), None):
+        action, _ = on_policy.act(actor, (), observation, available, noise, config)
+        assert (steps.timestep.available & (np.asarray(action) > 0)).sum(axis=-1).all()
 
 
-def test_policies_of_several_teams_know_who_they_act_for():
-    one, many = ippo("dense", env=TOGETHER), ippo("dense", env=RIVALS)
-    assert (on_policy.policy_input_size(one), on_policy.policy_input_size(many)) == (3, 3 + 5)
+def test_policy_input_of_several_teams_has_the_agent():
+    one, several = ippo_config("dense", env=ONE_TEAM), ippo_config("dense", env=TWO_TEAMS)
     rows = jnp.zeros((2, 5, 3))
     assert on_policy.policy_input(rows, one) is rows
-    np.testing.assert_array_equal(on_policy.policy_input(rows, many)[..., 3:], np.broadcast_to(np.eye(5), (2, 5, 5)))
+    one_hot = on_policy.policy_input(rows, several)[..., 3:]
+    np.testing.assert_array_equal(one_hot, np.broadcast_to(np.eye(5), (2, 5, 5)))
 
 
-def test_a_lane_is_an_agent_in_an_environment_until_it_leaves():
-    config, steps = ippo("lare-rd", env=RIVALS, environments=2), steps_of(RIVALS, 2)
-    number = np.arange(TOTAL * 2 * 5, dtype=np.float32).reshape(TOTAL, 2, 5)
-    steps = steps._replace(after=steps.after._replace(reward=number))
-    steps.after.terminated[steps.ended] = True
-    config = replace(config, method=config_of("dense").method, factors=())
-    _, rollout = taken(config, steps)
+def test_rollout_of_many_agents():
+    config, steps = ippo_config("lare-rd", env=TWO_TEAMS, n_envs=2), random_steps(TWO_TEAMS, 2)
+    reward = np.arange(TOTAL * 2 * 5, dtype=np.float32).reshape(TOTAL, 2, 5)
+    steps = steps._replace(next_timestep=steps.next_timestep._replace(reward=reward))
+    steps.next_timestep.terminated[steps.ended] = True
+    config = replace(config, method=small_config("dense").method, n_factors=())
+    _, rollout = store_and_roll_out(config, steps)
     last = jax.tree.map(np.asarray, newest(steps))
-    left = 0
-    for step, env, agent in np.ndindex(20, 2, 5):
-        lane, place = (step, env * 5 + agent), (step, env, agent)
-        alive, stays = last.before.alive[place], last.after.alive[place]
-        assert float(rollout.mask[lane]) == alive
-        who = np.eye(5)[agent]
-        np.testing.assert_array_equal(rollout.observation[lane], [*last.before.observation[place], *who])
-        np.testing.assert_array_equal(rollout.next_observation[lane], [*last.after.observation[place], *who])
-        np.testing.assert_array_equal(rollout.action[lane], last.action[place])
-        np.testing.assert_array_equal(rollout.available[lane], last.before.available[place])
-        assert float(rollout.reward[lane]) == (last.after.reward[place] if alive else 0)
-        # Who leaves has nothing to expect of an episode that goes on.
-        assert float(rollout.ended[lane]) == (last.ended[step, env] or not stays)
-        assert float(rollout.continues[lane]) == (stays and not last.ended[step, env])
-        left += alive and not stays
-    assert left
+    n_leaving = 0
+    for t, env, agent in np.ndindex(20, 2, 5):
+        actor, index = (t, env * 5 + agent), (t, env, agent)
+        alive, next_alive = last.timestep.alive[index], last.next_timestep.alive[index]
+        assert float(rollout.mask[actor]) == alive
+        one_hot = np.eye(5)[agent]
+        np.testing.assert_array_equal(rollout.observation[actor], [*last.timestep.observation[index], *one_hot])
+        next_observation = [*last.next_timestep.observation[index], *one_hot]
+        np.testing.assert_array_equal(rollout.next_observation[actor], next_observation)
+        np.testing.assert_array_equal(rollout.action[actor], last.action[index])
+        np.testing.assert_array_equal(rollout.available[actor], last.timestep.available[index])
+        assert float(rollout.reward[actor]) == (last.next_timestep.reward[index] if alive else 0)
+        # An agent that leaves expects nothing of an episode that goes on.
+        is_done = last.ended[t, env] or not next_alive
+        assert float(rollout.done[actor]) == float(rollout.terminated[actor]) == is_done
+        n_leaving += alive and not next_alive
+    assert n_leaving
 
 
-def test_agents_that_have_left_change_nothing():
-    """What they observe, do and are paid, from the step after their last one."""
-    config, steps = ippo("dense", env=TOGETHER), steps_of(TOGETHER)
-    gone = ~steps.before.alive
-    long_gone = gone & np.roll(gone, 1, axis=0) & ~np.roll(steps.ended, 1, axis=0)[..., None]
-    spoilt = steps._replace(
-        before=steps.before._replace(observation=np.where(long_gone[..., None], 99, steps.before.observation)),
-        after=steps.after._replace(
-            observation=np.where(gone[..., None], 99, steps.after.observation),
-            reward=np.where(gone, 99, steps.after.reward),
+def test_train_step_ignores_dead_agents():
+    config, steps = ippo_config("dense", env=ONE_TEAM), random_steps(ONE_TEAM)
+    dead = ~steps.timestep.alive
+    # The next observation of an agent's last step still counts.
+    long_dead = dead & np.roll(dead, 1, axis=0) & ~np.roll(steps.ended, 1, axis=0)[..., None]
+    changed = steps._replace(
+        timestep=steps.timestep._replace(observation=np.where(long_dead[..., None], 99, steps.timestep.observation)),
+        next_timestep=steps.next_timestep._replace(
+            observation=np.where(dead[..., None], 99, steps.next_timestep.observation),
+            reward=np.where(dead, 99, steps.next_timestep.reward),
         ),
-        action=np.where(gone[..., None], np.eye(4, dtype=np.float32)[0], steps.action),
+        action=np.where(dead[..., None], np.eye(4, dtype=np.float32)[0], steps.action),
     )
-    improve, found = jax.jit(partial(on_policy.improve_one, config=config)), []
-    for given in (steps, spoilt):
-        learner, _ = taken(config, given)
-        found.append(improve(learner, newest(given), jax.random.key(0), jnp.array(0)))
-    one, other = ((learner.algorithm, measured) for learner, measured in found)
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+    train, results = jax.jit(partial(on_policy._train_seed, config=config)), []
+    for trajectory in (steps, changed):
+        learner, _ = store_and_roll_out(config, trajectory)
+        learner, metrics = train(learner, newest(trajectory), jax.random.key(0), jnp.array(0))
+        results.append((learner.algorithm, metrics))
+    for a, b in zip(*map(jax.tree.leaves, results), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize(("algorithm", "env"), [("ppo", ALONE), long("ippo", RIVALS)])
-def test_seeds_in_lockstep_are_seeds_alone(algorithm, env):
-    config = config_of("lare-rd", algorithm, env, rollout_steps=TOTAL, environments=2)
-    functions = compiled(config)
+@pytest.mark.parametrize(("algorithm", "env"), [("ppo", ONE_AGENT), long_case("ippo", TWO_TEAMS)])
+def test_train_step_of_seeds_in_lockstep(algorithm, env):
+    config = small_config("lare-rd", algorithm, env, rollout_steps=TOTAL, n_envs=2)
+    functions = compile_functions(config)
     keys = jax.vmap(jax.random.key)(jnp.arange(3))
-    start, steps = functions.init(keys), steps_of(env, 2)
-    many, factors = (
-        jax.tree.map(lambda leaf: np.stack([leaf] * 3), part) for part in (steps, factors_for(config, steps))
-    )
+    start, steps = functions.init(keys), random_steps(env, 2)
+    stacked = jax.tree.map(lambda leaf: np.stack([leaf] * 3), (steps, random_factors(config, steps)))
     alone = jax.tree.map(lambda leaf: np.asarray(leaf)[1], start)
-    together, _ = functions.fit(functions.learn_returns(store_seeds(config)(start, many, factors)), keys)
-    together, _ = functions.improve(together, many, keys, 40)
-    alone = with_steps(alone, config, steps, tell=True)
-    alone = alone._replace(credit=jax.jit(partial(common.fit_often, config=config))(alone, keys[1])[0])
-    alone, _ = jax.jit(partial(on_policy.improve_one, config=config))(alone, steps, keys[1], jnp.array(40))
+    together, _ = functions.fit(functions.learn_returns(store_seeds(config)(start, *stacked)), keys)
+    together, _ = functions.train_step(together, stacked[0], keys, 40)
+    alone = add_steps(alone, config, steps, learn=True)
+    alone = alone._replace(credit=jax.jit(partial(fit_repeatedly, config=config))(alone, keys[1])[0])
+    alone, _ = jax.jit(partial(on_policy._train_seed, config=config))(alone, steps, keys[1], jnp.array(40))
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
         np.testing.assert_allclose(np.asarray(a)[1], b, rtol=1e-3, atol=1e-4)

@@ -1,4 +1,4 @@
-"""What a run says where nobody watches it live."""
+"""Lines of progress where there is no terminal."""
 
 import io
 
@@ -8,16 +8,7 @@ from rich.console import Console
 from lare_rl.training.progress import Terminal
 
 
-def lines_of(*evaluations):
-    text = io.StringIO()
-    terminal = Terminal(Console(file=text))
-    terminal.started("Task method", 0, 20_000)
-    for metrics in evaluations:
-        terminal.evaluated(metrics)
-    return text.getvalue().splitlines()
-
-
-def measured(step, rate, **more):
+def metrics(step, rate, **more):
     return [
         {"step": step, "seed": seed, "evaluation/return": float(seed), "time/steps_per_second": rate, **more}
         for seed in (0, 2)
@@ -27,19 +18,16 @@ def measured(step, rate, **more):
 @pytest.mark.parametrize(
     ("evaluation", "line"),
     [
-        (measured(5000, 4000.0), "step  5000 of 20000: 4000 steps/s, return 1.0"),
-        (
-            measured(10_000, 50.0, **{"critic/loss": 1.0}),
-            "step 10000 of 20000: 50 steps/s, return 1.0, 4 min left",
-        ),
-        (
-            measured(19_000, 50.0, **{"critic/loss": 1.0}),
-            "step 19000 of 20000: 50 steps/s, return 1.0, 20 s left",
-        ),
-        (measured(20_000, 50.0, **{"critic/loss": 1.0}), "step 20000 of 20000: 50 steps/s, return 1.0"),
-        (measured(10_000, 0.0, **{"critic/loss": 1.0}), "step 10000 of 20000: 0 steps/s, return 1.0"),
+        (metrics(5000, 4000.0), "step  5000 of 20000: 4000 steps/s, return 1.0"),
+        (metrics(10_000, 50.0, **{"critic/loss": 1.0}), "step 10000 of 20000: 50 steps/s, return 1.0, 4 min left"),
+        (metrics(19_000, 50.0, **{"critic/loss": 1.0}), "step 19000 of 20000: 50 steps/s, return 1.0, 20 s left"),
+        (metrics(20_000, 50.0, **{"critic/loss": 1.0}), "step 20000 of 20000: 50 steps/s, return 1.0"),
+        (metrics(10_000, 0.0, **{"critic/loss": 1.0}), "step 10000 of 20000: 0 steps/s, return 1.0"),
     ],
 )
-def test_a_line_for_each_evaluation(evaluation, line):
-    """The time that is left is told once there are updates: they are what takes time."""
-    assert lines_of(evaluation) == ["Task method: step 0 of 20000", line]
+def test_line_per_evaluation(evaluation, line):
+    text = io.StringIO()
+    terminal = Terminal(Console(file=text))
+    terminal.on_start("Task method", 0, 20_000)
+    terminal.on_evaluation(evaluation)
+    assert text.getvalue().splitlines() == ["Task method: step 0 of 20000", line]

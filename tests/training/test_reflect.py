@@ -1,22 +1,24 @@
-"""Reflection: what episodes say of a function, and that the better predictor of returns is kept."""
+"""Reflection: what episodes tell about a function, and that the better predictor of returns is kept."""
 
 import json
 from dataclasses import replace
 
-import gymnasium
 import numpy as np
 import pytest
 
-from helpers.toys import Chase, Says, toy_spec
-from lare_rl.envs.play import Episode, episodes_of
+from helpers.scripted_model import ScriptedModel
+from helpers.toy_envs import toy_spec
+from helpers.training_runs import train_quietly
+from lare_rl.envs.play import Episode, play_episodes
 from lare_rl.errors import LareError
 from lare_rl.latent.design import design
-from lare_rl.latent.function import verified
-from lare_rl.latent.verify import random_steps
+from lare_rl.latent.function import verify_function
 from lare_rl.llm import prompts
 from lare_rl.llm.recording import RecordedModel, read_recording
-from lare_rl.training import reflect as module
-from lare_rl.training.reflect import EPISODES, evidence_of, reflect
+from lare_rl.training.reflect import N_EPISODES, assess_function, reflect
+from lare_rl.training.stored_episodes import stored_role_episodes
+
+TASK = toy_spec()
 
 
 def source(*factors: str) -> str:
@@ -30,182 +32,138 @@ WRONG = source("observation[:, 1:2]")
 CONSTANT = source("0 * action + 1", "observation[:, 1:2]", "2 * observation[:, 1:2]")
 
 
-def designed(model, rounds, **given):
-    """A first function, and the best one after some rounds."""
-    record, said = given.get("record"), given.get("said", lambda _: None)
-    function = design(toy_spec(), model=model, candidates=1, record=record, said=said)
-    return reflect(function, toy_spec(), model, rounds, **given)
+def design_and_reflect(model, rounds, record=None, messages=None, **arguments):
+    on_message = (messages if messages is not None else []).append
+    function = design(TASK, model=model, candidates=1, record=record, on_message=on_message)
+    return reflect(function, TASK, model, rounds, record=record, on_message=on_message, **arguments)
+
+
+def assess(function_source, episodes, task=TASK):
+    return assess_function(verify_function(function_source, task), task, episodes)
 
 
 @pytest.fixture(scope="module")
 def episodes():
-    return episodes_of(toy_spec(), EPISODES)
+    return play_episodes(TASK, N_EPISODES)
 
 
-def test_episodes_are_whole_and_always_the_same(episodes):
-    again = episodes_of(toy_spec(), EPISODES)
-    assert len(episodes) == 40
-    for one, other in zip(episodes, again, strict=True):
-        assert (one.before.shape, one.action.shape, one.after.shape) == ((20, 1, 2), (20, 1, 1), (20, 1, 2))
-        np.testing.assert_array_equal(one.before[1:], one.after[:-1])
-        np.testing.assert_array_equal(one.after, other.after)
-        # The toy pays -(a - s_0)^2.
-        assert one.total == pytest.approx(-np.sum((one.action - one.before[..., :1]) ** 2), rel=1e-5)
-        assert one.total == other.total
+@pytest.mark.parametrize(("function", "least", "most"), [(RIGHT, 0.99, 1), (WRONG, -1, 0.3)])
+def test_r2_of_unseen_returns(function, least, most, episodes):
+    assert least < assess(function, episodes).r2 <= most
 
 
-def test_episodes_of_a_policy():
-    (perfect,) = episodes_of(toy_spec(), 1, lambda observation: observation[:1])
-    assert perfect.total == pytest.approx(0, abs=1e-9)
-
-
-@pytest.mark.parametrize(("one", "least", "most"), [(RIGHT, 0.99, 1), (WRONG, -1, 0.3)])
-def test_a_function_is_judged_by_returns_that_its_factors_have_not_seen(one, least, most, episodes):
-    assert least < evidence_of(verified(one, toy_spec()), toy_spec(), episodes).r2 <= most
-
-
-def test_the_evidence_says_what_each_factor_did_and_what_returns_say_of_it(episodes):
-    task = toy_spec()
-    lines = evidence_of(verified(RIGHT, task), task, episodes).text.splitlines()
-    assert lines[0].startswith("- f_0: from ")
-    assert "it correlates most" in lines[0]
-    assert lines[2] == "The factors explain 100% of the variation of the returns of 40 episodes."
-    assert lines[4].startswith("- f_0: 100%, -")
-    assert lines[5].startswith("- f_1: 0%, ")
-    dead, one, two, *_ = evidence_of(verified(CONSTANT, task), task, episodes).text.splitlines()
+def test_assessment_describes_factors(episodes):
+    right = assess(RIGHT, episodes)
+    assert right.ranges[0].startswith("- f_0: from ")
+    assert "it correlates most" in right.ranges[0]
+    assert "explain 100%" in right.sentences[0]
+    assert right.sentences[2].startswith("- f_0: 100%, -")
+    assert right.sentences[3].startswith("- f_1: 0%, ")
+    dead, first, second = assess(CONSTANT, episodes).ranges
     assert "standard deviation 0;" in dead
-    assert "+1.00 with f_2" in one
-    assert "+1.00 with f_1" in two
+    assert "+1.00 with f_2" in first
+    assert "+1.00 with f_1" in second
 
 
-def test_both_observations_are_named_apart(episodes):
-    task = toy_spec(judges="both")
-    text = evidence_of(verified(WRONG, task), task, episodes).text
-    assert [line.split(":")[0] for line in text.splitlines()[:2]] == ["- f_0 (before)", "- f_0 (after)"]
+def test_assessment_distinguishes_observations(episodes):
+    ranges = assess(WRONG, episodes, toy_spec(judges="both")).ranges
+    assert [line.split(":")[0] for line in ranges] == ["- f_0 (before)", "- f_0 (after)"]
 
 
-def test_of_many_agents_those_that_have_left_do_not_count():
-    task = toy_spec()
-    random = np.random.default_rng(0)
+def test_agents_that_left_do_not_count():
+    rng = np.random.default_rng(0)
 
-    def episode(steps):
-        alive = np.ones((steps, 3), bool)
-        alive[steps // 2 :, 2] = False
-        seen = random.normal(size=(steps, 3, 2)).astype(np.float32)
-        action = random.uniform(-1, 1, (steps, 3, 1)).astype(np.float32)
-        paid = -np.square(action - seen[..., :1])[..., 0]
-        team = (paid * alive).sum(axis=1) / alive.sum(axis=1)
-        seen[~alive] = 1e6
-        return Episode(seen, action, seen, alive, paid, team)
+    def make_episode(length):
+        alive = np.ones((length, 3), bool)
+        alive[length // 2 :, 2] = False
+        observation = rng.normal(size=(length, 3, 2)).astype(np.float32)
+        action = rng.uniform(-1, 1, (length, 3, 1)).astype(np.float32)
+        reward = -np.square(action - observation[..., :1])[..., 0]
+        team_reward = (reward * alive).sum(axis=1) / alive.sum(axis=1)
+        observation[~alive] = 1e6
+        return Episode(observation, action, observation, alive, reward, team_reward)
 
-    played = [episode(steps) for steps in random.integers(10, 30, size=40)]
-    assert evidence_of(verified(RIGHT, task), task, played).r2 > 0.99
+    assert assess(RIGHT, [make_episode(length) for length in rng.integers(10, 30, size=40)]).r2 > 0.99
 
 
-def test_where_all_returns_are_the_same_nothing_is_better(episodes):
-    alike = [replace(one, team_reward=np.zeros(20)) for one in episodes]
-    function, said = design(toy_spec(), model=Says(WRONG), candidates=1), []
-    assert reflect(function, toy_spec(), Says(RIGHT), episodes=alike, said=said.append).source == WRONG
-    assert said[-1] == "reflection 1: R² = nan, not better" or said[-1].endswith("not better")
+def test_too_few_episodes_are_refused(episodes):
+    with pytest.raises(LareError, match="20 are needed"):
+        assess(RIGHT, episodes[:19])
 
 
-def test_a_better_function_is_kept_and_a_worse_one_is_not():
-    task = toy_spec()
-    said = []
-    model = Says(WRONG, RIGHT, CONSTANT)
-    function = designed(model, 2, said=said.append)
+def test_equal_returns_improve_nothing(episodes):
+    equal = [replace(episode, team_reward=np.zeros(20)) for episode in episodes]
+    messages = []
+    function = reflect(
+        verify_function(WRONG, TASK), TASK, ScriptedModel(RIGHT), episodes=equal, on_message=messages.append
+    )
+    assert function.source == WRONG
+    assert messages[-1].endswith("not better")
+
+
+def test_better_function_is_kept():
+    messages, model = [], ScriptedModel(WRONG, RIGHT, CONSTANT)
+    function = design_and_reflect(model, 2, messages=messages)
     assert function.source == RIGHT
     assert [exchange["stage"] for exchange in function.exchanges] == ["candidate", "reflect", "reflect"]
-    assert said[-1].endswith("not better")
+    assert messages[-1].endswith("not better")
     # The second round is about the best function so far.
-    assert "Functions" in model.asked[2][2]["content"]
-    assert json.loads(model.asked[2][2]["content"])["Functions"] == RIGHT
-    evidence = evidence_of(verified(WRONG, task), task, episodes_of(task, EPISODES)).text
-    assert model.asked[1] == prompts.reflect(
-        task, json.dumps({"Understand": "", "Analyze": "", "Functions": WRONG}), evidence
-    )
+    assert json.loads(model.requests[2][2]["content"])["Functions"] == RIGHT
+    assessment = assess(WRONG, play_episodes(TASK, N_EPISODES))
+    evidence = "\n".join([*assessment.ranges, *assessment.sentences])
+    reply = json.dumps({"Understand": "", "Analyze": "", "Functions": WRONG})
+    assert model.requests[1] == prompts.reflect(TASK, reply, evidence)
 
 
-def test_what_was_recorded_answers_again(tmp_path):
-    """Two rounds that ask for the same have two replies."""
-    lines, path = (WRONG, CONSTANT, RIGHT), tmp_path / "talk.json"
-    first = designed(Says(*lines), 2, record=path)
-    model = RecordedModel([read_recording(path.read_text(), "talk.json")], "Chase")
-    again = designed(model, 2)
+def test_episodes_of_policy():
+    model = ScriptedModel(RIGHT, WRONG)
+    design_and_reflect(model, 1, policy=lambda observation: observation[:1] + 0.5)
+    episodes = play_episodes(TASK, N_EPISODES, lambda observation: observation[:1] + 0.5)
+    assert assess(RIGHT, episodes).ranges[0] in model.requests[1][-1]["content"]
+
+
+def test_episodes_of_finished_run(small, tmp_path):
+    task = toy_spec(judges="before")
+    run = train_quietly(task, small(method="rrdu", seeds=2, steps=600), tmp_path / "run")
+    model = ScriptedModel(RIGHT)
+    assert reflect(verify_function(WRONG, task), task, model, episodes=run).source == RIGHT
+    assert assess(WRONG, stored_role_episodes(run, task), task).ranges[0] in model.requests[0][-1]["content"]
+
+
+def test_recording_answers_again(tmp_path):
+    """Two rounds with equal requests have two replies."""
+    path = tmp_path / "talk.json"
+    first = design_and_reflect(ScriptedModel(WRONG, CONSTANT, RIGHT), 2, record=path)
+    again = design_and_reflect(RecordedModel([read_recording(path.read_text(), "talk.json")], "Chase"), 2)
     assert first.source == again.source == RIGHT
 
 
-@pytest.mark.parametrize("error", [LareError("the environment has gone"), KeyboardInterrupt()])
-def test_what_was_verified_is_kept_where_nothing_can_be_shown(monkeypatch, error):
-    def gone(*_):
-        raise error
-
-    monkeypatch.setattr(module, "episodes_of", gone)
-    said = []
-    model = Says(RIGHT)
-    assert designed(model, 3, said=said.append).source == RIGHT
-    assert said[-1] == f"no reflection: {str(error) or 'stopped'}"
+class StoppingModel(ScriptedModel):
+    def reply(self, messages, sample):
+        if not self.replies:
+            raise KeyboardInterrupt
+        return super().reply(messages, sample)
 
 
-def test_whoever_stops_a_reflection_takes_what_there_is():
-    class Stops(Says):
-        def reply(self, messages, sample):
-            if not self.lines:
-                raise KeyboardInterrupt
-            return super().reply(messages, sample)
-
-    said = []
-    assert designed(Stops(RIGHT), 3, said=said.append).source == RIGHT
-    assert said[-1] == "reflection 1: stopped"
-
-
-class Reused(Chase):
-    """Writes every observation into the same memory."""
-
-    def reset(self, *, seed=None, options=None):
-        observation, info = super().reset(seed=seed)
-        self.memory = np.array(observation)
-        return self.memory, info
-
-    def step(self, action):
-        observation, *rest = super().step(action)
-        self.memory[:] = observation
-        return self.memory, *rest
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (ScriptedModel(RIGHT), "reflection 1: no reply is left"),
+        (StoppingModel(RIGHT), "reflection 1: stopped"),
+        (ScriptedModel(RIGHT, *["def f(): ..."] * 5), "reflection 1: "),
+    ],
+)
+def test_failure_keeps_function(model, message):
+    messages = []
+    assert design_and_reflect(model, 1, messages=messages).source == RIGHT
+    assert any(line.startswith(message) for line in messages)
+    assert model.replies == []
 
 
-gymnasium.register("misfits/Reused-v0", entry_point=Reused, max_episode_steps=20)
-
-
-@pytest.mark.filterwarnings("ignore:.*share an object")  # Gymnasium sees it too
-def test_observations_are_copied(episodes):
-    task = toy_spec(environment="misfits/Reused-v0")
-    for one, other in zip(episodes_of(task, EPISODES), episodes, strict=True):
-        np.testing.assert_array_equal(one.before, other.before)
-        np.testing.assert_array_equal(one.after, other.after)
-    for one, other in zip(random_steps(task), random_steps(toy_spec()), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_a_round_that_fails_changes_nothing():
-    model = Says(RIGHT, *["def f(): ..."] * 5)
-    assert designed(model, 1).source == RIGHT
-    assert model.lines == []
-
-
-def test_what_was_verified_is_kept_when_the_model_leaves():
-    said = []
-    function = designed(Says(RIGHT), 1, said=said.append)
+def test_missing_episodes_keep_function(episodes):
+    messages = []
+    function = reflect(
+        verify_function(RIGHT, TASK), TASK, ScriptedModel(), episodes=episodes[:3], on_message=messages.append
+    )
     assert function.source == RIGHT
-    assert said[-1] == "reflection 1: nobody there"
-
-
-def test_episodes_of_a_given_policy():
-    """The best there is returns 0, and its factor with it."""
-    task = toy_spec()
-    best = episodes_of(task, 2, lambda observation: observation[:1])
-    assert [episode.total for episode in best] == pytest.approx([0, 0], abs=1e-9)
-    model = Says(RIGHT, WRONG)
-    designed(model, 1, policy=lambda observation: observation[:1] + 0.5)
-    played = episodes_of(task, EPISODES, lambda observation: observation[:1] + 0.5)
-    shown = evidence_of(verified(RIGHT, task), task, played).text
-    assert shown in model.asked[1][-1]["content"]
+    assert messages == ["no reflection: 3 episodes say too little of a function: 20 are needed"]

@@ -1,41 +1,43 @@
-"""Which code a run was made by."""
+"""The version that is saved with results."""
 
 import subprocess
 
 import pytest
 
 import lare_rl
-from lare_rl.util.provenance import source
+from lare_rl.util.provenance import code_version
 
-ME = ("-c", "user.name=me", "-c", "user.email=me@example.org")
+
+def git(directory, *arguments):
+    user = ("-c", "user.name=me", "-c", "user.email=me@example.org")
+    return subprocess.run(("git", *user, *arguments), cwd=directory, check=True, capture_output=True, text=True).stdout
 
 
 @pytest.fixture
 def checkout(tmp_path):
-    """A repository with one file, committed."""
     (tmp_path / "code.py").write_text("1\n")
-    for command in (("init", "-q"), ("add", "."), (*ME, "commit", "-qm", "first")):
-        subprocess.run(("git", *command), cwd=tmp_path, check=True)
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-qm", "first")
     return tmp_path
 
 
-def test_a_checkout_names_its_commit(checkout):
-    full = subprocess.run(("git", "rev-parse", "HEAD"), cwd=checkout, capture_output=True, text=True, check=True).stdout
-    assert source(checkout) == f"{lare_rl.__version__} ({full[:10]})"
+def test_commit_of_a_checkout(checkout):
+    assert code_version(checkout) == f"{lare_rl.__version__} ({git(checkout, 'rev-parse', 'HEAD')[:10]})"
 
 
-def test_a_changed_checkout_says_so(checkout):
+def test_changed_checkout(checkout):
     (checkout / "code.py").write_text("2\n")
-    assert source(checkout).endswith(", changed)")
+    assert code_version(checkout).endswith(", changed)")
 
 
-def test_somebody_elses_repository_is_not_named(checkout):
+def test_other_repository_around_it(checkout):
     (checkout / ".gitignore").write_text(".venv\n")
-    installed = checkout / ".venv" / "lare"
-    installed.mkdir(parents=True)
-    assert source(installed) == lare_rl.__version__
+    package = checkout / ".venv" / "lare"
+    package.mkdir(parents=True)
+    assert code_version(package) == lare_rl.__version__
 
 
-def test_neither_is_anything_where_there_is_no_git(checkout, monkeypatch):
+def test_missing_git(checkout, monkeypatch):
     monkeypatch.setenv("PATH", "")
-    assert source(checkout) == lare_rl.__version__
+    assert code_version(checkout) == lare_rl.__version__

@@ -1,12 +1,12 @@
-"""Letters that steer a terminal or that nobody sees."""
+"""Characters that control a terminal, or that are invisible."""
 
 import pytest
 
-from lare_rl.util.sanitize import in_a_line, legible, unseen
+from lare_rl.util.sanitize import first_invisible, one_line, sanitize
 
-HIDDEN = {
+INVISIBLE = {
     "escape": "\x1b",
-    "a tag": "\U000e0041",
+    "tag": "\U000e0041",
     "soft hyphen": "\u00ad",
     "Mongolian vowel separator": "\u180e",
     "grapheme joiner": "\u034f",
@@ -14,23 +14,23 @@ HIDDEN = {
     "variation selector": "\ufe0f",
     "empty Braille": "\u2800",
     "private use": "\ue000",
-    "the direction of writing": "\u202e",
+    "direction of writing": "\u202e",
     "zero width": "\u200b",
-    "a paragraph's end": "\u2029",
-    "not assigned": "\u0378",
-    "half a character": "\ud800",
+    "end of paragraph": "\u2029",
+    "unassigned": "\u0378",
+    "surrogate": "\ud800",
     "C1": "\x9b",
 }
 
 
-@pytest.mark.parametrize("letter", HIDDEN.values(), ids=HIDDEN)
-def test_what_nobody_sees_is_found_and_shown(letter):
-    assert unseen(f"ab{letter}c") == 2
-    assert legible(f"a\nb{letter}c") == "a\nb?c"
-    assert in_a_line(f" a\n\tb{letter}c ") in ("a b?c", "a b c")  # where it ends a line, there is a space
+@pytest.mark.parametrize("letter", INVISIBLE.values(), ids=INVISIBLE)
+def test_invisible_characters(letter):
+    assert first_invisible(f"ab{letter}c") == 2
+    assert sanitize(f"a\nb{letter}c") == "a\nb?c"
+    assert one_line(f" a\n\tb{letter}c ") in ("a b?c", "a b c")  # a character that ends a line becomes a space
 
 
 @pytest.mark.parametrize("text", ["plain", "two\nlines\tand a tab", "größe, ε, 漢字, e\u0301", "✅ 😀 ─ →", ""])
-def test_what_can_be_seen_is_left(text):
-    assert unseen(text) is None
-    assert legible(text) == text
+def test_visible_texts(text):
+    assert first_invisible(text) is None
+    assert sanitize(text) == text

@@ -1,8 +1,8 @@
 """`CreditAssigner`: proxy rewards for your own training loop, for another library's, or for logged episodes.
 
-Show it every step of every environment, with the rewards that the environment pays. It stores the decoder's inputs and the
-episodes' returns, fits the decoder, and gives each step a proxy reward. The loop trains on these, and asks for them again whenever
-it samples steps, because stored proxy rewards would be those of an older decoder.
+Give it every step of every environment, with the rewards that the environment pays. It stores the decoder's inputs and the episodes'
+returns, fits the decoder, and computes a proxy reward for each step. The loop trains on these, and asks for them again whenever it
+samples steps, because stored proxy rewards would be those of an older decoder.
 
     credit = CreditAssigner("lare-bayes", phi, task=task)
     steps = credit.add(observation, action, next_observation, reward, terminated, truncated)   # a row for each environment
@@ -19,25 +19,25 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner import saving
-from lare_rl.assigner.assigner_config import CreditConfig, Space, check, layouts
-from lare_rl.assigner.decoder_learner import CHUNK, PIECE, WAITING, Learner
-from lare_rl.assigner.payment import payment
+from lare_rl.assigner.assigner_config import AssignerConfig, Space, check_config, resolve_layouts
+from lare_rl.assigner.decoder_learner import DecoderLearner
+from lare_rl.assigner.saving import AssignerState
 from lare_rl.assigner.store import Store
-from lare_rl.config.defaults import MANY_AGENTS
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
+from lare_rl.credit.explanation_text import explanation_lines, raw_feature_names
 from lare_rl.credit.methods import Reward, find_method
-from lare_rl.envs.families import known_score
-from lare_rl.envs.load import as_task
-from lare_rl.errors import LareError, shortened
+from lare_rl.credit.returns import estimate_score_type
+from lare_rl.envs.families import find_score
+from lare_rl.envs.load import resolve_task
+from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction
-from lare_rl.tasks.spec import Judges, TaskSpec
+from lare_rl.tasks.spec import FactorInputs, TaskSpec
 
-SAMPLE = 256
-"""About how many steps are kept to verify `phi` on, when it is loaded from a file."""
+__all__ = ["CreditAssigner"]
 
 
 class CreditAssigner:
-    """Proxy rewards for steps, by any method that assigns credit to steps (`lare-rl methods`). Safe to call from several threads."""
+    """Proxy rewards for steps, by any method that assigns credit to steps (`lare-rl methods`). Several threads may use it."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class CreditAssigner:
         task: TaskSpec | str | Path | None = None,
         observation_space: Space | None = None,
         action_space: Space | None = None,
-        judges: Judges | None = None,
+        judges: FactorInputs | None = None,
         agents: int = 1,
         max_steps: int | None = None,
         capacity: int = 1_000_000,
@@ -57,94 +57,92 @@ class CreditAssigner:
         scale_rewards: bool = False,
         forget: bool = True,
     ):
-        """A new assigner, without any steps.
+        """Make an assigner without any steps.
 
         Args:
-            method: a row of the table. `dense` and `episodic` assign no credit.
-            phi: for the methods that need one, whose names begin with `lare-`, and for `llm-reward`.
-            task: the task that `phi` was designed for: a name, a path, or a spec. Spaces and `judges` that are not given are taken
-                from it.
-            observation_space: the space of a single agent in a single environment, or how many numbers an observation has.
+            method: the name of a method. `dense` and `episodic` assign no credit.
+            phi: for the methods that need one: those whose names begin with `lare-`, and `llm-reward`.
+            task: the task that `phi` was designed for: a name, a path, or a spec. Spaces and `judges` are taken from it if you do not
+                give them.
+            observation_space: the space of a single agent in a single environment, or the length of an observation.
             action_space: the same for actions. Actions are in the environment's units.
-            judges: which observation of a step the factors judge: the one before it, the one after it, or both.
-            agents: the number of agents of a team, which shares its return. With several, the axis after that of the steps is
-                that of the agents in all arrays.
+            judges: the observations of a step that the factors and raw features are computed from: "before", "after" or "both".
+            agents: the number of agents of a team, which shares its return. With several, all arrays have an axis of agents after
+                the axis of steps.
             max_steps: the length of the longest episode; needed for many agents.
-            capacity: number of steps that are kept. All steps that a replay buffer can sample must be among them.
-            settings: settings of the decoder.
-            seed: random seed of the decoder's weights and of its batches.
+            capacity: the number of steps that are stored: at least as many as your replay buffer stores.
+            settings: the settings of the decoder.
+            seed: the random seed of the decoder's weights and of its batches.
             fits_per_step: gradient updates of the decoder for each added step. A closed-form decoder has none.
             scale_rewards: divide r_hat by the running root mean square of R/T.
-            forget: whether a closed-form fit may forget episodes whose steps are not kept any more. True suits training, in which
-                the policy changes; False suits a log, whose episodes all count the same.
+            forget: whether a closed-form fit may forget episodes whose steps are not stored any more. Use True in training, because
+                the policy changes, and False for a log, whose episodes all count the same.
 
         Raises:
             LareError: method, function, task and spaces do not go together.
         """
-        task = None if task is None else as_task(task, playable=False)
-        decoder = settings or (CreditSettings() if agents == 1 else MANY_AGENTS)
-        if decoder.score == "auto" and task is not None and (score := known_score(task)) is not None:
-            decoder = decoder.model_copy(update={"score": score})
-        observation, action = layouts(task, {"observation": observation_space, "action": action_space})
-        self.config = CreditConfig(
-            find_method(method),
-            phi,
-            task,
-            observation,
-            action,
-            judges or (task.judges if task is not None else "after"),
-            agents,
-            max_steps,
-            capacity,
-            decoder,
-            seed,
-            fits_per_step,
-            scale_rewards,
-            forget,
+        task = None if task is None else resolve_task(task, playable=False)
+        settings = settings or (CreditSettings() if agents == 1 else MULTI_AGENT_CREDIT)
+        if settings.score == "auto" and task is not None and (score := find_score(task)) is not None:
+            settings = settings.model_copy(update={"score": score})
+        observation, action = resolve_layouts(task, {"observation": observation_space, "action": action_space})
+        self._init(
+            AssignerConfig(
+                method=find_method(method),
+                phi=phi,
+                task=task,
+                observation=observation,
+                action=action,
+                judges=judges or (task.judges if task is not None else "after"),
+                agents=agents,
+                max_steps=max_steps,
+                capacity=capacity,
+                settings=settings,
+                seed=seed,
+                fits_per_step=fits_per_step,
+                scale_rewards=scale_rewards,
+                forget=forget,
+            )
         )
-        check(self.config)
-        self.store = Store(capacity, (*self.config.axis, self.config.basis.inputs))
-        self.learner = Learner(self.config, self.store)
-        self.waiting: list[tuple[np.ndarray, ...]] = []
-        """Steps that have no features yet: number, before, action, after."""
-        self.unseen = 0
-        """The number of steps in `waiting`."""
-        self.sample: list[tuple[np.ndarray, np.ndarray]] = []
-        """The first observations and actions: a `phi` that is loaded from a file is verified on them again."""
-        self.sampled = 0
-        """The number of steps in `sample`."""
+
+    def _init(self, config: AssignerConfig) -> None:
+        check_config(config)
+        self.config = config
+        self.store = Store(config.capacity, (*config.agent_axis, config.spec.basis.n_inputs), config.agents)
+        self.learner = DecoderLearner(config, self.store)
         self.lock = threading.RLock()
 
     def add(
         self,
-        before: Any,
+        observation: Any,
         action: Any,
-        after: Any,
+        next_observation: Any,
         reward: Any,
         terminated: Any,
         truncated: Any,
         *,
-        lanes: Sequence[Hashable] | None = None,
+        env_ids: Sequence[Hashable] | None = None,
         valid: Any = None,
         alive: Any = None,
+        lanes: Sequence[Hashable] | None = None,
     ) -> Int[np.ndarray, " steps"]:
-        """Show one step of each of some environments (lanes).
+        """Add one step of each of several environments.
 
-        A lane that has shown no step while `capacity` steps of other lanes came is given up, as by `drop`.
+        An environment without a step while `capacity` steps of others came is abandoned, as by `drop`.
 
         Args:
-            before: the observations before the steps: (n, ...), for many agents (n, agents, ...). If `phi` was designed for the
-                environment, give the environment's own observations, without a wrapper's normalisation.
+            observation: the observations before the steps: (n, ...), for many agents (n, agents, ...). If `phi` was designed for the
+                environment, give the environment's own observations, not those of a wrapper that normalises them.
             action: the actions, in the environment's units.
-            after: the observations after the steps; at the end of an episode its last one, not the first of the next episode.
+            next_observation: the observations after the steps. At the end of an episode: its last one, not the first of the next.
             reward: the environment's rewards, (n,). Their sum over an episode is its return R. For many agents (n, agents) is
                 possible too: R is then the sum of the mean over those that are alive.
             terminated: (n,), whether the episode has terminated.
-            truncated: (n,), whether the episode was truncated, for instance by a time limit. Its return is learned from all the
-                same.
-            lanes: the environment of each row, by any hashable key; 0 to n - 1 by default.
-            valid: (n,), false for a row that is not a step, such as the call after an end, in which a vector environment resets.
+            truncated: (n,), whether the episode was truncated, for instance by a time limit. Its return is learned from as well.
+            env_ids: the environment of each row, as any hashable value; 0 to n - 1 by default.
+            valid: (n,), false for a row that is not a step, such as the call after an end in which a vector environment resets.
             alive: (n, agents), which agents acted; all by default.
+            lanes: the earlier name of `env_ids`.
 
         Returns:
             A number for each step, for `rewards_at`; -1 for a row that is not valid.
@@ -153,186 +151,142 @@ class CreditAssigner:
             LareError: shapes do not fit, a number is not finite, or the steps or an episode are more than `capacity`.
         """
         with self.lock:
-            before, action, after = self.config.rows(before, action, after)
-            count = len(before)
-            paid, there = self.config.team_reward(reward, alive, count)
-            ended = self.flags(terminated, "terminated", count) | self.flags(truncated, "truncated", count)
-            known = np.ones(count, bool) if valid is None else self.flags(valid, "valid", count)
-            lanes = range(count) if lanes is None else lanes
-            if len(lanes) != count:
-                raise LareError(f"lanes has {len(lanes)} entries, and there are {count} steps")
-            rows = np.flatnonzero(known)
+            observation, action, next_observation = self.config.to_rows(observation, action, next_observation)
+            n_rows = len(observation)
+            reward, alive = self.config.to_team_reward(reward, alive, n_rows)
+            ended = _to_flags(terminated, "terminated", n_rows) | _to_flags(truncated, "truncated", n_rows)
+            rows = np.flatnonzero(np.ones(n_rows, bool) if valid is None else _to_flags(valid, "valid", n_rows))
+            env_ids = lanes if env_ids is None else env_ids
+            env_ids = range(n_rows) if env_ids is None else env_ids
+            if len(env_ids) != n_rows:
+                raise LareError(f"env_ids has {len(env_ids)} entries, but there are {n_rows} steps")
             # Copies, because an environment may write its next step into the same memory.
-            before, action, after, paid, ended = (part[rows] for part in (before, action, after, paid, ended))
-            for values, name in ((before, "before"), (action, "action"), (after, "after"), (paid, "reward")):
-                check_finite(values, rows, name)
-            found = np.full(count, -1)
+            arrays = (observation, action, next_observation, reward, ended)
+            observation, action, next_observation, reward, ended = (array[rows] for array in arrays)
+            _check_finite(
+                rows, observation=observation, action=action, next_observation=next_observation, reward=reward
+            )
+            numbers = np.full(n_rows, -1)
             if not len(rows):
-                return found
-            found[rows] = numbers = self.keep(before, action, after, None if there is None else there[rows])
-            over = False
-            for place, (number, row) in enumerate(zip(numbers.tolist(), rows.tolist(), strict=True)):
-                run = self.store.running_of(lanes[row], before[place])
-                run.steps.append(number)
-                run.paid += float(paid[place])
-                run.last = after[place]
-                if ended[place]:
-                    self.learner.ended(self.store.end(lanes[row], run.paid), beside=over)
-                    over = True
-            if self.unseen >= WAITING:
-                self.look()
-            if self.learner.untold >= PIECE:
-                self.learn()
-            return found
-
-    def keep(
-        self, before: np.ndarray, action: np.ndarray, after: np.ndarray, alive: np.ndarray | None
-    ) -> Int[np.ndarray, " steps"]:
-        """Store new steps, which wait for their features from now on. Returns their numbers."""
-        numbers = self.store.add(len(before))
-        if self.store.alive is None and alive is not None:
-            self.store.alive = np.ones((self.store.capacity, self.config.agents), bool)
-        if self.store.alive is not None:
-            self.store.alive[numbers % self.store.capacity] = True if alive is None else alive
-        self.waiting.append((numbers, before, action, after))
-        self.unseen += len(before)
-        self.learner.owe(len(before))
-        return numbers
+                return numbers
+            alive = None if alive is None else alive[rows]
+            numbers[rows] = self.learner.add_steps(observation, action, next_observation, alive)
+            has_ended = False
+            for i, row in enumerate(rows.tolist()):
+                episode = self.store.get_running(env_ids[row], observation[i])
+                episode.steps.append(int(numbers[row]))
+                episode.return_ += float(reward[i])
+                episode.last_observation = next_observation[i]
+                if ended[i]:
+                    self.learner.end_episode(self.store.end(env_ids[row], episode.return_), same_call=has_ended)
+                    has_ended = True
+            self.learner.flush_large_queues()
+            return numbers
 
     def add_episode(
-        self, before: Any, action: Any, after: Any, reward: Any, *, alive: Any = None
+        self, observation: Any, action: Any, next_observation: Any, reward: Any, *, alive: Any = None
     ) -> Int[np.ndarray, " steps"]:
-        """Show a whole episode that has ended. `reward` is that of each step, (T,), or the score, a single number.
+        """Add a whole episode that has ended. `reward` is that of each step, (T,), or the score, a single number.
 
         Raises:
             LareError: as in `add`, or the episode has no step.
         """
         with self.lock:
-            before, action, after = (part.copy() for part in self.config.rows(before, action, after))
-            count = len(before)
-            rows = np.arange(count)
-            if not count:
+            rows = self.config.to_rows(observation, action, next_observation)
+            observation, action, next_observation = (array.copy() for array in rows)
+            n_steps = len(observation)
+            if not n_steps:
                 raise LareError("the episode has no step")
-            if np.ndim(reward) == 0:
-                score, (_, there) = float(reward), self.config.team_reward(np.zeros(count), alive, count)
-            else:
-                paid, there = self.config.team_reward(reward, alive, count)
-                check_finite(paid, rows, "reward")
-                score = float(paid.sum())
+            is_score = np.ndim(reward) == 0
+            rewards, alive = self.config.to_team_reward(np.zeros(n_steps) if is_score else reward, alive, n_steps)
+            _check_finite(
+                np.arange(n_steps),
+                observation=observation,
+                action=action,
+                next_observation=next_observation,
+                reward=rewards,
+            )
+            score = float(reward) if is_score else float(rewards.sum())
             if not np.isfinite(score):
-                raise LareError(f"the score is {score}: a number must be finite")
-            for values, name in ((before, "before"), (action, "action"), (after, "after")):
-                check_finite(values, rows, name)
-            numbers = self.keep(before, action, after, there)
-            self.learner.ended(self.store.put_new(numbers, score))
-            if self.learner.untold >= PIECE:
-                self.learn()
+                raise LareError(f"the score is {score}: give a finite number")
+            numbers = self.learner.add_steps(observation, action, next_observation, alive)
+            self.learner.end_episode(self.store.add_episode(numbers, score))
+            self.learner.flush_large_queues()
             return numbers
 
-    def end(self, lane: Hashable, score: float | None = None) -> None:
-        """End the episode of a lane, with `score` as its return, or else the sum of its rewards.
+    def end(self, env_id: Hashable, score: float | None = None) -> None:
+        """End the episode of an environment, with `score` as its return, or else the sum of its rewards.
 
-        Use this if the score is not part of the steps. If it comes late, give every episode its own lane.
+        Use this if the score is not part of the steps. If the score comes late, give every episode an `env_id` of its own.
 
         Raises:
-            LareError: there is no such lane, or the score is not finite.
+            LareError: no episode is running in this environment, or the score is not finite.
         """
         with self.lock:
-            run = self.store.running.get(lane)
-            if run is None:
-                kept = self.store.capacity
+            episode = self.store.running.get(env_id)
+            if episode is None:
                 raise LareError(
-                    f"no episode is running in lane {lane!r}: it has ended, or is older than {kept} steps (capacity)"
+                    f"no episode is running in the environment {env_id!r}: it has ended, or is older than "
+                    f"{self.store.capacity} steps (capacity)"
                 )
             if score is not None and not np.isfinite(score):
-                raise LareError(f"score = {score} of lane {lane!r} is not finite")
-            self.learner.ended(self.store.end(lane, run.paid if score is None else float(score)))
+                raise LareError(f"the score of the environment {env_id!r} is {score}: give a finite number")
+            score = episode.return_ if score is None else float(score)
+            self.learner.end_episode(self.store.end(env_id, score))
 
-    def drop(self, lane: Hashable) -> None:
-        """Give up the episode of a lane: it is never learned from. Its steps still have proxy rewards."""
+    def drop(self, env_id: Hashable) -> None:
+        """Abandon the episode of an environment: it is never learned from. Its steps still have proxy rewards."""
         with self.lock:
-            self.store.drop(lane)
-
-    def flags(self, values: Any, name: str, count: int) -> Bool[np.ndarray, " steps"]:
-        """Flags as an array, one for each step."""
-        flags = np.asarray(values, bool)
-        if flags.shape != (count,):
-            raise LareError(f"{name} must be one flag for each of {count} steps, and has the shape {flags.shape}")
-        return flags
-
-    def look(self) -> None:
-        """Compute the features of the steps that wait for them, and add these to the running statistics."""
-        if not self.waiting:
-            return
-        number, *steps = (np.concatenate(part) for part in zip(*self.waiting, strict=True))
-        if self.config.phi is not None and self.sampled < SAMPLE:
-            _, action, after = (part.reshape(-1, part.shape[-1])[:SAMPLE].copy() for part in steps)
-            self.sample.append((after, action))
-            self.sampled += len(after)
-        for start in range(0, len(number), PIECE):
-            part = slice(start, start + PIECE)
-            found, places = self.config.features(*(each[part] for each in steps)), number[part] % self.store.capacity
-            self.store.features[places] = found
-            alive = np.ones(found.shape[:-1], bool) if self.store.alive is None else self.store.alive[places]
-            self.learner.observe_steps(found, alive)
-        self.waiting.clear()  # only now, because phi may raise an error above
-        self.unseen = 0
-
-    def catch_up(self) -> None:
-        """Add the episodes that have ended to the scales, and learn from them if there are enough new ones."""
-        self.learner.observe_returned()
-        if self.learner.is_due:
-            self.learn()
-
-    def learn(self) -> None:
-        """Let the decoder learn from the episodes that have ended."""
-        self.look()
-        self.learner.learn()
+            self.store.drop(env_id)
 
     def fit(self, updates: int = 500) -> None:
-        """Fit now: so many gradient updates of the decoder. A closed-form decoder is fitted once, whatever `updates` is."""
+        """Fit now, by this many gradient updates of the decoder. A closed-form decoder is fitted once, whatever `updates` is."""
         with self.lock:
-            self.learn()
+            self.learner.learn_returns()
             self.learner.fit(updates)
 
-    def fit_owed(self) -> None:
-        """Make the gradient updates for the steps that were added since the last call; none if these steps are few.
+    def fit_pending(self) -> None:
+        """Make the gradient updates for the steps that were added since the last call, once there are at least 16 updates.
 
         A closed-form decoder is fitted whenever there are enough new episodes, and needs no updates here.
         """
         with self.lock:
-            self.catch_up()
-            if self.learner.descends and self.learner.owed >= CHUNK:
-                self.look()
-                self.learner.fit_owed()
+            self.learner.catch_up()
+            self.learner.fit_pending()
+
+    def fit_owed(self) -> None:
+        """Do the same as `fit_pending`, under its earlier name."""
+        self.fit_pending()
 
     def rewards_at(self, steps: Any) -> Float[np.ndarray, "*shape"]:
-        """r_hat of stored steps, by the newest decoder: an array of the shape of `steps`, for many agents with one more axis.
+        """Return r_hat of stored steps by the newest decoder: an array of the shape of `steps`, for many agents with one more axis.
 
-        0 for the number -1, and for all steps while nothing has been fitted. `ircr` pays 0.5 for an episode that has not ended.
+        It is 0 for the number -1, and for all steps while nothing has been fitted. `ircr` pays 0.5 until an episode ends.
 
         Raises:
             LareError: a step was never stored, or is not stored any more.
         """
         with self.lock:
-            self.catch_up()
-            steps = numbers_of(steps)
-            flat = steps.ravel()
-            known = flat >= 0
-            rows = self.store.rows(flat[known])
-            if len(rows) and flat.max() >= self.store.steps - self.unseen:  # one of the steps waits for its features
-                self.look()
-            found = np.zeros((len(flat), *self.config.axis), np.float32)
+            self.learner.catch_up()
+            numbers = _to_step_numbers(steps)
+            flat = numbers.ravel()
+            is_step = flat >= 0
+            rows = self.store.rows(flat[is_step])
+            if len(rows) and flat.max() >= self.store.steps - self.learner.n_pending_steps:
+                self.learner.flush_inputs()
+            reward = np.zeros((len(flat), *self.config.agent_axis), np.float32)
             alive = None if self.store.alive is None else self.store.alive[rows]
-            features, long = self.store.features[rows], self.store.lengths(rows)
-            found[known] = payment(self.learner, features, long, alive, rows)
-            return found.reshape(*steps.shape, *self.config.axis)
+            inputs, length = self.store.features[rows], self.store.lengths(rows)
+            reward[is_step] = self.learner.rewards(inputs, length, alive, rows)
+            return reward.reshape(*numbers.shape, *self.config.agent_axis)
 
-    def rewards(self, before: Any, action: Any, after: Any, *, length: Any = None) -> Float[np.ndarray, "n *agents"]:
-        """r_hat of any steps, by the newest decoder: (n,), for many agents (n, agents). The steps are not stored.
+    def rewards(
+        self, observation: Any, action: Any, next_observation: Any, *, length: Any = None
+    ) -> Float[np.ndarray, "n *agents"]:
+        """Return r_hat of any steps by the newest decoder: (n,), for many agents (n, agents). The steps are not stored.
 
-        `length` is T of each step's episode, (n,): if a score is an average over steps, r_hat is divided by T. The default is the
-        mean length of the episodes so far.
+        `length` is T of each step's episode, (n,): if a score is a mean over steps, r_hat is divided by T. The default is the mean
+        length of the episodes so far.
 
         Raises:
             LareError: the method pays by the return of the step's episode (`ircr`), or shapes do not fit.
@@ -343,88 +297,112 @@ class CreditAssigner:
                 f"{name} pays by the return of a step's episode: call rewards_at, with the numbers of steps"
             )
         with self.lock:
-            self.catch_up()
-            found = self.config.features(*self.config.rows(before, action, after))
-            long = np.full(len(found), self.store.usual_length) if length is None else np.asarray(length, np.int32)
-            if long.shape != (len(found),):
-                raise LareError(
-                    f"length must be one number for each of {len(found)} steps, and its shape is {long.shape}"
-                )
-            return payment(self.learner, found, long)
+            self.learner.catch_up()
+            inputs = self.config.compute_inputs(*self.config.to_rows(observation, action, next_observation))
+            if length is None:
+                length = np.full(len(inputs), self.store.mean_length)
+            length = np.asarray(length, np.int32)
+            if length.shape != (len(inputs),):
+                raise LareError(f"length has the shape {length.shape}: give one number for each of {len(inputs)} steps")
+            return self.learner.rewards(inputs, length)
 
     def metrics(self) -> dict[str, float]:
-        """Metrics of the decoder, which need no true rewards.
+        """Return metrics of the decoder, which need no true rewards.
 
         `credit/return_r2` is R^2 of the last 32 returns, each predicted before it was learned from: NaN while they are fewer than
         8, or all the same. `credit/loss` is the mean loss of the last gradient updates.
         """
         with self.lock:
-            self.learn()
+            self.learner.learn_returns()
             return {
                 "credit/return_r2": self.learner.return_r2(),
                 "credit/episodes": float(self.store.ended),
                 "credit/dropped": float(self.store.dropped),
-                "credit/fits": float(self.learner.fits),
+                "credit/fits": float(self.learner.n_updates),
                 "credit/loss": self.learner.loss,
             }
 
     def explanation(self) -> list[str]:
-        """What the stored returns say about the factors, in sentences: how much they explain, which of them, what may be missing.
+        """Explain the stored returns by the factors, in sentences: how much they explain, which of them, what may be missing.
 
-        Empty for fewer than 20 episodes, and for a method without a decoder.
+        The list is empty for fewer than 20 episodes, and for a method without a decoder.
         """
         with self.lock:
-            self.learn()
-            return self.learner.explanation()
+            self.learner.learn_returns()
+            explanation, config = self.learner.explain(), self.config
+            if explanation is None:
+                return []
+            assert self.learner.decoder is not None
+            factor_names = [] if config.phi is None else config.phi.factor_columns(config.judges)
+            raw_names, raw_inputs = [], tuple(name for name in config.spec.inputs if name != "factors")
+            if "observation_change" not in raw_inputs and raw_inputs[-1:] == ("action",):
+                texts = ("", "") if config.task is None else (config.task.observation, config.task.action)
+                n_raw = len(explanation.residual_correlation)
+                raw_names = raw_feature_names(*texts, n_raw, config.action.size, len(raw_inputs) > 2)
+            score_type = estimate_score_type(self.learner.decoder)
+            return explanation_lines(explanation, score_type, factor_names, raw_names)
+
+    @property
+    def score_type(self) -> str:
+        """How the score is modelled: as the `sum` or the `average` over an episode's steps."""
+        decoder = self.learner.decoder
+        return "average" if decoder is not None and bool(decoder.is_mean) else "sum"
 
     @property
     def form(self) -> str:
-        """How the score is modelled: as the `sum` or the `average` over an episode's steps."""
-        state = self.learner.state
-        return "average" if state is not None and bool(state.average) else "sum"
+        """The same as `score_type`, under its earlier name."""
+        return self.score_type
 
     def save(self, directory: str | Path, episodes: bool = True) -> None:
-        """Write everything to a directory: settings, decoder, `phi` and, unless they are left out, steps and episodes.
+        """Write everything to a directory: settings, decoder, `phi` and, if `episodes` is true, steps and episodes.
 
         A running episode is not saved. Raises `LareError` if the directory cannot be written.
         """
         with self.lock:
-            saving.save(self, Path(directory), episodes)
+            saving.write_state(saving.get_state(self.config, self.learner, episodes=episodes), Path(directory))
 
     @classmethod
     def load(cls, directory: str | Path) -> "CreditAssigner":
-        """Read what `save` has written; `phi` is verified again.
+        """Read what `save` has written. `phi` is verified again.
 
         Raises:
             LareError: the directory does not exist, is damaged, or was written by another version.
         """
         credit = cls.__new__(cls)
-        saving.load(credit, Path(directory))
+        state = saving.read_state(Path(directory))
+        try:
+            credit.__setstate__(state)
+        except saving.DAMAGED_FILE_ERRORS as error:
+            raise saving.damaged_error(Path(directory), error) from error
         return credit
 
-    def __getstate__(self) -> dict[str, Any]:
-        """The state for another process, or for a model's file: decoder and `phi`, without steps and episodes."""
+    def __getstate__(self) -> AssignerState:
+        """Return the state for another process, or for a model's file: decoder and `phi`, without steps and episodes."""
         with self.lock:
-            return {
-                "text": saving.text_of(self),
-                "arrays": saving.arrays_of(self, episodes=False),
-                "phi": self.config.phi,
-            }
+            return saving.get_state(self.config, self.learner, episodes=False)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        saving.restore(self, state["text"], state["arrays"], state["phi"])
+    def __setstate__(self, state: AssignerState) -> None:
+        self._init(state.config)
+        saving.restore(self.learner, state)
 
 
-def numbers_of(steps: Any) -> Int[np.ndarray, "*shape"]:
-    """Numbers of steps as an array. Raises `LareError` if one of them is not such a number."""
-    found = np.asarray(steps)
-    if found.size and (found.dtype.kind not in "iu" or found.min() < -1):
-        raise LareError(f"steps must be numbers that `add` has given, or -1, and are {shortened(steps)}")
-    return found.astype(np.int64)
+def _to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
+    flags = np.asarray(values, bool)
+    if flags.shape != (n_rows,):
+        raise LareError(f"{name} has the shape {flags.shape}: give one flag for each of {n_rows} steps")
+    return flags
 
 
-def check_finite(values: np.ndarray, rows: np.ndarray, name: str) -> None:
-    """Raise `LareError` for the first number that is not finite; `rows` are the places of the values' rows in the user's array."""
-    if not np.isfinite(values).all():
-        place = np.argwhere(~np.isfinite(values))[0]
-        raise LareError(f"{name} of row {rows[place[0]]} holds {values[tuple(place)]}: a number must be finite")
+def _to_step_numbers(steps: Any) -> Int[np.ndarray, "*shape"]:
+    numbers = np.asarray(steps)
+    if numbers.size and (numbers.dtype.kind not in "iu" or numbers.min() < -1):
+        raise LareError(f"steps are {short_repr(steps)}: give numbers that `add` has returned, or -1")
+    return numbers.astype(np.int64)
+
+
+def _check_finite(rows: np.ndarray, **arrays: np.ndarray) -> None:
+    """Raise `LareError` for the first number that is not finite. `rows` are the indices of the rows in the user's arrays."""
+    for name, values in arrays.items():
+        if not np.isfinite(values).all():
+            index = np.argwhere(~np.isfinite(values))[0]
+            raise LareError(f"{name} of row {rows[index[0]]} has {values[tuple(index)]}: give finite numbers")

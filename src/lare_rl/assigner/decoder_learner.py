@@ -1,272 +1,326 @@
-"""The decoder of a `CreditAssigner`: the data that it learns from, when it is fitted, and how well it predicts returns."""
+"""The decoder of a `CreditAssigner`: the data that wait for it, when it is fitted, and the rewards that it gives.
+
+Calls of compiled functions cost the same for one row as for hundreds, so data wait until there are enough of them, or until a result
+depends on them:
+
+    add_steps ────► pending steps ──flush_inputs──► inputs in the store ──flush_statistics──► running statistics
+    end_episode ──► pending returns ──────────────────────────────────────flush_statistics──► scales of returns
+                └─► pending episodes ─────────────────────────────────────learn_returns─────► sufficient statistics, decoder
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from math import inf
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from lare_rl.assigner import batches
 from lare_rl.assigner import compiled_functions as compiled
-from lare_rl.assigner import draws
-from lare_rl.assigner.assigner_config import CreditConfig
-from lare_rl.assigner.compiled_functions import Flat, on_host, padded, padding
+from lare_rl.assigner.assigner_config import AssignerConfig
+from lare_rl.assigner.compiled_functions import FlatState, on_cpu, pad, padded_size
 from lare_rl.assigner.store import Episode, Store
-from lare_rl.credit import closed_form, decomposition, returns
-from lare_rl.credit import prequential as prediction
-from lare_rl.credit.decomposition import Decomposition, Episodes
-from lare_rl.credit.explanation import no_steps
-from lare_rl.credit.explanation_text import entry_names, words
-from lare_rl.credit.methods import Encoder, Fit, Reward
-from lare_rl.nn.normalise import Scale, new_scale
+from lare_rl.credit import closed_form, decomposition, prequential, returns
+from lare_rl.credit.decomposition import CreditBatch, Decomposition
+from lare_rl.credit.explanation import Explanation
+from lare_rl.credit.methods import Fit, Reward
+from lare_rl.nn.normalise import Scale, empty_scale
 from lare_rl.util.float64 import float64
 
-WAITING = 256
-"""The most steps that wait for `phi` and for the running statistics."""
-PIECE = 8192
-"""Rows of features that are processed at a time."""
-CHUNK = 16
+__all__ = ["CHUNK_UPDATES", "DecoderLearner"]
+
+PENDING_STEPS = 256
+"""Steps that wait for their inputs, or for the running statistics, at most."""
+CHUNK_ROWS = 8192
+"""Rows that are processed in one call."""
+CHUNK_UPDATES = 16
 """Gradient updates of a decoder in one call."""
-MOST_OWED = 256
-"""The most updates that are owed at a time. Steps before the end of the first episode cannot add up to more."""
+MAX_PENDING_UPDATES = 256
+"""Gradient updates that wait, at most. It prevents a burst after a long first episode."""
+SAMPLE_STEPS = 256
+"""About how many steps are stored to verify `phi` on when it is loaded from a file."""
 
 
-class Learner:
+class DecoderLearner:
     """A decoder, and the state of its learning from the episodes of a store."""
 
-    def __init__(self, config: CreditConfig, store: Store):
+    def __init__(self, config: AssignerConfig, store: Store):
         self.config, self.store = config, store
-        self.state = untrained(config)
+        with on_cpu():
+            self.decoder: Decomposition | None = compiled.init_decoder(jax.random.key(config.seed), spec=config.spec)
         """None for a method that has no decoder."""
-        self.scale: Scale = new_scale()
+        self.scale: Scale = empty_scale()
         """The scale of R/T."""
-        self.unobserved: list[tuple[np.ndarray, np.ndarray]] = []
-        """Features of steps that are not in the running statistics yet, and which agents acted."""
-        self.pending: list[list[Episode]] = []
-        """Episodes that the decoder has not learned from yet. Those that ended in one call are together."""
-        self.returned: list[tuple[float, int]] = []
-        """R/T and T of episodes that are not in the scales yet."""
-        self.untold = 0
-        """Steps of the episodes that are pending."""
-        self.told = self.fits = 0
-        """The number of episodes that the decoder has learned from, and the number of its gradient updates."""
-        self.owed = 0.0
-        """Gradient updates that are due for the steps so far, and not made yet."""
+        self.n_learned = 0
+        """Episodes that the decoder has learned from."""
+        self.n_updates = 0
+        """Gradient updates of the decoder."""
         self.loss = float("nan")
         """The mean loss of the last gradient updates."""
-        self.has_learned = False
-        self.flat: tuple[Decomposition | None, Flat | None] = None, None
-        """A state, and its flattened form, which computes rewards."""
+        self.phi_sample: list[tuple[np.ndarray, np.ndarray]] = []
+        """The first observations and actions: a `phi` that is loaded from a file is verified on them again."""
+        self.n_pending_steps = 0
+        self._pending_steps: list[tuple[np.ndarray, ...]] = []
+        """Number, observation, action and next observation of steps that have no inputs yet."""
+        self._pending_inputs: list[tuple[np.ndarray, np.ndarray]] = []
+        """Inputs of steps that are not in the running statistics yet, and which agents acted."""
+        self._pending_returns: list[tuple[float, int]] = []
+        """R/T and T of episodes that are not in the scales yet."""
+        self._pending_episodes: list[list[Episode]] = []
+        """Episodes that the decoder has not learned from yet. Episodes that ended in one call are together."""
+        self._pending_updates = 0.0
+        self._is_fitted = False
+        self._flat: tuple[Any, Any, FlatState | None] = None, None, None
+        """A decoder and a scale, and their flat form."""
 
     @property
-    def descends(self) -> bool:
-        """Whether it is fitted by a gradient, and there is an episode to fit it to."""
-        return self.config.method.descends and bool(self.store.episodes)
+    def is_fitted(self) -> bool:
+        """Whether the decoder has been fitted yet."""
+        if not self._is_fitted and self.decoder is not None:  # after the first fit, there is no need to ask the device
+            uses_gradient = self.config.method.uses_gradient
+            self._is_fitted = self.n_updates > 0 if uses_gradient else bool(returns.is_fitted(self.decoder))
+        return self._is_fitted
 
-    @property
-    def fitted(self) -> bool:
-        """Whether it has been fitted yet."""
-        if not self.has_learned:  # once it has, there is no need to ask the device again
-            if self.state is None or self.config.method.descends:
-                self.has_learned = self.fits > 0
-            else:
-                self.has_learned = bool(returns.is_fitted(self.state))
-        return self.has_learned
+    def add_steps(
+        self, observation: np.ndarray, action: np.ndarray, next_observation: np.ndarray, alive: np.ndarray | None
+    ) -> Int[np.ndarray, " steps"]:
+        """Store new steps, and return their numbers. Raises `LareError` if they are more than the capacity."""
+        n_steps = len(observation)
+        numbers = self.store.add(n_steps, alive)
+        self._pending_steps.append((numbers, observation, action, next_observation))
+        self.n_pending_steps += n_steps
+        self._pending_updates = min(self._pending_updates + self.config.fits_per_step * n_steps, MAX_PENDING_UPDATES)
+        return numbers
 
-    @property
-    def paying(self) -> Flat:
-        """The flattened decoder with the parts that compute rewards, without the parts that are only for learning."""
-        assert self.state is not None
-        of, flat = self.flat
-        if of is not self.state or flat is None:
-            light = self.state._replace(optimizer=(), rivals=None)
-            if not decomposition.optimistic(self.config.method, self.config.settings):
-                light = light._replace(closed=None)
-            flat = Flat(*jax.tree.flatten(light))
-            self.flat = self.state, flat
-        return flat
+    def end_episode(self, episode: Episode, *, same_call: bool = False) -> None:
+        """Queue an episode that has ended. `same_call`: it ended in the same call as the previous one."""
+        if not same_call:
+            self._pending_episodes.append([])
+        self._pending_episodes[-1].append(episode)
+        self._pending_returns.append((episode.score / len(episode.steps), len(episode.steps)))
 
-    @property
-    def is_due(self) -> bool:
-        """Whether enough new episodes have ended to learn from them."""
-        return sum(map(len, self.pending)) >= max(returns.GROWTH * self.told, 1)
+    def flush_large_queues(self) -> None:
+        """Process what waits, if there is much of it."""
+        if self.n_pending_steps >= PENDING_STEPS:
+            self.flush_inputs()
+        if sum(len(episode.steps) for episode in chain.from_iterable(self._pending_episodes)) >= CHUNK_ROWS:
+            self.learn_returns()
 
-    @property
-    def until_the_next_fit(self) -> float:
-        """After how many new episodes a closed form is fitted again; other decoders are not fitted when they learn returns."""
-        if self.state is None or self.state.closed is None:
-            return inf
-        return (closed_form.GROWTH_OF_FIT - 1) * self.told
-
-    def owe(self, steps: int) -> None:
-        """Add the gradient updates that are due for new steps."""
-        self.owed = min(self.owed + self.config.fits_per_step * steps, MOST_OWED)
-
-    def ended(self, episode: Episode, beside: bool = False) -> None:
-        """Add an episode that has ended; `beside` the one before, if both ended in one call."""
-        if not beside:
-            self.pending.append([])
-        self.pending[-1].append(episode)
-        self.untold += len(episode.steps)
-        self.returned.append((episode.score / len(episode.steps), len(episode.steps)))
-
-    def observe_steps(
-        self, features: Float[np.ndarray, "n *agents features"], alive: Bool[np.ndarray, "n *agents"]
-    ) -> None:
-        """Add new steps to the running statistics, many at a time: a call costs the same for one as for hundreds."""
-        if self.state is None:
+    def flush_inputs(self) -> None:
+        """Compute the decoder's inputs of pending steps, with phi. Raises `LareError` if a factor is not finite."""
+        if not self._pending_steps:
             return
-        self.unobserved.append((features, alive))
-        if sum(len(rows) for rows, _ in self.unobserved) >= WAITING:
-            self.observe()
+        number, *steps = (np.concatenate(arrays) for arrays in zip(*self._pending_steps, strict=True))
+        if self.config.phi is not None and sum(len(action) for _, action in self.phi_sample) < SAMPLE_STEPS:
+            _, action, observation = (rows.reshape(-1, rows.shape[-1])[:SAMPLE_STEPS].copy() for rows in steps)
+            self.phi_sample.append((observation, action))
+        for start in range(0, len(number), CHUNK_ROWS):
+            chunk = slice(start, start + CHUNK_ROWS)
+            inputs = self.config.compute_inputs(*(rows[chunk] for rows in steps))
+            rows = number[chunk] % self.store.capacity
+            self.store.features[rows] = inputs
+            alive = np.ones(inputs.shape[:-1], bool) if self.store.alive is None else self.store.alive[rows]
+            if self.decoder is not None:
+                self._pending_inputs.append((inputs, alive))
+        self._pending_steps.clear()  # only now, because phi may raise an error above
+        self.n_pending_steps = 0
+        if sum(len(inputs) for inputs, _ in self._pending_inputs) >= PENDING_STEPS:
+            self.flush_statistics()
 
-    def observe(self) -> None:
-        """Add the waiting steps and episodes to the running statistics."""
-        self.observe_returned()
-        if self.state is None or not self.unobserved:
+    def flush_statistics(self) -> None:
+        """Add pending inputs to the running statistics, and pending returns to the scales."""
+        self._flush_returns()
+        if self.decoder is None or not self._pending_inputs:
             return
-        features, alive = (np.concatenate(part) for part in zip(*self.unobserved, strict=True))
-        self.unobserved.clear()
-        for start in range(0, len(features), PIECE):
-            part = slice(start, start + PIECE)
-            rows = padding(len(features[part]))
-            with on_host():
-                self.state = compiled.observe_steps(self.state, padded(features[part], rows), padded(alive[part], rows))
+        inputs, alive = (np.concatenate(arrays) for arrays in zip(*self._pending_inputs, strict=True))
+        self._pending_inputs.clear()
+        for start in range(0, len(inputs), CHUNK_ROWS):
+            chunk = slice(start, start + CHUNK_ROWS)
+            size = padded_size(len(inputs[chunk]))
+            with on_cpu():
+                self.decoder = compiled.observe_steps(self.decoder, pad(inputs[chunk], size), pad(alive[chunk], size))
 
-    def observe_returned(self) -> None:
-        """Add the episodes that have ended to the scales, many at a time."""
-        if not self.returned:
+    def _flush_returns(self) -> None:
+        if not self._pending_returns:
             return
-        mean, length = np.array(self.returned).T
-        rows = padding(len(mean))
-        there = np.arange(rows) < len(mean)
-        mean, length = padded(mean.astype(np.float32), rows), padded(length.astype(np.int32), rows)
-        self.returned.clear()
-        with on_host():
-            if self.state is not None:
-                self.state = compiled.observe_returns(self.state, mean, length, there)
-            self.scale = compiled.observe_mean_rewards(self.scale, mean, there)
+        mean_reward, length = np.array(self._pending_returns).T
+        self._pending_returns.clear()
+        size = padded_size(len(mean_reward))
+        mask = np.arange(size) < len(mean_reward)
+        mean_reward, length = pad(mean_reward.astype(np.float32), size), pad(length.astype(np.int32), size)
+        with on_cpu():
+            if self.decoder is not None:
+                self.decoder = compiled.observe_returns(self.decoder, mean_reward, length, mask)
+            self.scale = compiled.observe_scale(self.scale, mean_reward, mask)
 
-    def learn(self) -> None:
-        """Let the decoder learn from the episodes that have ended. All steps must have their features.
+    def catch_up(self) -> None:
+        """Add pending returns to the scales, and let the decoder learn if there are enough new episodes."""
+        self._flush_returns()
+        if sum(map(len, self._pending_episodes)) >= max(returns.MIN_GROWTH * self.n_learned, 1):
+            self.learn_returns()
+
+    def learn_returns(self) -> None:
+        """Let the decoder learn from pending episodes.
 
         However late this is called, a decoder in closed form is fitted as often as if it had been called whenever episodes ended: a
-        return is predicted by a decoder that was fitted to those before it.
+        return is predicted by a decoder that was fitted to the returns before it.
         """
-        self.observe()
+        self.flush_inputs()
+        self.flush_statistics()
         oldest = self.store.steps - self.store.capacity
-        new = [kept for group in self.pending if (kept := [one for one in group if one.steps[0] >= oldest])]
-        self.pending.clear()
-        self.untold = 0
-        with on_host(), float64():
-            while new:
-                now = new.pop(0)
-                while new and len(now) < self.until_the_next_fit:
-                    now += new.pop(0)
-                self.told += len(now)
-                if self.state is not None:
-                    self.state = jax.block_until_ready(self.after(self.state, now, list(chain.from_iterable(new))))
+        groups = [[episode for episode in group if episode.steps[0] >= oldest] for group in self._pending_episodes]
+        groups = [group for group in groups if group]
+        self._pending_episodes.clear()
+        with on_cpu(), float64():
+            while groups:
+                new = groups.pop(0)
+                while groups and len(new) < self._episodes_until_fit():
+                    new += groups.pop(0)
+                self.n_learned += len(new)
+                if self.decoder is not None:
+                    later = list(chain.from_iterable(groups))
+                    self.decoder = jax.block_until_ready(self._learn(self.decoder, new, later))
 
-    def after(self, state: Decomposition, now: Sequence[Episode], later: Sequence[Episode]) -> Decomposition:
-        """The state of a decoder that has learned from some new episodes, while others still wait."""
-        for piece in self.pieces(now):
-            state = compiled.tell(state, piece, self.config.settings)
-        if state.closed is None:
-            return state
-        whole = self.config.forget or self.store.steps <= self.store.capacity
-        if self.config.method.fit is not Fit.SIGNS and whole and compiled.is_stale(state):
-            waiting = set(map(id, later))
-            state = compiled.begin_again(state)
-            for piece in self.pieces([one for one in self.store.episodes.values() if id(one) not in waiting]):
-                state = compiled.add(state, piece)
-        if compiled.is_due(state):
-            state = compiled.fit_in_closed_form(state, self.config.method.name, self.config.forms)
-        return state
+    def _episodes_until_fit(self) -> float:
+        """Return after how many new episodes a closed form is fitted again. Other decoders are not fitted here."""
+        if self.decoder is None or self.decoder.closed_form is None:
+            return inf
+        return (closed_form.FIT_GROWTH - 1) * self.n_learned
 
-    def pieces(self, episodes: Sequence[Episode]) -> Iterator[Episodes]:
-        """Whole episodes, some at a time, in arrays of one of two shapes: for a single episode, or for many."""
-        total, longest = sum(len(one.steps) for one in episodes), max(len(one.steps) for one in episodes)
-        rows = padding(longest)
-        if total > rows:
-            rows = padding(max(longest, min(PIECE // self.config.agents, prediction.LAST * longest)))
-        return draws.pieces(self.store, episodes, prediction.LAST, rows)
+    def _learn(self, decoder: Decomposition, new: Sequence[Episode], later: Sequence[Episode]) -> Decomposition:
+        """Return a decoder that has learned from some new episodes, while later ones still wait."""
+        for batch in self._pack(new):
+            decoder = compiled.predict_then_update(decoder, batch, settings=self.config.settings)
+        if decoder.closed_form is None:
+            return decoder
+        may_rebuild = self.config.forget or self.store.steps <= self.store.capacity
+        if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(decoder):
+            decoder = compiled.reset_statistics(decoder)
+            later_ids = set(map(id, later))
+            for batch in self._pack([e for e in self.store.episodes.values() if id(e) not in later_ids]):
+                decoder = compiled.add_episodes(decoder, batch)
+        return compiled.fit_closed_form(decoder, spec=self.config.spec) if compiled.is_due(decoder) else decoder
 
-    def fit(self, updates: int) -> None:
-        """Fit now: so many gradient updates of the decoder. A closed-form decoder is fitted once, whatever `updates` is."""
-        if self.state is None or not self.store.episodes:
+    def _pack(self, episodes: Sequence[Episode]) -> Iterator[CreditBatch]:
+        """Yield whole episodes in batches of one of two shapes: for a single episode, or for many."""
+        lengths = [len(episode.steps) for episode in episodes]
+        longest = max(lengths, default=1)
+        rows = padded_size(longest)
+        if sum(lengths) > rows:
+            rows = padded_size(max(longest, min(CHUNK_ROWS // self.config.agents, prequential.WINDOW * longest)))
+        return batches.pack_in_order(self.store, episodes, prequential.WINDOW, rows)
+
+    def fit(self, n_updates: int) -> None:
+        """Fit now, by this many gradient updates. A closed-form decoder is fitted once, whatever the number is."""
+        if self.decoder is None or not self.store.episodes:
             return
-        if not self.config.method.descends:
-            with on_host(), float64():
-                found = compiled.fit_in_closed_form(self.state, self.config.method.name, self.config.forms)
-                self.state = jax.block_until_ready(found)
+        if not self.config.method.uses_gradient:
+            with on_cpu(), float64():
+                self.decoder = jax.block_until_ready(compiled.fit_closed_form(self.decoder, spec=self.config.spec))
             return
-        self.owed = 0.0
-        for start in range(0, updates, CHUNK):
-            self.descend(min(CHUNK, updates - start))
+        self._pending_updates = 0.0
+        for start in range(0, n_updates, CHUNK_UPDATES):
+            self._update(min(CHUNK_UPDATES, n_updates - start))
 
-    def fit_owed(self) -> None:
-        """Make the updates that are owed, in whole chunks."""
-        self.observe()
-        while self.owed >= CHUNK:
-            self.owed -= CHUNK
-            self.descend(CHUNK)
+    def fit_pending(self) -> None:
+        """Make pending gradient updates, in whole chunks."""
+        is_trainable = self.config.method.uses_gradient and self.store.episodes
+        if not is_trainable or self._pending_updates < CHUNK_UPDATES:
+            return
+        self.flush_inputs()
+        self.flush_statistics()
+        while self._pending_updates >= CHUNK_UPDATES:
+            self._pending_updates -= CHUNK_UPDATES
+            self._update(CHUNK_UPDATES)
 
-    def descend(self, updates: int) -> None:
+    def _update(self, n_updates: int) -> None:
         """Make gradient updates. The number of an update is the seed of its batch."""
-        assert self.state is not None
-        assert self.config.method.fit is not None
-        random = np.random.default_rng([self.config.seed, self.fits])
-        longest = padding(max(len(episode.steps) for episode in self.store.episodes.values()))
-        batches = [
-            draws.batch(self.store, self.config.method.fit, self.config.settings, random, longest)
-            for _ in range(updates)
-        ]
-        together = jax.tree.map(lambda *parts: np.stack(parts), *batches)
-        with on_host():
-            keys = jax.random.split(jax.random.fold_in(jax.random.key(self.config.seed), self.fits), updates)
-            self.state, loss = compiled.descend(
-                self.state, together, keys, self.config.method.name, self.config.settings
-            )
-        self.fits += updates
+        assert self.decoder is not None
+        spec, seed = self.config.spec, self.config.seed
+        random = np.random.default_rng([seed, self.n_updates])
+        longest = padded_size(max(len(episode.steps) for episode in self.store.episodes.values()))
+        with on_cpu():
+            samples = [batches.sample_batch(self.store, spec, random, longest) for _ in range(n_updates)]
+            stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *samples)
+            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), self.n_updates), n_updates)
+            self.decoder, loss = compiled.fit_by_gradient(self.decoder, stacked, keys, spec=spec)
+        self.n_updates += n_updates
         self.loss = float(loss)
 
+    def rewards(
+        self,
+        inputs: Float[np.ndarray, "n *agents inputs"],
+        length: Int[np.ndarray, " n"],
+        alive: Bool[np.ndarray, "n *agents"] | None = None,
+        rows: Int[np.ndarray, " n"] | None = None,
+    ) -> Float[np.ndarray, "n *agents"]:
+        """Return the rewards of steps; 0 while nothing has been fitted.
+
+        Args:
+            inputs: the decoder's inputs.
+            length: T of each step's episode.
+            alive: which agents acted; all by default.
+            rows: the steps' rows in the store, for a method that pays by the return of a step's episode.
+        """
+        reward = np.zeros(inputs.shape[:-1], np.float32)
+        if self.config.method.reward is Reward.PROXY and not self.is_fitted:
+            return reward
+        inputs = inputs.reshape(len(inputs), self.config.agents, inputs.shape[-1])
+        mean_reward, finished = None, None
+        if self.config.method.reward is Reward.UNIFORM:
+            mean_reward, finished = self.store.mean_reward[rows], self.store.length[rows] > 0
+        for start in range(0, len(inputs), CHUNK_ROWS):
+            chunk = slice(start, start + CHUNK_ROWS)
+            size = padded_size(len(inputs[chunk]))
+            padded_length = pad(length[chunk].astype(np.int32), size)
+            padded_length[len(inputs[chunk]) :] = 1
+            arrays = (None if x is None else pad(x[chunk], size) for x in (mean_reward, finished, alive))
+            with on_cpu():
+                flat = self._flat_state()
+                r_hat = compiled.training_rewards(
+                    flat.leaves,
+                    pad(inputs[chunk], size),
+                    padded_length,
+                    *arrays,
+                    structure=flat.structure,
+                    spec=self.config.spec,
+                )
+            reward[chunk] = np.asarray(r_hat)[: len(inputs[chunk])].reshape(reward[chunk].shape)
+        return reward
+
+    def _flat_state(self) -> FlatState:
+        """Return the parts of the decoder that compute rewards, and the scale, in flat form."""
+        decoder, scale, flat = self._flat
+        if flat is None or decoder is not self.decoder or scale is not self.scale:
+            light = self.decoder
+            if light is not None:
+                light = light._replace(optimizer=(), score_type_predictions=None)
+                if not decomposition.is_optimistic(self.config.method, self.config.settings):
+                    light = light._replace(closed_form=None)
+            flat = FlatState(*jax.tree.flatten((light, self.scale)))
+            self._flat = self.decoder, self.scale, flat
+        return flat
+
     def return_r2(self) -> float:
-        """R^2 of the last returns, each predicted before it was learned from; NaN while there are few, or all are the same."""
-        if self.state is None:
+        """Return R^2 of the last returns, each predicted before it was learned from; NaN if they are few or all the same."""
+        if self.decoder is None:
             return float("nan")
-        with on_host():
-            return float(prediction.r2(self.state.predictions)[0])
+        with on_cpu():
+            return float(prequential.r2(self.decoder.predictions)[0])
 
-    def explanation(self) -> list[str]:
-        """What the stored returns say about the factors: `CreditAssigner.explanation`."""
-        basis = replace(self.config.basis, extended=True)
-        if self.state is None or not self.store.episodes or not basis.size:
-            return []
-        with on_host(), float64():
-            judge = self.state._replace(closed=closed_form.init(basis, 1))
-            judge = compiled.begin_again(judge)
-            steps = no_steps(basis)
-            for piece in self.pieces(list(self.store.episodes.values())):
-                judge, steps = compiled.add(judge, piece), compiled.add_steps(judge, steps, piece)
-            found = jax.tree.map(np.asarray, compiled.explain(judge, steps, self.state.average))
-        names = [] if self.config.phi is None else self.config.phi.columns_by(self.config.judges)
-        return words(found, returns.form_found(self.state), names, self.entry_names(len(found.left)))
-
-    def entry_names(self, entries: int) -> list[str]:
-        """Names of the raw entries; empty if they are differences, or those of another method than those in closed form."""
-        encoder, both = self.config.method.encoder, self.config.judges == "both"
-        if encoder not in (Encoder.NEXT, Encoder.JUDGED, Encoder.LATENT_AND_JUDGED):
-            return []
-        texts = ("", "") if self.config.task is None else (self.config.task.observation, self.config.task.action)
-        return entry_names(*texts, entries, self.config.action.size, both and encoder is not Encoder.NEXT)
-
-
-def untrained(config: CreditConfig) -> Decomposition | None:
-    """An untrained decoder; None for a method that has none."""
-    if config.method.reward is not Reward.PROXY:
-        return None
-    key, steps = jax.random.key(config.seed), config.max_steps or 1
-    with on_host():
-        return compiled.init(key, config.basis, config.method, config.settings, steps, config.agents, config.forms)
+    def explain(self) -> Explanation | None:
+        """Explain the stored returns by the inputs. Return None for a method without a decoder, and without episodes."""
+        if self.decoder is None or not self.store.episodes:
+            return None
+        basis = replace(self.config.spec.basis, extended=True)
+        if not basis.n_features:
+            return None
+        with on_cpu(), float64():
+            state = compiled.init_explanation(self.decoder.statistics, basis=basis)
+            for batch in self._pack(list(self.store.episodes.values())):
+                state = compiled.add_to_explanation(state, batch)
+            explanation = compiled.explain_returns(state, self.decoder.is_mean.astype(int))
+            return jax.tree.map(np.asarray, explanation)

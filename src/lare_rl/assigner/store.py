@@ -1,7 +1,7 @@
-"""The memory of a `CreditAssigner`: features of steps by number, and the episodes of these steps. NumPy, on the host.
+"""The memory of a `CreditAssigner`: the decoder's inputs of steps by number, and the episodes of these steps. NumPy, on the host.
 
-Steps of many lanes arrive interleaved. The numbers of steps count up from 0 without end, and a step is stored in a ring buffer at
-its number modulo the capacity. An episode is stored as the numbers of its steps. When the ring buffer is full, new steps overwrite
+Steps of many environments arrive interleaved. The numbers of steps count up from 0 without end, and a step is stored in a ring buffer
+at its number modulo the capacity. An episode is stored as the numbers of its steps. When the ring buffer is full, new steps overwrite
 the oldest ones, whose episodes are removed.
 """
 
@@ -16,6 +16,8 @@ from jaxtyping import Bool, Float, Int
 
 from lare_rl.errors import LareError
 
+__all__ = ["Episode", "RunningEpisode", "Store"]
+
 
 class Episode(NamedTuple):
     """An episode that has ended."""
@@ -27,28 +29,35 @@ class Episode(NamedTuple):
 
 
 @dataclass
-class Running:
-    """A running episode."""
+class RunningEpisode:
+    """An episode that has not ended."""
 
     steps: list[int] = field(default_factory=list)
-    paid: float = 0.0
+    return_: float = 0.0
     """The sum of its rewards so far."""
-    last: Float[np.ndarray, "*agents observation"] | None = None
+    last_observation: Float[np.ndarray, "*agents observation"] | None = None
     """The observation after its last step."""
 
     @property
     def newest(self) -> int:
-        """The number of its last step; before the first step, a number that is never reached."""
+        """The number of its last step; `sys.maxsize` before the first step."""
         return self.steps[-1] if self.steps else sys.maxsize
 
 
 class Store:
-    """Features of steps, and the episodes that they make up."""
+    """Inputs of steps, and the episodes that they belong to."""
 
-    def __init__(self, capacity: int, row: tuple[int, ...]):
-        self.capacity = capacity
-        self.features = np.zeros((capacity, *row), np.float32)
-        """The decoder's inputs for each step: [capacity *agents features]."""
+    def __init__(self, capacity: int, row_shape: tuple[int, ...], agents: int = 1):
+        """Make an empty store.
+
+        Args:
+            capacity: the number of steps that are stored.
+            row_shape: the shape of a step's inputs: (inputs,), or (agents, inputs).
+            agents: the number of agents.
+        """
+        self.capacity, self.agents = capacity, agents
+        self.features = np.zeros((capacity, *row_shape), np.float32)
+        """The decoder's inputs for each step: [capacity *agents inputs]."""
         self.alive: Bool[np.ndarray, "capacity agents"] | None = None
         """Which agents acted. None: all of them."""
         self.length = np.zeros(capacity, np.int32)
@@ -65,47 +74,49 @@ class Store:
         """The number of steps of these episodes."""
         self.oldest: list[tuple[int, int]] = []
         """A heap of the stored episodes: first step, and number."""
-        self.running: dict[Hashable, Running] = {}
-        """The running episodes by lane. The lane whose last step is the oldest comes first."""
+        self.running: dict[Hashable, RunningEpisode] = {}
+        """The running episodes by environment. The environment whose last step is the oldest comes first."""
         self.dropped = 0
-        """Episodes that were given up."""
+        """Episodes that were abandoned."""
 
-    def add(self, count: int) -> Int[np.ndarray, " count"]:
-        """Numbers for new steps. Episodes and lanes whose steps are all too old to be stored are removed.
+    def add(self, n_steps: int, alive: Bool[np.ndarray, "n_steps agents"] | None = None) -> Int[np.ndarray, " n_steps"]:
+        """Return numbers for new steps. Episodes whose steps are all too old to be stored are removed.
 
         Raises:
             LareError: there are more steps than can be stored.
         """
-        if count > self.capacity:
-            raise LareError(
-                f"{count} steps at once are more than the capacity of {self.capacity}: make capacity larger"
-            )
+        if n_steps > self.capacity:
+            raise LareError(f"{n_steps} steps at once are more than capacity = {self.capacity}: make capacity larger")
         while self.running and next(iter(self.running.values())).newest < self.steps - self.capacity:
             self.drop(next(iter(self.running)))
-        numbers = np.arange(self.steps, self.steps + count)
-        self.steps += count
+        numbers = np.arange(self.steps, self.steps + n_steps)
+        self.steps += n_steps
         while self.oldest and self.oldest[0][0] < self.steps - self.capacity:
             del self.episodes[heapq.heappop(self.oldest)[1]]
         self.length[numbers % self.capacity] = 0
+        if self.alive is None and alive is not None:
+            self.alive = np.ones((self.capacity, self.agents), bool)
+        if self.alive is not None:
+            self.alive[numbers % self.capacity] = True if alive is None else alive
         return numbers
 
-    def end(self, lane: Hashable, score: float) -> Episode:
-        """End the running episode of a lane, with `score` as its return.
+    def end(self, env_id: Hashable, score: float) -> Episode:
+        """End the running episode of an environment, with `score` as its return.
 
         Raises:
             LareError: its first steps are not stored any more.
         """
-        return self.put_new(np.array(self.running.pop(lane).steps, np.int64), score)
+        return self.add_episode(np.array(self.running.pop(env_id).steps, np.int64), score)
 
-    def put_new(self, steps: Int[np.ndarray, " steps"], score: float) -> Episode:
+    def add_episode(self, steps: Int[np.ndarray, " steps"], score: float) -> Episode:
         """Store an episode that has just ended. Raises `LareError` like `end`."""
         episode = Episode(steps, score)
         if self.steps - steps[0] > self.capacity:
             raise LareError(
-                f"an episode of {len(steps)} steps has ended, and its first ones are not stored any more: "
-                f"capacity = {self.capacity} must be larger"
+                f"an episode of {len(steps)} steps has ended, and its first steps are not stored any more: "
+                f"make capacity larger than {self.capacity}"
             )
-        self.put(self.ended, episode)
+        self.restore_episode(self.ended, episode)
         self.ended += 1
         self.ended_steps += len(steps)
         rows = episode.steps % self.capacity
@@ -113,46 +124,48 @@ class Store:
         self.mean_reward[rows] = score / len(rows)
         return episode
 
-    def put(self, number: int, episode: Episode) -> None:
+    def restore_episode(self, number: int, episode: Episode) -> None:
         """Store an episode under its number."""
         self.episodes[number] = episode
         heapq.heappush(self.oldest, (int(episode.steps[0]), number))
 
-    def running_of(self, lane: Hashable, before: Float[np.ndarray, "*agents observation"]) -> Running:
-        """The running episode of a lane, for a next step that begins at the observation `before`.
+    def get_running(self, env_id: Hashable, observation: Float[np.ndarray, "*agents observation"]) -> RunningEpisode:
+        """Return the running episode of an environment, for a next step that begins at this observation.
 
-        If its last step led to a different observation, the environment was reset in between: the running episode is given up, and
-        a new one begins.
+        If the last step led to a different observation, the environment was reset in between: the running episode is abandoned, and a
+        new one begins.
         """
-        run = self.running.get(lane)
-        if run is not None and run.last is not None and not np.array_equal(run.last, before):
-            self.drop(lane)
-        run = self.running.pop(lane, None) or Running()
-        self.running[lane] = run  # now the last of all lanes
+        run = self.running.get(env_id)
+        last = None if run is None else run.last_observation
+        if last is not None and not np.array_equal(last, observation):
+            self.drop(env_id)
+        run = self.running.pop(env_id, None) or RunningEpisode()
+        self.running[env_id] = run  # now the last of all environments
         return run
 
-    def drop(self, lane: Hashable) -> None:
-        """Give up the running episode of a lane. Its steps stay stored, and are never learned from."""
-        run = self.running.pop(lane, None)
+    def drop(self, env_id: Hashable) -> None:
+        """Abandon the running episode of an environment. Its steps stay stored, and are never learned from."""
+        run = self.running.pop(env_id, None)
         self.dropped += bool(run and run.steps)
 
     def rows(self, steps: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
-        """The places of stored steps.
+        """Return the rows of stored steps.
 
         Raises:
             LareError: a step was never stored, or is not stored any more.
         """
-        if steps.size and (steps.max() >= self.steps or steps.min() < max(0, self.steps - self.capacity)):
-            wrong = steps.max() if steps.max() >= self.steps else steps.min()
-            there = f"only {max(0, self.steps - self.capacity)} to {self.steps - 1}" if self.steps else "nothing"
-            raise LareError(f"step {wrong} is not stored, {there} is (capacity = {self.capacity})")
+        oldest = max(0, self.steps - self.capacity)
+        if steps.size and (steps.max() >= self.steps or steps.min() < oldest):
+            missing = steps.max() if steps.max() >= self.steps else steps.min()
+            stored = f"steps {oldest} to {self.steps - 1} are" if self.steps else "no step is"
+            raise LareError(f"step {missing} is not stored: {stored} (capacity = {self.capacity})")
         return steps % self.capacity
 
     def lengths(self, rows: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
-        """T of each step's episode; if that has not ended, the mean length of the episodes that have."""
-        return np.where(self.length[rows] > 0, self.length[rows], self.usual_length)
+        """Return T of each step's episode; for a running episode, the mean length of the episodes that have ended."""
+        return np.where(self.length[rows] > 0, self.length[rows], self.mean_length)
 
     @property
-    def usual_length(self) -> int:
+    def mean_length(self) -> int:
         """The mean length of the episodes that have ended."""
         return max(1, self.ended_steps // max(1, self.ended))

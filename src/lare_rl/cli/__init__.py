@@ -16,11 +16,10 @@ from lare_rl.cli.logs import relabel
 from lare_rl.cli.parse import parse
 from lare_rl.cli.runs import cross_play, evaluate, export, report, train
 from lare_rl.cli.studies import compare, reproduce, sweep
-from lare_rl.cli.terminal import progress, say
+from lare_rl.cli.terminal import print_error, print_line
 from lare_rl.errors import LareError
 from lare_rl.util import compilation
-from lare_rl.util.provenance import source
-from lare_rl.util.sanitize import in_a_line
+from lare_rl.util.provenance import code_version
 
 DESCRIPTION = (
     "Train reinforcement learning on episodic rewards, through latent rewards that a language model wrote. "
@@ -47,34 +46,35 @@ COMMANDS = {
 
 
 def main() -> None:
-    """`lare-rl`: a user's mistake is one line on stderr and exit status 2 (--debug prints its traceback too)."""
-    for stream in (sys.stdout, sys.stderr):  # so that a character that the terminal cannot show raises no error
+    """Run `lare-rl`. A user's mistake is one line on stderr and exit status 2; --debug prints its traceback too."""
+    for stream in (sys.stdout, sys.stderr):  # a character that the terminal cannot show must raise no error
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     try:
         if arguments == ["--version"]:
-            say(source())
+            print_line(code_version())
         else:
             command = parse(COMMANDS, DESCRIPTION, arguments)
-            os.environ.update(compilation.variables(os.environ))  # JAX reads them when a command imports it
+            os.environ.update(compilation.cache_variables(os.environ))  # JAX reads them when a command imports it
             command()
-    except LareError as error:
-        if debug:
-            traceback.print_exc()
-        progress(f"lare-rl: {in_a_line(error)}")
-        sys.exit(error.status)
     except KeyboardInterrupt:
         sys.exit(130)
-    except OSError as error:
-        if isinstance(error, BrokenPipeError):
-            # The reader has closed the pipe. Without this, Python would raise again when it flushes at exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            sys.exit(1)
+    except BrokenPipeError:
+        _discard_output()
+        sys.exit(1)
+    except (LareError, OSError) as error:
         if debug:
             traceback.print_exc()
-        progress(f"lare-rl: {in_a_line(error)}")
-        with contextlib.suppress(OSError):  # the output that is still buffered cannot be written either
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        print_error(error)
+        if isinstance(error, LareError):
+            sys.exit(error.status)
+        with contextlib.suppress(OSError):
+            _discard_output()
         sys.exit(2)
+
+
+def _discard_output() -> None:
+    """Discard what is still buffered for standard output. Python would raise again when it flushes at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.terminal import Data, Kind, Task, progress, say, steps_of, write_new
+from lare_rl.cli.terminal import Data, Kind, Task, load_steps, print_line, print_progress, write_new_file
 from lare_rl.errors import LareError
-from lare_rl.tasks.spec import Judges
+from lare_rl.tasks.spec import NO_ENVIRONMENT, FactorInputs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,10 +31,10 @@ def prompt(task: Task, kind: Kind = "factors") -> None:
     """
     from lare_rl.envs.load import load_task
     from lare_rl.llm.prompts import candidate
-    from lare_rl.tasks.spec import the_role
+    from lare_rl.tasks.spec import require_role
 
-    for message in candidate(the_role(load_task(task)), kind):
-        say(f"--- {message['role']} ---\n{message['content']}\n")
+    for message in candidate(require_role(load_task(task)), kind):
+        print_line(f"--- {message['role']} ---\n{message['content']}\n")
 
 
 def new_task(
@@ -52,48 +52,47 @@ def new_task(
             Parquet file, or the id of a local Minari data set.
         out: the file to write, which must not exist; the default is the task's name with .toml.
     """
-    drafted = draft_of(environment)
-    path = out or Path(f"{drafted.name}.toml")
-    write_new(path, drafted.toml, "--out")
-    for name, text in drafted.teams.items():
-        write_new(path.parent / name, text, "folder for --out")
-    say(f"wrote {', '.join(map(str, (path, *(path.parent / name for name in drafted.teams))))}")
-    if drafted.left_out:
-        say("  left out or cut short, because it seems to speak of rewards:")
-    for said in drafted.left_out:
-        say(f"    {said}")
-    if drafted.unused:
-        say(f"  sections of the documentation that were not used: {', '.join(drafted.unused)}")
-    for key in drafted.missing:
-        say(f"  fill in: {key} ({'the log' if drafted.of_logs else 'the environment'} does not document it)")
-    data = f" --data {environment}" if drafted.of_logs else ""
-    say(f"read it, then: lare-rl design {path}{data} --model NAME --out phi.py")
-    none = "lare-rl relabel without --function" if drafted.of_logs else "--method bayes"
-    say(
+    draft = _draft(environment)
+    path = out or Path(f"{draft.name}.toml")
+    paths = [path, *(path.parent / name for name in draft.teams)]
+    write_new_file(path, draft.toml, "--out")
+    for team_path, text in zip(paths[1:], draft.teams.values(), strict=True):
+        write_new_file(team_path, text, "folder for --out")
+    print_line(f"wrote {', '.join(map(str, paths))}")
+    if draft.removed:
+        print_line("  left out or cut short, because it seems to speak of rewards:")
+    for sentence in draft.removed:
+        print_line(f"    {sentence}")
+    if draft.unused_sections:
+        print_line(f"  sections of the documentation that were not used: {', '.join(draft.unused_sections)}")
+    for key in draft.missing_keys:
+        print_line(f"  fill in: {key} ({'the log' if draft.logs_only else 'the environment'} does not document it)")
+    data = f" --data {environment}" if draft.logs_only else ""
+    print_line(f"read it, then: lare-rl design {path}{data} --model NAME --out phi.py")
+    without_function = "lare-rl relabel without --function" if draft.logs_only else "--method bayes"
+    print_line(
         f"or, without a model: paste the output of lare-rl prompt {path} into a chat, or write phi.py yourself, with a function "
-        f"evaluation_func(observation, action) (docs/bring-your-own-task.md, 2.); {none} needs no phi.py"
+        f"evaluation_func(observation, action) (docs/bring-your-own-task.md, 2.); {without_function} needs no phi.py"
     )
 
 
-def draft_of(named: str) -> "Draft":
-    """The first draft of a task: of an environment, or of a log."""
-    from lare_rl.new_task.single_agent import draft
+def _draft(source: str) -> "Draft":
+    """Draft the task of an environment, or of a log."""
+    from lare_rl.new_task.single_agent import draft_task
 
-    if Path(named).exists():
-        from lare_rl.logs.draft_from_log import draft_of_logs
+    if not Path(source).exists():
+        try:
+            return draft_task(source)
+        except LareError:
+            if find_spec("minari") is None:
+                raise
+            from lare_rl.logs.minari import is_local_dataset
 
-        return draft_of_logs(named)
-    try:
-        return draft(named)
-    except LareError:
-        if find_spec("minari") is None:
-            raise
-        from lare_rl.logs.draft_from_log import draft_of_logs
-        from lare_rl.logs.minari import is_local
+            if not is_local_dataset(source):
+                raise
+    from lare_rl.logs.draft_from_log import draft_log_task
 
-        if not is_local(named):
-            raise
-        return draft_of_logs(named)
+    return draft_log_task(source)
 
 
 def verify(
@@ -103,7 +102,7 @@ def verify(
     data: Data = None,
     fit: int = 0,
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
-    judges: Judges | None = None,
+    judges: FactorInputs | None = None,
 ) -> None:
     """Verify a function: it is read, never executed, and its factors must be finite. Prints the entries that each factor reads.
 
@@ -122,86 +121,86 @@ def verify(
         policy: a run whose policy plays the episodes for --fit, instead of random actions.
         judges: which observation of a step the function judges, instead of the one that the task says.
     """
-    from lare_rl.cli.design import policy_that_plays
-    from lare_rl.credit.explanation_text import FEWEST
+    from lare_rl.cli.design import load_policy
+    from lare_rl.credit.explanation_text import MIN_EPISODES
     from lare_rl.envs.load import load_task, read_task
-    from lare_rl.latent.function import of_verdict
+    from lare_rl.latent.function import function_from_verdict
     from lare_rl.latent.saved import read_source
     from lare_rl.latent.verify import verify as verify_source
-    from lare_rl.tasks.spec import the_role
+    from lare_rl.tasks.spec import require_role
 
-    source, changed, written_for = read_source(file)
-    if fit and fit < FEWEST:
-        raise LareError(f"fit = {fit}: at least {FEWEST} episodes are needed")
+    source, changed, saved_task = read_source(file)
+    if fit and fit < MIN_EPISODES:
+        raise LareError(f"fit = {fit}: at least {MIN_EPISODES} episodes are needed")
     if policy is not None and (not fit or data is not None):
         raise LareError("--policy plays the episodes for --fit: give --fit a number of episodes, and no --data")
     spec = load_task(task) if data is None else read_task(task)
     spec = spec if judges is None else spec.model_copy(update={"judges": judges})
-    plays = policy_that_plays(policy, spec)
+    play = load_policy(policy, spec)
     if changed:
-        say("note    the source was changed after it was saved: its hash differs")
-    role = the_role(spec)
-    if written_for not in (None, role.name):
-        say(f"note    it was written for the task {written_for!r}")
-    verdict = verify_source(source, spec, kind, steps_of(data, spec))
-    say(f"for {role.name}: observations of {role.observation_size} numbers, actions of {role.action_size}")
+        print_line("note    the source was changed after it was saved: its hash differs")
+    role = require_role(spec)
+    if saved_task not in (None, role.name):
+        print_line(f"note    it was written for the task {saved_task!r}")
+    verdict = verify_source(source, spec, kind, load_steps(data, spec))
+    print_line(f"for {role.name}: observations of {role.observation_size} numbers, actions of {role.action_size}")
     for check in verdict.checks:
-        say(f"{'passed' if check.passed else 'FAILED'}  {check.name}")
+        print_line(f"{'passed' if check.passed else 'FAILED'}  {check.name}")
         for line in check.message.splitlines():
-            say(f"        {line}")
+            print_line(f"        {line}")
     for line in verdict.advice:
-        say(f"advice  {line}")
+        print_line(f"advice  {line}")
     if not verdict.passed:
         if file.suffix == ".json":
-            say("Paste the lines after FAILED into the same chat, and ask for the whole reply again, corrected.")
+            print_line("Paste the lines after FAILED into the same chat, and ask for the whole reply again, corrected.")
         sys.exit(1)
-    function = of_verdict(source, role, kind, verdict)
+    function = function_from_verdict(source, role, kind, verdict)
     for name, reads in zip(function.names, function.reads, strict=True):
-        say(f"factor  {name} reads {reads}")
+        print_line(f"factor  {name} reads {reads}")
     if fit:
-        say_what_returns_say(function, role, episodes_for(role, data, fit, plays))
+        _print_assessment(function, role, _load_episodes(role, data, fit, play))
 
 
-def episodes_for(role: "TaskSpec", data: str | None, count: int, policy: "Policy | None") -> "Sequence[Episode]":
-    """Episodes of a log, or of the environment."""
+def _load_episodes(role: "TaskSpec", data: str | None, n_episodes: int, policy: "Policy | None") -> "Sequence[Episode]":
+    """Return episodes of a log, or of the environment."""
     if data is not None:
         from lare_rl.logs.steps import logged_episodes
 
-        return logged_episodes(data, role, count)
-    from lare_rl.envs.play import episodes_of
+        return logged_episodes(data, role, n_episodes)
+    from lare_rl.envs.play import play_episodes
 
-    progress(f"playing {count} episodes by {'random actions' if policy is None else 'the policy'}")
-    return episodes_of(role, count, policy)
+    print_progress(f"playing {n_episodes} episodes by {'random actions' if policy is None else 'the policy'}")
+    return play_episodes(role, n_episodes, policy)
 
 
-def say_what_returns_say(function: "LatentFunction", role: "TaskSpec", episodes: "Sequence[Episode]") -> None:
+def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: "Sequence[Episode]") -> None:
     """Print how well the factors explain the returns of some episodes."""
-    from lare_rl.credit.explanation_text import error_shown, r2_shown
-    from lare_rl.training.reflect import told_by_returns
+    from lare_rl.training.reflect import assess_function
+    from lare_rl.util.findings import format_value
 
-    found = told_by_returns(function, role, episodes)
-    if len({one.total for one in episodes}) == 1:
-        say(f"All {len(episodes)} episodes have the same return, which says nothing about the factors.")
-        if role.environment != "none":
-            say(
+    assessment = assess_function(function, role, episodes)
+    if len({episode.return_ for episode in episodes}) == 1:
+        print_line(f"All {len(episodes)} episodes have the same return, which says nothing about the factors.")
+        if role.environment != NO_ENVIRONMENT:
+            print_line(
                 "Does the environment pay before its time limit (max_episode_steps)? If it does, let its score differ between bad "
-                "episodes too: a grade that is 0 for all random actions teaches nothing."
+                "episodes too: a score that is 0 for all random actions teaches nothing."
             )
         return
-    if math.isfinite(found.r2):
-        say(
-            f"Returns of episodes not seen yet, predicted by the factors: R² = {r2_shown(found.r2)} (1: exactly; 0: no better than "
-            f"their mean), with a standard error of {error_shown(found.r2_error)}. LaRe predicted each return from the episodes "
-            "before it. The first predictions had few such episodes: if the factors are right, R² usually rises with more. Rare "
-            "events need many. If R² remains below about 0.8, phi lacks something that the score depends on, or a part of the "
-            "score is noise or is decided by the initial state."
+    if math.isfinite(assessment.r2):
+        r2, r2_error = format_value(assessment.r2, "r2"), format_value(assessment.r2_error, "error")
+        print_line(
+            f"Returns of unseen episodes, predicted by the factors: R² = {r2} (1: exactly; 0: no better than their mean), "
+            f"with a standard error of {r2_error}. Each return was predicted from the episodes before it, so R² "
+            "usually rises with more episodes if the factors "
+            "are right. If it remains below about 0.8, phi lacks something that the score depends on, or the score is partly noise "
+            "or decided by the initial state."
         )
-        if found.r2_of_lengths is not None:
-            say(
-                f"Predicted by the lengths of these episodes alone, without a factor: R² = {r2_shown(found.r2_of_lengths)}."
-            )
-        say(
-            f"Fitted to all {len(episodes)} episodes (such shares may be high where R² is low, because these returns were seen):"
+        if assessment.length_r2 is not None:
+            length_r2 = format_value(assessment.length_r2, "r2")
+            print_line(f"Predicted by the lengths of these episodes alone, without a factor: R² = {length_r2}.")
+        print_line(
+            f"Fitted to all {len(episodes)} episodes (shares may be high where R² is low, because these returns were seen):"
         )
-    for line in found.sentences:
-        say(line)
+    for line in assessment.sentences:
+        print_line(line)

@@ -2,10 +2,10 @@
 
 from typing import TYPE_CHECKING
 
-from lare_rl.cli.terminal import show
+from lare_rl.cli.terminal import print_table
 
 if TYPE_CHECKING:
-    from lare_rl.algorithms.table import Algorithm
+    from lare_rl.algorithms.registry import Algorithm
     from lare_rl.credit.methods import Method
 
 
@@ -15,7 +15,7 @@ def tasks() -> None:
     from lare_rl.envs.load import read_task, shipped_tasks
 
     specs = [read_task(name) for name in shipped_tasks()]
-    show(
+    print_table(
         ("task", "observation", "action", "judges", "agents"),
         (
             (
@@ -32,34 +32,29 @@ def tasks() -> None:
 
 def methods() -> None:
     """List the ways to assign credit, and where each comes from."""
-    from lare_rl.credit.methods import TABLE
+    from lare_rl.credit.methods import METHODS
 
-    show(
+    print_table(
         ("method", "what the algorithm is trained on", "source"),
-        ((row.name, row.summary + for_whom(row), row.source) for row in TABLE),
+        ((method.name, method.summary + _agents_note(method), method.source) for method in METHODS.values()),
     )
 
 
-def for_whom(method: "Method") -> str:
-    """A note on methods that are only for one agent or only for many."""
-    return " (many agents)" if method.for_many_only else " (one agent)" if method.for_one_only else ""
+def _agents_note(method: "Method") -> str:
+    return " (many agents)" if method.multi_agent_only else " (one agent)" if method.single_agent_only else ""
 
 
 def algorithms() -> None:
     """List the reinforcement learning algorithms, and where each comes from."""
-    from lare_rl.algorithms.table import TABLE
+    from lare_rl.algorithms.registry import ALGORITHMS
 
-    show(
+    print_table(
         ("algorithm", "consumes", "agents", "actions", "what it is", "source"),
-        ((row.name, row.consumes, for_agents(row), for_actions(row), row.summary, row.source) for row in TABLE),
+        (_algorithm_row(algorithm) for algorithm in ALGORITHMS.values()),
     )
 
 
-def for_agents(row: "Algorithm") -> str:
-    """How many agents an algorithm trains."""
-    return "any" if row.one_agent and row.many_agents else "many" if row.many_agents else "one"
-
-
-def for_actions(row: "Algorithm") -> str:
-    """Which actions an algorithm takes."""
-    return "any" if row.continuous and row.discrete else "continuous" if row.continuous else "discrete"
+def _algorithm_row(algorithm: "Algorithm") -> tuple[str, ...]:
+    agents = "one" if not algorithm.multi_agent else "any" if algorithm.single_agent else "many"
+    actions = "discrete" if not algorithm.continuous else "any" if algorithm.discrete else "continuous"
+    return algorithm.name, algorithm.consumes, agents, actions, algorithm.summary, algorithm.source

@@ -2,7 +2,7 @@
 
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.terminal import progress, say
+from lare_rl.cli.terminal import print_line, print_progress
 
 
 def relabel(
@@ -54,10 +54,10 @@ def relabel(
         if spec is None:
             raise LareError("--function needs the --task that it was designed for")
         phi = lare_rl.load_function(function, spec, steps=lare_rl.logged_steps(dataset, spec))
-    # So that a half-written output is removed when the process is told to stop.
+    # An exception, unlike the default of this signal, removes a half-written output.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
-    with shown() as told:
-        found = lare_rl.relabel(
+    with _progress_bars() as listener:
+        result = lare_rl.relabel(
             dataset,
             out,
             method=method,
@@ -68,29 +68,30 @@ def relabel(
             memory=memory,
             seed=seed,
             overwrite=overwrite,
-            told=told,
+            listener=listener,
         )
-    for line in found.words:
-        say(line)
-    say(f"wrote {found.out}")
+    for line in result.summary:
+        print_line(line)
+    print_line(f"wrote {result.out}")
 
 
 @contextmanager
-def shown() -> Iterator:
-    """A progress bar on stderr for each pass over the data; only a line if stderr is not a terminal."""
+def _progress_bars() -> Iterator[Callable[[str, int, int | None], None]]:
+    """Show a progress bar on stderr for each pass over the data, or only a line if stderr is not a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bars:
-        passes = {}
+        bar_ids = {}
 
-        def told(stage: str, done: int, count: int | None) -> None:
-            if stage not in passes:
+        def update(stage: str, n_done: int, n_episodes: int | None) -> None:
+            if stage not in bar_ids:
                 name = {"fit": "learning", "write": "writing"}[stage]
-                passes[stage] = bars.add_task(name, total=count)
+                bar_ids[stage] = bars.add_task(name, total=n_episodes)
                 if bars.disable:
-                    progress(f"{name}, {'an unknown number of' if count is None else f'{count:,}'} episodes")
-            bars.update(passes[stage], completed=done)
+                    number = "an unknown number of" if n_episodes is None else f"{n_episodes:,}"
+                    print_progress(f"{name}, {number} episodes")
+            bars.update(bar_ids[stage], completed=n_done)
 
-        yield told
+        yield update

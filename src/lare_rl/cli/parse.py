@@ -1,138 +1,168 @@
-"""Read the command line with tyro, and turn the boxes in which tyro reports errors into one line."""
+"""Read the command line with tyro. A mistake of the user is a `LareError` of one line."""
 
 import contextlib
 import functools
 import inspect
 import io
-import re
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
-from pydantic import BaseModel
-from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
-from lare_rl.config.settings import kind_of
-from lare_rl.errors import LareError, did_you_mean
+from lare_rl.errors import CheckedModel, LareError, did_you_mean, model_keys, nested_model
 
-COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-NUMBERS = {"INT": "not a whole number, such as 10000", "FLOAT": "not a number, such as 0.5"}
-"""The error text for each of tyro's names of numeric types."""
-ARGUMENT = re.compile(r" *((?:--[\w.-]+ )?[A-Z][A-Z|]*) (.*)")
-"""A missing argument as tyro describes it: its name, and its help."""
-CONTINUED = re.compile(r"\n {8,}")
-"""A line break inside the text of an argument. The help joins the lines; tyro would break them there."""
+__all__ = ["parse"]
+
+_RULES = ConstructorRegistry()
+_NUMBERS = {int: "a whole number, such as 10000", float: "a number, such as 0.5"}
 
 
 def parse(
     commands: Mapping[str, Callable[..., None]], description: str, arguments: Sequence[str]
 ) -> Callable[[], None]:
-    """The requested command with its options, ready to be called. A request for help prints the help and exits.
+    """Return the requested command with its options, ready to be called. A request for help prints the help and exits.
 
     Raises:
         LareError: the arguments cannot be read.
     """
-    asked = {name: deferred(command) for name, command in commands.items()}
-    with RULES, contextlib.redirect_stderr(io.StringIO()) as box:
+    name, *options = arguments or [""]
+    if name in ("-h", "--help"):
+        deferred = {name: _defer(command) for name, command in commands.items()}
+        with _RULES:
+            tyro.extras.subcommand_cli_from_dict(deferred, prog="lare-rl", description=description, args=[name])
+    if name not in commands:
+        problem = f"there is no command {name!r}{did_you_mean(name, commands)}" if name else "there is no command"
+        raise LareError(f"{problem}; see lare-rl --help")
+    prog = f"lare-rl {name}"
+    with _RULES, contextlib.redirect_stderr(io.StringIO()) as stderr:
         try:
-            return tyro.extras.subcommand_cli_from_dict(asked, prog="lare-rl", description=description, args=arguments)
-        except SystemExit as stopped:
-            if not stopped.code:
+            command, unknown = tyro.cli(_defer(commands[name]), prog=prog, args=options, return_unknown_args=True)
+        except LareError as error:
+            raise LareError(f"{error}; see {prog} --help") from None
+        except SystemExit as exit_:
+            if not exit_.code:  # after the help
                 raise
-    if arguments and arguments[0] not in commands and not arguments[0].startswith("-"):
-        raise LareError(
-            f"there is no command {arguments[0]!r}{did_you_mean(arguments[0], commands)}; see lare-rl --help"
-        )
-    command = f"lare-rl {arguments[0]}" if arguments and arguments[0] in commands else "lare-rl"
-    raise LareError(f"{in_one_line(box.getvalue(), commands)}; see {command} --help")
+            raise LareError(f"{_first_paragraph(stderr.getvalue()).rstrip('.')}; see {prog} --help") from None
+    if unknown:
+        hint = did_you_mean(unknown[0], _option_names(commands[name]))
+        raise LareError(f"unrecognized options: {', '.join(unknown)}{hint}; see {prog} --help")
+    return command
 
 
-def deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-    """A function with the signature of a command that only stores its arguments.
+def _first_paragraph(box: str) -> str:
+    """Return the text below the title of tyro's box, up to the next horizontal line, in one line."""
+    lines = [line.strip("│| ") for line in box.strip().splitlines()[1:]]
+    groups = itertools.groupby(lines, key=lambda line: bool(line.strip("─╰╯+- ")))
+    return next((" ".join(" ".join(group).split()) for is_text, group in groups if is_text), "")
 
-    So tyro does not call the command, and an error inside the command is not taken for an error of the command line.
+
+def _defer(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """Return a function with the signature of a command that only stores its arguments.
+
+    So an error inside the command is not taken for an error of the command line.
     """
+    signature = inspect.signature(command)
 
     @functools.wraps(command)
-    def keep(*values: object, **named: object) -> Callable[[], None]:
-        return functools.partial(command, *values, **named)
+    def store(*args: Any, **kwargs: Any) -> Callable[[], None]:
+        for name, parameter in signature.parameters.items():
+            if isinstance(parameter.default, CheckedModel):
+                kwargs[name] = type(parameter.default)(**kwargs[name])
+        return functools.partial(command, *args, **kwargs)
 
-    signature = inspect.signature(command)
-    keep.__doc__ = CONTINUED.sub(" ", inspect.cleandoc(command.__doc__ or ""))
-    keep.__dict__["__signature__"] = signature
-    keep.__annotations__ = {name: shown_as(one.annotation, one.default) for name, one in signature.parameters.items()}
-    del keep.__wrapped__  # tyro would read the docstring there
-    return keep
+    del store.__wrapped__  # tyro would read docstring and signature there
+    store.__doc__ = inspect.cleandoc(command.__doc__ or "").replace("\n" + " " * 8, " ")  # the help breaks lines itself
+    store.__dict__["__signature__"] = signature
+    store.__annotations__ = {
+        name: _option_type(parameter.annotation, parameter.default) for name, parameter in signature.parameters.items()
+    }
+    return store
 
 
-RULES = ConstructorRegistry()
+def _option_names(command: Callable[..., None]) -> Iterator[str]:
+    for name, parameter in inspect.signature(command).parameters.items():
+        is_model = isinstance(parameter.default, CheckedModel)
+        for key in model_keys(type(parameter.default)) if is_model else [name]:
+            yield f"--{key.replace('_', '-')}"
 
 
-@RULES.struct_rule
-def options_of(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """The options of a Pydantic model, as tyro makes them, but for `shown_as`."""
-    if not (isinstance(info.type, type) and issubclass(info.type, BaseModel)):
+@_RULES.struct_rule
+def _read_model(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Make an option of each field of a model. If the model itself may be None, so may all of its fields."""
+    if not (isinstance(info.type, type) and issubclass(info.type, CheckedModel)):
         return None
-    options = []
+    may_be_none = not isinstance(info.default, info.type)
+    fields = []
     for name, field in info.type.model_fields.items():
-        default = getattr(info.default, name, field.get_default(call_default_factory=True))
-        options.append(StructFieldSpec(name, shown_as(kind_of(field), default), default, helptext=field.description))
-    return StructConstructorSpec(instantiate=info.type, fields=tuple(options))
+        default, doc = None if may_be_none else getattr(info.default, name), field.description
+        if kind := nested_model(field):
+            default = tyro.MISSING if default is None else default
+            doc = doc or inspect.cleandoc(kind.__doc__ or "").split("\n\n")[0]
+        else:
+            annotation: Any = field.annotation
+            if field.metadata:
+                annotation = Annotated[(annotation, *field.metadata)]
+            kind = _option_type(annotation | None if may_be_none else annotation, default)
+        fields.append(StructFieldSpec(name, kind, default, helptext=" ".join((doc or "").split())))
+
+    def collect(**values: Any) -> dict[str, Any]:
+        return {name: value for name, value in values.items() if value is not None and value != {}}
+
+    return StructConstructorSpec(instantiate=collect, fields=tuple(fields))
 
 
-def shown_as(kind: Any, default: object) -> Any:
-    """The type of an option. If it may be left out, the help says in words what happens then; "None" would say something else."""
+@_RULES.primitive_rule
+def _read_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """Convert numbers and choices. A `LareError` is not caught by tyro, as a `ValueError` would be."""
+    choices = get_args(info.type) if info.type_origin is Literal else ()
+    if choices:
+        expected = f"one of {', '.join(choices)}"
+    elif info.type in _NUMBERS:
+        expected = _NUMBERS[info.type]
+    else:
+        return None
+
+    def convert(texts: list[str]) -> Any:
+        try:
+            return choices[choices.index(texts[0])] if choices else info.type(texts[0])
+        except ValueError:
+            raise LareError(f"{texts[0]!r} is not {expected}") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=_metavar(info.type) or "",
+        instance_from_str=convert,
+        is_instance=lambda value: value in choices if choices else type(value) in (int, info.type),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _option_type(kind: Any, default: object) -> Any:
+    """Return the type of an option. If its default is None, the help names the type without None, and no default."""
     if default is not None:
         return kind
-    taken = [one for one in get_args(kind) if one is not NoneType]
-    name = metavar(taken[0]) if len(taken) == 1 else None
-    return Annotated[kind, tyro.conf.arg(help_behavior_hint="", metavar=name)]
+    kinds = [inner for inner in get_args(kind) if inner is not NoneType]
+    metavar = _metavar(kinds[0]) if len(kinds) == 1 else None
+    return Annotated[kind, tyro.conf.arg(help_behavior_hint="", metavar=metavar)]
 
 
-def metavar(kind: Any) -> str | None:
-    """The name of a type in the help."""
-    origin, inside = get_origin(kind), get_args(kind)
+def _metavar(kind: Any) -> str | None:
+    """Return the name of a type in the help."""
+    origin, args = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        return metavar(inside[0])
+        return _metavar(args[0])
     if origin is Literal:
-        return "{" + ",".join(inside) + "}"
+        return "{" + ",".join(args) + "}"
     if origin is tuple:
-        return f"[{metavar(inside[0])} [{metavar(inside[0])} ...]]"
+        return f"[{_metavar(args[0])} [{_metavar(args[0])} ...]]"
     return kind.__name__.upper() if isinstance(kind, type) else None
-
-
-def in_one_line(box: str, commands: Mapping[str, object]) -> str:
-    """The error that a box of tyro's reports."""
-    said, *more = sections(box)
-    said = said.split(" Got errors:")[0].rstrip(".")
-    if said.startswith("Unrecognized or misplaced options: "):
-        misplaced = re.findall(r"(\S+) \(applied to", said)
-        said = f"Unrecognized options: {', '.join(misplaced)}"
-    if found := re.fullmatch(r"Unrecognized options: (\S+?)(,.*)?", said):
-        known = [*re.findall(r"(?<!\S)--[\w.-]+", " ".join(more)), *commands]
-        hint = "" if found[1] in known else did_you_mean(found[1], known)  # tyro also names options of other commands
-        return f"unrecognized options: {found[1]}{found[2] or ''}{hint}"
-    if found := re.fullmatch(r"Error parsing (\S+): no type matching (.+) could be instantiated from \['(.*)'\]", said):
-        kind = found[2].replace("{None}|", "")
-        return f"{found[1]} {found[3]}: {NUMBERS.get(kind, f'not of the kind {kind}')}"
-    if found := re.fullmatch(r"Missing value for argument '(\S+)'\..*", said):
-        return f"{found[1]} needs a value"
-    if found := re.fullmatch(r"Missing from (lare-rl [\w-]+): (.*)", said):
-        return f"{found[1]} needs {' and '.join(ARGUMENT.sub(described, one) for one in found[2].split('(required)') if one)}"
-    if found := re.fullmatch(r"invalid choice '(.*)' for argument '(\S+)'\. Expected one of \((.*)\)", said):
-        known = sorted(set(re.findall(r"'([^']*)'", found[3])) - {"None"})
-        return f"{found[2]} {found[1]}: not one of {', '.join(known)}"
-    return said
-
-
-def described(argument: re.Match[str]) -> str:
-    """A missing argument, with its help in brackets."""
-    return f"{argument[1]} ({argument[2].rstrip('. ')})"
-
-
-def sections(box: str) -> list[str]:
-    """The texts between the horizontal lines of a box, without its title. Some terminals get the box drawn in ASCII."""
-    lines = [line.strip("╭╮╰╯│ ") for line in COLOUR.sub("", box).splitlines()[1:]]
-    ruled = "\n".join("\0" if re.fullmatch(r"[─-]{3,}", line) else line for line in lines)
-    return [" ".join(part.split()) for part in ruled.split("\0") if part.strip()] or [box.strip()]

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.design import BUDGET, REQUESTS
-from lare_rl.cli.terminal import RunDirectories, RunDirectory, progress, say, show
-from lare_rl.config.settings import ResolvedSettings, Settings, set_in_vain
-from lare_rl.errors import LareError, pip_install
+from lare_rl.cli.terminal import RunDirectories, RunDirectory, print_line, print_progress, print_table
+from lare_rl.config.effective import unused_settings
+from lare_rl.config.settings import ResolvedSettings, Settings
+from lare_rl.errors import LareError, install_command
 
 if TYPE_CHECKING:
-    from lare_rl.llm.model import Model
+    from lare_rl.latent.function import LatentFunction
+    from lare_rl.tasks.spec import TaskSpec
     from lare_rl.training.progress import Listener
 
 DEFAULTS = Settings()
@@ -24,8 +25,6 @@ def train(
     task: Annotated[Positional[str | None], tyro.conf.arg(metavar="[TASK]")] = None,
     settings: Annotated[Settings, tyro.conf.arg(name="")] = DEFAULTS,
     function: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = (),
-    model: str | None = None,
-    base_url: str | None = None,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     tensorboard: bool = False,
@@ -39,9 +38,6 @@ def train(
         task: a shipped name (see `lare-rl tasks`), or the path of a task file. Not given with --resume.
         function: a latent function (.py), or a reply with one (.json), to use instead of a recorded one; verified before it is
             run. Where several teams learn, one --function for each, in the order of the task.
-        model: with --reflect-every, the model to ask: the path of a recording (.json), or the name of a model behind an
-            OpenAI-compatible endpoint.
-        base_url: the endpoint; the default is OPENAI_BASE_URL, or else OpenAI's.
         out: the run directory, which must not exist; the default is runs/TASK-METHOD-ALGORITHM-sSEED.
         resume: a run directory to continue, from its last checkpoint and with its own settings. With --steps, a finished run is
             extended.
@@ -51,91 +47,78 @@ def train(
         watch: write verdict and curves to watch.html in the run directory after every evaluation, and open it in the browser.
     """
     import lare_rl
-    from lare_rl.config.resolve import decide
-    from lare_rl.latent.function import CHANGED, per_role
-    from lare_rl.latent.saved import load
-    from lare_rl.runs.directory import default_directory, open_run
-    from lare_rl.training.train import check_given
+    from lare_rl.runs.directory import open_run
 
     if resume is not None:
         if (task, function, out, settings.model_copy(update={"steps": None})) != (None, (), None, DEFAULTS):
-            raise LareError(
-                "--resume goes on with the run's own settings: give it no task and no other setting than --steps"
-            )
-        config = open_run(resume).config
-        asked = model_of(model, base_url, config.task.name)
-        listeners = [*listeners_of(wandb, mlflow, config.settings), *page_of(resume, watch)]
-        run = lare_rl.resume(resume, steps=settings.steps, model=asked, tensorboard=tensorboard, listeners=listeners)
+            raise LareError("--resume uses the run's settings: give it no task, and no setting but --steps")
+        run_settings = open_run(resume).config.settings
+        listeners = [*_listeners(wandb, mlflow, run_settings), *_live_page(resume, watch)]
+        run = lare_rl.resume(resume, steps=settings.steps, tensorboard=tensorboard, listeners=listeners)
     elif task is None:
         raise LareError(
-            "say what to train on: lare-rl train TASK (lare-rl tasks lists them), or lare-rl train --resume DIR"
+            "there is no task: use lare-rl train TASK (lare-rl tasks lists them), or lare-rl train --resume DIR"
         )
     else:
+        from lare_rl.config.resolve import resolve
+        from lare_rl.runs.directory import default_directory
+
         spec = lare_rl.load_task(task)
-        resolved = decide(settings, spec)
-        for in_vain in set_in_vain(settings, resolved, spec).values():
-            raise LareError(f"{in_vain}: leave the setting out")
-        if function:
-            check_given(resolved)
-        functions = [load(file, role) for file, role in per_role(function, spec)] if function else None
-        for one in functions or ():
-            if one.changed:
-                progress(
-                    f"the function by {one.model.removesuffix(CHANGED)} was changed after it was saved: its hash differs"
-                )
-        asked = model_of(model, base_url, spec.name)
+        resolved = resolve(settings, spec)
+        for warning in unused_settings(settings, resolved, spec).values():
+            raise LareError(f"{warning}: leave the setting out")
+        functions = _load_functions(function, spec, resolved) if function else None
         out = out or default_directory(spec, resolved)
         run = lare_rl.train(
             spec,
             settings,
             function=functions,
-            model=asked,
             out=out,
             tensorboard=tensorboard,
-            listeners=[*listeners_of(wandb, mlflow, resolved), *page_of(out, watch)],
+            listeners=[*_listeners(wandb, mlflow, resolved), *_live_page(out, watch)],
         )
-    say(f"finished {run.directory}; to see it: lare-rl report {run.directory}")
+    print_line(f"finished {run.directory}; to see it: lare-rl report {run.directory}")
 
 
-def listeners_of(wandb: str | None, mlflow: str | None, settings: ResolvedSettings) -> "list[Listener]":
-    """The terminal, and the tracking services that the user asked for."""
+def _load_functions(files: tuple[Path, ...], spec: "TaskSpec", resolved: ResolvedSettings) -> "list[LatentFunction]":
+    """Load and verify the latent functions of a run."""
+    from lare_rl.latent.function import CHANGED_SUFFIX, pair_with_roles
+    from lare_rl.latent.saved import load_function
+    from lare_rl.training.latent_functions import check_draw_unused
+
+    check_draw_unused(resolved)
+    functions = [load_function(file, role) for file, role in pair_with_roles(files, spec)]
+    for function in functions:
+        if function.changed:
+            author = function.model.removesuffix(CHANGED_SUFFIX)
+            print_progress(f"the function by {author} was changed after it was saved: its hash differs")
+    return functions
+
+
+def _listeners(wandb: str | None, mlflow: str | None, settings: ResolvedSettings) -> "list[Listener]":
+    """Return the terminal, and the requested tracking services."""
     from lare_rl.training.progress import Terminal
     from lare_rl.training.trackers import MLflow, WeightsAndBiases
 
-    told: list[Listener] = [Terminal()]
-    kept = settings.model_dump(mode="json")
+    listeners: list[Listener] = [Terminal()]
+    config = settings.model_dump(mode="json")
     if wandb is not None:
-        told.append(WeightsAndBiases(project=wandb, config=kept))
+        listeners.append(WeightsAndBiases(project=wandb, config=config))
     if mlflow is not None:
-        told.append(MLflow(mlflow, parameters=kept))
-    return told
+        listeners.append(MLflow(mlflow, parameters=config))
+    return listeners
 
 
-def page_of(directory: Path, watch: bool) -> "list[Listener]":
-    """The page that shows the run, if the user asks for it, or asked for it before the run was stopped."""
+def _live_page(directory: Path, watch: bool) -> "list[Listener]":
+    """Return the page that shows the run, if it is requested now, or was requested before the run was stopped."""
     if not watch and not directory.exists():
         return []
     from lare_rl.report.live_page import PAGE, LivePage
 
     page = directory / PAGE
     if watch:
-        progress(f"to watch it: {page}")
+        print_progress(f"to watch it: {page}")
     return [LivePage(directory, browser=watch)] if watch or page.exists() else []
-
-
-def model_of(model: str | None, base_url: str | None, task: str) -> "Model | None":
-    """The model that a run asks for better functions; None if the user named none."""
-    from lare_rl.llm.budget import Budget
-    from lare_rl.llm.live import LiveModel
-    from lare_rl.llm.model import recorded_model
-
-    if base_url is not None and (model is None or model.endswith(".json")):
-        raise LareError("--base-url is for a live model: say which one with --model NAME")
-    if model is None:
-        return None
-    if model.endswith(".json"):
-        return recorded_model(task, "factors", 0, Path(model))
-    return LiveModel(model, base_url, None, Budget(REQUESTS, BUDGET), said=progress)
 
 
 def evaluate(
@@ -155,62 +138,63 @@ def evaluate(
     """
     import numpy as np
 
-    from lare_rl.algorithms.table import ALGORITHMS
-    from lare_rl.compare.statistics import in_words, plus_minus
-    from lare_rl.envs.families import env_spec
-    from lare_rl.evaluation.evaluate import RANDOM_EPISODES, above_chance, evaluation_of, random_play
-    from lare_rl.evaluation.video import check_video, record_video
+    from lare_rl.algorithms.registry import ALGORITHMS
+    from lare_rl.envs.families import load_env_spec
+    from lare_rl.evaluation.evaluate import RANDOM_EPISODES, evaluate_policy, gain_over_random, play_random
+    from lare_rl.evaluation.video import check_video_path, record_video
     from lare_rl.runs.directory import open_run
-    from lare_rl.training.explain import explanation_of
-    from lare_rl.training.session import load_actor
+    from lare_rl.training.explain import explain_run
+    from lare_rl.training.saved_state import load_actor
+    from lare_rl.util.findings import format_value
+    from lare_rl.util.statistics import format_mean_std, format_plus_minus
 
     opened = open_run(run)
+    task, settings = opened.config.task, opened.config.settings
+    env_spec = load_env_spec(task)
     if video is not None:
-        check_video(video)
-        if env_spec(opened.config.task).agents == 1:
-            draw_without_a_screen()
-            progress("filming an episode; without a graphics card that may take minutes")
+        check_video_path(video)
+        if env_spec.n_agents == 1:
+            _render_without_screen()
+            print_progress("filming an episode; without a graphics card that may take minutes")
         record_video(opened, video, best, deterministic)
-        say(f"wrote {video}")
-    found = evaluation_of(opened, episodes, best, deterministic)
-    since = load_actor(opened, of_best=True)[2] if best else None
-    counted = f"{episodes} episodes" if episodes != 1 else "1 episode"
-    roles = opened.config.task.roles
-    for team, role in enumerate(roles):
-        for place, seed in enumerate(opened.seeds):
-            named = f"{role.name}, " if len(roles) > 1 else ""
-            of_seed, summed = (in_words(each[place, :, team]) for each in (found.returns, found.sums))
-            of_best = "" if since is None else f" ({when_saved(int(since[place]), opened.config.settings.warmup)})"
-            of_all = f"; summed over the agents {summed}" if env_spec(opened.config.task).agents > 1 else ""
-            say(f"{named}seed {seed}: return {of_seed} over {counted}{of_best}{of_all}")
-    by_chance = random_play(opened.config.task, max(episodes, RANDOM_EPISODES)) if len(roles) == 1 else []
-    if by_chance:
-        returns = np.array([one.total for one in by_chance])
-        say(f"random actions: return {in_words(returns)} over {len(by_chance)} episodes")
-        if (difference := above_chance(found.returns[:, :, 0], returns)) is not None:
-            say(f"difference: {plus_minus(*difference)} (± is its standard error)")
-    if not (
-        deterministic or ALGORITHMS[opened.config.settings.algorithm].greedy(env_spec(opened.config.task).discrete)
-    ):
-        say("The policy samples its actions, as in training; --deterministic plays the most likely ones.")
-    for name, values in found.measures.items():
-        for seed, of_seed in zip(opened.seeds, values, strict=True):
-            say(f"seed {seed}: {name} {in_words(of_seed)}")
-        if by_chance:
-            of_chance = np.array([one.measures[name] for one in by_chance])
-            say(f"random actions: {name} {in_words(of_chance)}")
-    if told := explanation_of(opened):
-        say(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
-    for line in told:
-        say(line)
+        print_line(f"wrote {video}")
+    evaluation = evaluate_policy(opened, episodes, best, deterministic)
+    best_steps = load_actor(opened, best=True)[2] if best else None
+    episodes_text = format_value(episodes, "count episode")
+    for team_index, role in enumerate(task.roles):
+        for seed_index, seed in enumerate(opened.seeds):
+            returns, sums = (
+                format_mean_std(values[seed_index, :, team_index])
+                for values in (evaluation.returns, evaluation.summed_returns)
+            )
+            line = f"{role.name}, " if len(task.roles) > 1 else ""
+            line += f"seed {seed}: return {returns} over {episodes_text}"
+            if best_steps is not None:
+                step = int(best_steps[seed_index])
+                untrained = ", before its first update" if step <= settings.warmup else ""
+                line += f" (the policy of step {step:,}{untrained})"
+            print_line(line + (f"; summed over the agents {sums}" if env_spec.n_agents > 1 else ""))
+    random_episodes = play_random(task, max(episodes, RANDOM_EPISODES)) if len(task.roles) == 1 else []
+    if random_episodes:
+        random_returns = np.array([episode.return_ for episode in random_episodes])
+        print_line(f"random actions: return {format_mean_std(random_returns)} over {len(random_episodes)} episodes")
+        if (gain := gain_over_random(evaluation.returns[:, :, 0], random_returns)) is not None:
+            print_line(f"difference: {format_plus_minus(*gain)} (± is its standard error)")
+    if not (deterministic or ALGORITHMS[settings.algorithm].greedy(env_spec.discrete)):
+        print_line("The policy samples its actions, as in training; --deterministic plays the most likely ones.")
+    for name, seed_values in evaluation.measures.items():
+        for seed, values in zip(opened.seeds, seed_values, strict=True):
+            print_line(f"seed {seed}: {name} {format_mean_std(values)}")
+        if random_episodes:
+            values = np.array([episode.measures[name] for episode in random_episodes])
+            print_line(f"random actions: {name} {format_mean_std(values)}")
+    if explanation := explain_run(opened):
+        print_line(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
+    for line in explanation:
+        print_line(line)
 
 
-def when_saved(step: int, warmup: int) -> str:
-    """The step of a policy, and whether it had been trained by then."""
-    return f"the policy of step {step:,}{', before its first update' if step <= warmup else ''}"
-
-
-def draw_without_a_screen() -> None:
+def _render_without_screen() -> None:
     """Let MuJoCo render without a screen."""
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
         os.environ.setdefault("MUJOCO_GL", "egl")
@@ -226,26 +210,27 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = False) ->
         film: film an episode of each run too, and show it in the page. Without a graphics card that may take minutes.
     """
     from lare_rl.report.report import write_report
-    from lare_rl.runs.directory import read_config
-    from lare_rl.runs.discover import run_directories
-    from lare_rl.tasks.trust import TRUSTED, unknown_module
+    from lare_rl.runs.config_file import read_config
+    from lare_rl.runs.discover import find_run_directories
+    from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module
 
     if film:
-        draw_without_a_screen()
-    found = run_directories(runs)
-    unknown = sorted({one for run in found if (one := unknown_module(read_config(run).task)) is not None})
-    usual = found[0] / "report.html"
-    if unknown and out is None and usual.exists():
+        _render_without_screen()
+    directories = find_run_directories(runs)
+    modules = {untrusted_module(read_config(directory).task) for directory in directories} - {None}
+    untrusted = ",".join(sorted(map(str, modules)))
+    default_path = directories[0] / "report.html"
+    if untrusted and out is None and default_path.exists():
         raise LareError(
-            f"{usual} would be replaced by a page without random play, credit and factors, because the module {unknown[0]} is not "
-            f"imported: set {TRUSTED}={','.join(unknown)}, or write another file with --out"
+            f"{default_path} would lose random play, credit and factors, because {untrusted} is not imported: set "
+            f"{TRUST_VARIABLE}={untrusted} to allow the import, or write another file with --out"
         )
-    progress("drawing, which takes up to a minute for each run")
-    say(f"wrote {write_report(found, out, film)}")
-    for module in unknown:
-        progress(
-            f"the module {module} was not imported, so random play, credit and factors are left out: set {TRUSTED}={module} to "
-            "allow the import"
+    print_progress("drawing, which takes up to a minute for each run")
+    print_line(f"wrote {write_report(directories, out, film)}")
+    if untrusted:
+        print_progress(
+            f"random play, credit and factors are left out, because {untrusted} was not imported: set {TRUST_VARIABLE}={untrusted} "
+            "to allow the import"
         )
 
 
@@ -268,12 +253,12 @@ def export(
     import lare_rl
     from lare_rl.runs.directory import open_run
 
-    found = lare_rl.export(open_run(run), out, seed, best)
-    say(f"wrote {', '.join(found.functions)} to {found.directory}; exported.py there says how to call them")
-    if found.left_out:
-        progress(f"there is no reward function: {found.left_out}")
-    if not found.onnx:
-        progress(f"without the package onnx, no .onnx files were written: {pip_install('onnx')}")
+    result = lare_rl.export_run(open_run(run), out, seed, best)
+    print_line(f"wrote {', '.join(result.functions)} to {result.directory}; exported.py there says how to call them")
+    if result.no_reward_reason:
+        print_progress(f"there is no reward function: {result.no_reward_reason}")
+    if not result.onnx:
+        print_progress(f"without the package onnx, no .onnx files were written: {install_command('onnx')}")
 
 
 def cross_play(
@@ -290,23 +275,16 @@ def cross_play(
         second: another run of the same task.
         episodes: number of episodes for each pair of seeds.
     """
-    from lare_rl.compare.statistics import in_words
-    from lare_rl.evaluation.team_matches import Match
-    from lare_rl.evaluation.team_matches import cross_play as play
+    from lare_rl.evaluation.cross_play import cross_play as play
     from lare_rl.runs.directory import open_run
+    from lare_rl.util.statistics import format_mean_std
 
     runs = open_run(first), open_run(second)
-    matches = play(runs, episodes)
-    task = runs[0].config.task
-    ours, theirs = (role.team for role in task.teams)
-
-    def cell(match: Match) -> str:
-        return in_words(match.returns.ravel())
-
-    rows = zip((first, second), (matches[:2], matches[2:]), strict=True)
-    head = (f"{ours} of, against {theirs} of", str(first), str(second))
-    show(head, ((str(name), *map(cell, row)) for name, row in rows))
-    say(
-        f"Returns of the {ours} team: mean ± standard deviation over all pairs of a seed of one run and a seed of the other, "
+    cells = [format_mean_std(match.returns.ravel()) for match in play(runs, episodes)]
+    first_team, second_team = (role.team for role in runs[0].config.task.teams)
+    head = (f"{first_team} of, against {second_team} of", str(first), str(second))
+    print_table(head, [(str(first), *cells[:2]), (str(second), *cells[2:])])
+    print_line(
+        f"Returns of the {first_team} team: mean ± standard deviation over all pairs of a seed of one run and a seed of the other, "
         f"{episodes} episodes each."
     )

@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.terminal import RunDirectories, progress, say, show
+from lare_rl.cli.terminal import RunDirectories, print_line, print_progress, print_table
 from lare_rl.errors import LareError
 
-BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
+_BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
 """A directory of the checkout. It does not exist if LaRe was installed from a package index."""
 
 Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")]
@@ -32,39 +32,40 @@ def sweep(
         ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
         check: only check the file, list its runs and how far they are, and train nothing.
     """
-    from lare_rl.cli.sweep_progress import watching
-    from lare_rl.compare.metric_tables import rows_of, write_table
-    from lare_rl.sweep.processes import shares
-    from lare_rl.sweep.sweep import is_done, read_sweep, run_sweep
+    from lare_rl.cli.sweep_progress import show_progress
+    from lare_rl.compare.metric_tables import read_metric_rows, write_table
+    from lare_rl.config.effective import warmup_warning
+    from lare_rl.sweep.processes import assign_cores
+    from lare_rl.sweep.sweep import read_sweep, run_sweep
 
-    wanted, jobs = read_sweep(file)
+    resources, jobs = read_sweep(file)
     for job in jobs:
-        if warning := job.resolved.untrained:
-            progress(f"{job.name}: {warning}")
+        if warning := warmup_warning(job.resolved):
+            print_progress(f"{job.name}: {warning}")
     if check:
         if ray is None:
             try:
-                shares(wanted.processes, wanted.cores)
+                assign_cores(resources.processes, resources.cores)
             except LareError as error:  # the sweep may be meant for another machine
-                progress(f"{error}: the sweep would not begin on this machine")
+                print_progress(f"{error}: the sweep would not begin on this machine")
         for job in jobs:
-            say(f"{job.name}: {'done' if is_done(job) else f'step {job.step():,} of {job.resolved.steps:,}'}")
+            print_line(f"{job.name}: {'done' if job.done else f'step {job.step():,} of {job.resolved.steps:,}'}")
         return
 
-    def tabulate() -> None:
-        rows = rows_of(job.directory for job in jobs)
+    def write_tables() -> None:
+        rows = read_metric_rows(job.directory for job in jobs)
         for path in write_table(rows, jobs[0].directory.parent.parent / "results") if rows else ():
-            say(f"wrote {path}")
+            print_line(f"wrote {path}")
 
     try:
-        with watching(jobs) as said:
-            failed = run_sweep(wanted, jobs, said, ray)
+        with show_progress(jobs) as on_message:
+            failed_jobs = run_sweep(resources, jobs, on_message, ray)
     except BaseException:
         with suppress(LareError):  # the error to report is the one that stopped the sweep
-            tabulate()
+            write_tables()
         raise
-    tabulate()
-    if failed:
+    write_tables()
+    if failed_jobs:
         sys.exit(1)
 
 
@@ -85,26 +86,27 @@ def compare(
         late: compare means over the evaluations after three quarters of the steps, which vary less than the last one.
         out: the page to write.
     """
-    from lare_rl.compare import compare as page
+    from lare_rl.compare import page
+    from lare_rl.compare.collect import collect_results
+    from lare_rl.compare.messages import MESSAGES
+    from lare_rl.util.findings import render
 
-    found, remarks = page.find_all(runs, metric)
-    for remark in remarks:
-        progress(remark)
-    comparisons = page.write_comparisons(found, out, metric, remarks, at, late)
+    results, findings = collect_results(runs, metric)
+    for finding in findings:
+        print_progress(render(finding, MESSAGES))
+    comparisons = page.write_comparisons(results, out, metric, findings, at, late)
     for comparison in comparisons:
         if len(comparisons) > 1:
-            say(f"\n{comparison.tasks[0]}")
-        show(*page.cells(comparison))
-        say(page.said_of(comparison))
-    if rows := page.cells_of_all(comparisons):
-        say("\nAll tasks: each run is compared with the runs on the same task.")
-        show(page.HEAD_OF_ALL, rows)
+            print_line(f"\n{comparison.tasks[0]}")
+        print_table(*page.comparison_table(comparison))
+        print_line(page.describe(comparison))
+    if rows := page.overall_table(comparisons):
+        print_line(f"\n{MESSAGES['over_tasks']}")
+        print_table(page.OVERALL_HEADER, rows)
     elif len(comparisons) > 1:
-        say(
-            "\nNo table over all tasks: it needs the same baseline, and another method, on every task with equally many seeds."
-        )
-    say(page.MEANINGS)
-    say(f"wrote {out}")
+        print_line(f"\n{MESSAGES['no_overall_table']}")
+    print_line(MESSAGES["columns"])
+    print_line(f"wrote {out}")
 
 
 def reproduce(
@@ -128,43 +130,43 @@ def reproduce(
         cores: number of cores for each run.
         ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
     """
-    from lare_rl.cli.sweep_progress import watching
-    from lare_rl.sweep.sweep import Share
-    from lare_rl.training.train import Interrupted
+    from lare_rl.cli.sweep_progress import show_progress
+    from lare_rl.sweep.sweep import Resources
+    from lare_rl.training.loop import RunInterruptedError
 
-    paper = from_the_checkout("reproduce")
+    paper = _import_from_checkout("reproduce")
     if exhibit is None:
-        show(("exhibit", "of the paper", "what it shows"), paper.listed())
+        print_table(("exhibit", "of the paper", "what it shows"), paper.listed())
         return
-    share = Share(processes=processes, cores=cores)
+    resources = Resources(processes=processes, cores=cores)
 
-    def make(name: str) -> None:
-        say(f"wrote {paper.reproduce(name, budget, share, runs, out, ray, watching)}")
+    def write_page(name: str) -> None:
+        print_line(f"wrote {paper.reproduce(name, budget, resources, runs, out, ray, show_progress)}")
 
     if exhibit != "all":
-        make(exhibit)
+        write_page(exhibit)
         return
     names = [name for name, _, _ in paper.listed()]
-    failed = 0
+    n_failed = 0
     for name in names:
         try:
-            make(name)
-        except Interrupted:
+            write_page(name)
+        except RunInterruptedError:
             raise
         except LareError as error:  # the other exhibits are still made
-            failed += 1
-            progress(f"{name}: {error}")
-    if failed:
-        raise LareError(f"{failed} of {len(names)} exhibits have no page")
+            n_failed += 1
+            print_progress(f"{name}: {error}")
+    if n_failed:
+        raise LareError(f"{n_failed} of {len(names)} exhibits have no page")
 
 
-def from_the_checkout(module: str) -> ModuleType:
-    """A module of `benchmarks/paper`, which only a checkout has. Raises `LareError` if LaRe was installed without one."""
-    if not (BENCHMARKS / "paper" / f"{module}.py").is_file():
+def _import_from_checkout(module: str) -> ModuleType:
+    """Import a module of `benchmarks/paper`, which only a checkout has."""
+    if not (_BENCHMARKS / "paper" / f"{module}.py").is_file():
         raise LareError(
-            "lare-rl reproduce needs a checkout, whose directory benchmarks/paper describes the exhibits: clone the repository, and "
-            "install it there by pip install -e '.[statistics]'"
+            "lare-rl reproduce needs a checkout, which describes the exhibits: clone the repository, and install it there by "
+            "pip install -e '.[statistics]'"
         )
-    if str(BENCHMARKS) not in sys.path:
-        sys.path.append(str(BENCHMARKS))
+    if str(_BENCHMARKS) not in sys.path:
+        sys.path.append(str(_BENCHMARKS))
     return importlib.import_module(f"paper.{module}")

@@ -8,20 +8,19 @@ from collections.abc import Callable, Iterator, Sequence
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from lare_rl.cli.terminal import progress
+from lare_rl.cli.terminal import print_progress
 from lare_rl.errors import LareError
 from lare_rl.sweep.jobs import Job
-from lare_rl.util.sanitize import legible
+from lare_rl.util.sanitize import sanitize
 
-EVERY = 2.0
-"""Seconds between two updates of the bars."""
+__all__ = ["show_progress", "update_bars"]
 
 
 @contextlib.contextmanager
-def watching(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
-    """Show the progress of a sweep; yields the function that prints its messages."""
+def show_progress(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
+    """Show the progress of a sweep, and yield the function that prints its messages."""
     if not sys.stderr.isatty():
-        yield progress
+        yield print_progress
         return
     console = Console(stderr=True)
     columns = (
@@ -32,34 +31,34 @@ def watching(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:
     )
     ended = threading.Event()
     with Progress(*columns, console=console, transient=True) as bars:
-        looking = threading.Thread(target=look, args=(jobs, bars, ended), daemon=True)
-        looking.start()
+        thread = threading.Thread(target=update_bars, args=(jobs, bars, ended), daemon=True)
+        thread.start()
         try:
-            yield lambda text: console.print(legible(text), highlight=False, markup=False)
+            yield lambda text: console.print(sanitize(text), highlight=False, markup=False)
         finally:
             ended.set()
-            looking.join()
+            thread.join()
 
 
-def look(jobs: Sequence[Job], bars: Progress, ended: threading.Event) -> None:
-    """Update the bars until the sweep has ended."""
-    whole = bars.add_task("all runs", total=sum(job.resolved.steps for job in jobs))
-    own: dict[str, TaskID] = {}
+def update_bars(jobs: Sequence[Job], bars: Progress, ended: threading.Event, refresh_s: float = 2.0) -> None:
+    """Update the bars until the sweep has ended. Only active runs have a bar."""
+    all_runs = bars.add_task("all runs", total=sum(job.resolved.steps for job in jobs))
+    bar_ids: dict[str, TaskID] = {}
     while not ended.is_set():
-        steps = {job.name: step_of(job) for job in jobs}
-        bars.update(whole, completed=sum(steps.values()))
+        steps = {job.name: _current_step(job) for job in jobs}
+        bars.update(all_runs, completed=sum(steps.values()))
         for job in jobs:
-            done = steps[job.name]
-            if 0 < done < job.resolved.steps and job.name not in own:
-                own[job.name] = bars.add_task(job.name, total=job.resolved.steps)
-            if job.name in own:
-                bars.update(own[job.name], completed=done, visible=done < job.resolved.steps)
-        ended.wait(EVERY)
+            step, total = steps[job.name], job.resolved.steps
+            if 0 < step < total and job.name not in bar_ids:
+                bar_ids[job.name] = bars.add_task(job.name, total=total)
+            if job.name in bar_ids:
+                bars.update(bar_ids[job.name], completed=step, visible=step < total)
+        ended.wait(refresh_s)
 
 
-def step_of(job: Job) -> int:
-    """The number of steps that a run has done. A damaged run counts as 0; the process that trains it reports the damage."""
+def _current_step(job: Job) -> int:
+    """Return the step of a run. A damaged run counts as 0, and the process that trains it reports the damage."""
     try:
-        return job.step() if job.begun else 0
+        return job.step() if job.started else 0
     except LareError:
         return 0

@@ -1,4 +1,4 @@
-"""Shared by the commands: types of their arguments, and functions that print."""
+"""What the commands share: types of their arguments, and functions that print."""
 
 import sys
 from collections.abc import Iterable, Sequence
@@ -9,7 +9,7 @@ import tyro
 from tyro.conf import Positional
 
 from lare_rl.errors import LareError
-from lare_rl.util.sanitize import legible
+from lare_rl.util.sanitize import one_line, sanitize
 
 if TYPE_CHECKING:
     from lare_rl.latent.verify import Steps
@@ -23,33 +23,39 @@ RunDirectories = Annotated[
 Kind = Literal["factors", "reward"]
 Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET")]
 
-WIDTH = 200
-"""Characters in a line, where the output is not a terminal."""
+_TABLE_WIDTH = 200
+"""Characters in a line of a table, where the output is not a terminal."""
 
 
-def say(text: str) -> None:
-    print(legible(text), flush=True)  # noqa: T201 - the one place that writes to standard output
+def print_line(text: str) -> None:
+    """Print a text to standard output, without characters that control the terminal."""
+    print(sanitize(text), flush=True)  # noqa: T201 - the one place that writes to standard output
 
 
-def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table, as wide as the terminal, or `WIDTH` without one. Its first column is never wrapped."""
+def print_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table, as wide as the terminal. Its first column is never wrapped."""
     from rich.console import Console
     from rich.table import Table
 
     table = Table(*head, box=None, pad_edge=False)
     table.columns[0].no_wrap = True
     for row in rows:
-        table.add_row(*map(legible, row))
-    Console(width=None if sys.stdout.isatty() else WIDTH, markup=False).print(table)
+        table.add_row(*map(sanitize, row))
+    Console(width=None if sys.stdout.isatty() else _TABLE_WIDTH, markup=False).print(table)
 
 
-def progress(text: str) -> None:
+def print_progress(text: str) -> None:
     """Print a message to stderr, so that stdout holds only the result."""
-    sys.stderr.write(legible(text) + "\n")
+    sys.stderr.write(sanitize(text) + "\n")
 
 
-def steps_of(data: str | None, task: "TaskSpec") -> "Steps | None":
-    """Steps of a log, if one is given."""
+def print_error(error: Exception) -> None:
+    """Print an error to stderr, in one line."""
+    print_progress(f"lare-rl: {one_line(error)}")
+
+
+def load_steps(data: str | None, task: "TaskSpec") -> "Steps | None":
+    """Load the steps of a log that functions are checked on."""
     if data is None:
         return None
     from lare_rl.logs.steps import logged_steps
@@ -57,8 +63,8 @@ def steps_of(data: str | None, task: "TaskSpec") -> "Steps | None":
     return logged_steps(data, task)
 
 
-def free_name(path: Path) -> Path:
-    """The path itself, or, if it exists, the first free one with a number appended."""
+def find_free_path(path: Path) -> Path:
+    """Return the path, or if it exists, the first free one with a number appended."""
     number, free = 1, path
     while free.exists():
         number += 1
@@ -66,8 +72,8 @@ def free_name(path: Path) -> Path:
     return free
 
 
-def write_new(path: Path, text: str, option: str) -> None:
-    """Write a file that must not exist."""
+def write_new_file(path: Path, text: str, option: str) -> None:
+    """Write a file that must not exist. `option` is the command-line option that names it."""
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)

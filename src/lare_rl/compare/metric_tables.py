@@ -6,47 +6,50 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from lare_rl.runs.directory import CONFIG, read_config, read_metrics
+from lare_rl.runs.config_file import CONFIG, read_config
+from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.util.files import write_atomically
 
+__all__ = ["read_metric_rows", "write_table"]
+
 KEYS = ("task", "run", "method", "algorithm", "judges", "draw", "seed", "step")
+"""The first columns of the table."""
 
 
-def rows_of(directories: Iterable[Path]) -> list[dict[str, Any]]:
-    """A row for each run, seed and evaluation."""
+def read_metric_rows(directories: Iterable[Path]) -> list[dict[str, Any]]:
+    """Read a row for each run, seed and evaluation."""
     rows = []
     for directory in directories:
         if not (directory / CONFIG).is_file():
             continue
         config = read_config(directory)
-        plan = config.settings
-        run = {
+        settings = config.settings
+        keys = {
             "task": config.task.name,
             "run": directory.name,
-            "method": plan.method,
-            "algorithm": plan.algorithm,
-            "judges": plan.judged_by(config.task),
-            "draw": plan.draw,
+            "method": settings.method,
+            "algorithm": settings.algorithm,
+            "judges": settings.factor_inputs(config.task),
+            "draw": settings.draw,
         }
-        rows += [run | line for line in read_metrics(directory)]
+        rows += [keys | line for line in read_metrics(directory)]
     return rows
 
 
 def write_table(rows: Sequence[dict[str, Any]], path: Path) -> list[Path]:
-    """Write PATH.csv and, with the extra `statistics`, PATH.parquet; returns the files written."""
+    """Write PATH.csv and, with the extra `statistics`, PATH.parquet. Return the paths of the files."""
     names = [*KEYS, *sorted({name for row in rows for name in row} - {*KEYS})]
     text = io.StringIO()
     writer = csv.DictWriter(text, names)
     writer.writeheader()
     writer.writerows(rows)
-    written = [path.with_suffix(".csv")]
-    write_atomically(written[0], lambda file: file.write(text.getvalue().encode()))
+    csv_path, parquet_path = path.with_suffix(".csv"), path.with_suffix(".parquet")
+    write_atomically(csv_path, lambda file: file.write(text.getvalue().encode()))
     try:
         import pyarrow
         from pyarrow import parquet
     except ImportError:
-        return written
+        return [csv_path]
     table = pyarrow.Table.from_pylist([{name: row.get(name) for name in names} for row in rows])
-    written.append(path.with_suffix(".parquet"))
-    write_atomically(written[1], lambda file: parquet.write_table(table, file))
-    return written
+    write_atomically(parquet_path, lambda file: parquet.write_table(table, file))
+    return [csv_path, parquet_path]

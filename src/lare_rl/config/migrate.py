@@ -1,6 +1,6 @@
-"""Reading config.json of earlier versions.
+"""Read config.json of earlier versions.
 
-When a setting gets another name or meaning, `FORMAT` is increased, and a new row of `MIGRATIONS` converts the old form. So reports
+When a setting gets another name or meaning, `FORMAT` is increased, and a new row of `_MIGRATIONS` converts the old form. So reports
 and comparisons of old runs are still possible. Their checkpoints are not migrated.
 """
 
@@ -9,33 +9,47 @@ from typing import Any
 
 from lare_rl.errors import LareError
 
-FORMAT = 4
+__all__ = ["FORMAT", "migrate"]
+
+FORMAT = 5
 """The format of config.json and of the checkpoint. It is increased whenever their contents change."""
 
 
-def from_2(values: dict[str, Any]) -> dict[str, Any]:
-    """Only the checkpoint changed: it holds the size of R beside that of R/T."""
-    return values
+def migrate(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values in the current format.
 
-
-def from_3(values: dict[str, Any]) -> dict[str, Any]:
-    """`isolation` said how the process was isolated that executed phi."""
-    return {name: value for name, value in values.items() if name != "isolation"}
-
-
-MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {2: from_2, 3: from_3}
-"""Functions that convert a format to the next one."""
-
-
-def migrated(values: dict[str, Any]) -> dict[str, Any]:
-    """The values in the current format. Raises `LareError` if their format is newer, or too old."""
+    Raises:
+        LareError: their format is newer, or too old.
+    """
     number = values.get("format")
-    while isinstance(number, int) and number in MIGRATIONS:
-        values = MIGRATIONS[number](values) | {"format": number + 1}
+    while isinstance(number, int) and number in _MIGRATIONS:
+        values = _MIGRATIONS[number](values) | {"format": number + 1}
         number += 1
     if number != FORMAT:
         raise LareError(
-            f"the run is of another version of LaRe ({values.get('lare', 'unknown')}), whose files this one does not read: "
-            "use that version, or train it again"
+            f"the run is of another version of LaRe ({values.get('lare', 'unknown')}): use that version, or train it again"
         )
     return values
+
+
+def _from_2(values: dict[str, Any]) -> dict[str, Any]:
+    # Only the checkpoint changed.
+    return values
+
+
+def _from_3(values: dict[str, Any]) -> dict[str, Any]:
+    # `isolation` said how the process that executed phi was isolated.
+    return {name: value for name, value in values.items() if name != "isolation"}
+
+
+def _from_4(values: dict[str, Any]) -> dict[str, Any]:
+    # `reflect_every` replaced phi during a run. The oldest runs have no `first_fit`.
+    settings = values.get("settings")
+    if not isinstance(settings, dict):
+        return values
+    settings = {name: value for name, value in settings.items() if name != "reflect_every"}
+    return values | {"settings": {"first_fit": "published"} | settings}
+
+
+_MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {2: _from_2, 3: _from_3, 4: _from_4}
+"""Functions that convert a format to the next one."""

@@ -1,168 +1,154 @@
-"""The settings of a run: as a user gives them, and with every open value decided."""
+"""The settings of a run: `Settings`, as a user gives them, and `ResolvedSettings`, in which every value is decided."""
 
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, Never, TypeVar
 
-from pydantic import Field, create_model, field_validator, model_validator
-from pydantic.fields import FieldInfo
+from pydantic import ConfigDict, Field, SerializeAsAny, create_model, field_validator, model_validator
 
-from lare_rl.algorithms.settings import PPOSettings, QMIXSettings, SACSettings, TD3Settings
-from lare_rl.algorithms.table import ALGORITHMS, DDPG, IPPO, PPO, VDN, AlgorithmSettings, Consumes, Name
-from lare_rl.credit.decoder_settings import RECENT, CreditSettings
+from lare_rl.algorithms.registry import ALGORITHMS, AlgorithmSettings
+from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
-from lare_rl.errors import Checked
-from lare_rl.latent.candidates import CANDIDATES
-from lare_rl.tasks.spec import Judges, TaskSpec
+from lare_rl.errors import CheckedModel
+from lare_rl.llm.prompts import N_CANDIDATES
+from lare_rl.tasks.spec import FactorInputs, TaskSpec
 
-LARGEST_SEED = 2**31 - 1
+__all__ = ["ResolvedSettings", "Settings"]
 
-MOST_SEEDS = 1000
-"""The most seeds in one process."""
-
-
-def kind_of(field: FieldInfo) -> Any:
-    """The type of a field, with its bounds."""
-    return Annotated[(field.annotation, *field.metadata)] if field.metadata else field.annotation
-
-
-def optional(field: FieldInfo) -> tuple[Any, Any]:
-    """A field that may also be None, which is its default."""
-    return kind_of(field) | None, Field(None, description=field.description)
-
-
-OPTIONS: dict[str, Any] = {name: optional(field) for name, field in CreditSettings.model_fields.items()}
-
-if TYPE_CHECKING:
-    CreditOptions = CreditSettings
-else:
-    CreditOptions = create_model("CreditOptions", __base__=Checked, __module__=__name__, **OPTIONS)
-    CreditOptions.__doc__ = "How the decoder is fitted. The algorithm decides each setting that is not given."
+MAX_SEED = 2**31 - 1
+MAX_SEEDS = 1000
+"""In one process."""
 
 Count = Annotated[int, Field(ge=1)]
 
+Open = TypeVar("Open")
+"""The type of an open value: None in `Settings`, and Never in `ResolvedSettings`."""
 
-class Settings(Checked):
-    """The settings of `lare-rl train` and `lare_rl.train`. If a setting is None, the task and the algorithm decide it."""
+OPEN: Any = None
 
-    method: str | None = None
+
+class _RunSettings(CheckedModel, Generic[Open]):
+    method: str | Open = OPEN
     """How credit is assigned (see `lare-rl methods`). By default lare-bayes, and lare-rd with qmix and vdn."""
-    algorithm: Name | None = None
-    """The reinforcement learning algorithm. By default, for a single agent: ppo if actions are discrete, else td3. For many agents:
-    qmix if there are a global state and action masks, else ippo."""
-    steps: Count | None = None
+    algorithm: str | Open = OPEN
+    """The reinforcement learning algorithm (see `lare-rl algorithms`). By default, for a single agent: ppo if actions are discrete,
+    else td3. For many agents: qmix if there are a global state and action masks, else ippo."""
+    steps: Count | Open = OPEN
     """Environment steps of each seed (in one step, all agents act). By default 1,000,000 for a single agent, and about 2,000,000
     for many."""
     seeds: Count = 1
     """How many seeds to train, in lockstep in one process."""
-    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 0
+    seed: Annotated[int, Field(ge=0, le=MAX_SEED)] = 0
     """The first seed; the others are the numbers after it."""
-    judges: Judges | None = None
+    judges: FactorInputs | None = None
     """By which observation a step is judged: the one before it, the one after it, or both. By default, as the task says."""
     draw: Annotated[int, Field(ge=0)] = 0
     """Which recorded reply of the language model to take phi from (0 to 4); independent of the seed."""
-    candidates: Count = CANDIDATES
+    candidates: Count = N_CANDIDATES
     """How many candidates phi is combined from; with 1, there is no self-prompting. The shipped recordings have 1 and 5."""
-    environments: Count | None = None
+    environments: Count | Open = OPEN
     """Copies of the environment for each seed. By default 1 on the host, where several copies run in worker processes; in JAX, 82
     for ippo and 8 for qmix."""
-    rollout_steps: Count | None = None
+    rollout_steps: Count | Open = OPEN
     """Steps of each copy in an iteration, which collects, stores, fits and updates. By default 50 for algorithms that consume
     transitions or sequences, and 2000 over all copies for ppo; for ippo an episode on particle tasks, and on other tasks 2050 over
     all copies in JAX, 2000 on the host."""
-    fit_every: Count | None = None
+    fit_every: Count | Open = OPEN
     """For ppo and ippo, and for every algorithm with diaster: iterations between two fits of the decoder. By default 10 for ippo,
     else 1."""
-    fit_updates: Count | None = None
+    fit_updates: Count | Open = OPEN
     """For the same algorithms: gradient steps of the decoder in each fit. By default 500 for ppo and 50 for ippo; with diaster, one
     for every 50 environment steps."""
     first_fit: Literal["held-out", "published"] | None = None
     """For ippo: how long the decoder's first fit lasts. held-out (the default): until the error on held-out episodes stops falling.
     published: fit_updates, as in every later fit."""
-    evaluate_every: Count | None = None
+    evaluate_every: Count | Open = OPEN
     """Environment steps between two evaluations; the last step is followed by one, too. A checkpoint is written at each. By default
     5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 iterations for ppo."""
-    evaluation_episodes: Count | None = None
+    evaluation_episodes: Count | Open = OPEN
     """Episodes in one evaluation. By default 10; in JAX, 50 for ippo and 32 for qmix."""
-    reflect_every: Count | None = None
-    """For lare-bayes: environment steps between two reflections. In each, a language model sees how well its function explains the
-    stored returns, and a new function that explains them better replaces the old one. By default there are no reflections."""
-    capacity: Annotated[int, Field(ge=4)] | None = None
+    capacity: Annotated[int, Field(ge=4)] | Open = OPEN
     """Rows in the replay of a seed; an episode of T steps takes T + 1. By default 1,000,000; 15,000 of the longest episodes for
     ippo, and 5000 for qmix."""
     scale_rewards: bool = False
     """Divide the rewards that the algorithm sees by the running root mean square of R/T. It changes nothing for ppo and ippo."""
-    td3: TD3Settings = TD3Settings()
-    ddpg: TD3Settings = DDPG
-    sac: SACSettings = SACSettings()
-    ppo: PPOSettings = PPO
-    ippo: PPOSettings = IPPO
-    qmix: QMIXSettings = QMIXSettings()
-    vdn: QMIXSettings = VDN
-    credit: CreditOptions = CreditOptions()
+    credit: CreditSettings | Open = OPEN
+    """How the decoder is fitted. The algorithm decides each of these settings that is not given."""
 
-    @field_validator("method")
+    @field_validator("method", "algorithm")
     @classmethod
-    def known_method(cls, method: str | None) -> str | None:
-        return None if method is None else find_method(method).name
-
-    @field_validator("credit", mode="before")
-    @classmethod
-    def options(cls, credit: Any) -> Any:
-        """Of a `CreditSettings`, take only the values that were set."""
-        return credit.model_dump(include=credit.model_fields_set) if isinstance(credit, CreditSettings) else credit
+    def _find_name(cls, name: Any, info: Any) -> Any:
+        if name is not None:
+            (find_method if info.field_name == "method" else ALGORITHMS.find)(name)
+        return name
 
     @model_validator(mode="after")
-    def seeds_that_there_are(self) -> "Settings":
-        if self.seeds > MOST_SEEDS:
-            raise ValueError(f"seeds = {self.seeds}: at most {MOST_SEEDS} train in one process")
-        if self.seed + self.seeds - 1 > LARGEST_SEED:
-            raise ValueError(f"seed = {self.seed} with seeds = {self.seeds}: the largest seed is {LARGEST_SEED}")
+    def _check_seeds(self) -> "_RunSettings":
+        if self.seeds > MAX_SEEDS:
+            raise ValueError(f"seeds = {self.seeds}: at most {MAX_SEEDS} train in one process")
+        if self.seed + self.seeds - 1 > MAX_SEED:
+            raise ValueError(f"seed = {self.seed} with seeds = {self.seeds}: the largest seed is {MAX_SEED}")
         return self
 
 
-class ResolvedSettings(Checked):
-    """The settings that a run uses, with every open value decided. The names are those of `Settings`."""
-
-    method: str
-    algorithm: Name
-    steps: Count
-    seeds: Annotated[int, Field(ge=1, le=MOST_SEEDS)]
-    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)]
-    judges: Judges | None
-    draw: Annotated[int, Field(ge=0)]
-    candidates: Count
-    environments: Count
-    rollout_steps: Count
-    fit_every: Count
-    fit_updates: Count
-    evaluate_every: Count
-    evaluation_episodes: Count
-    capacity: Annotated[int, Field(ge=4)]
-    scale_rewards: bool
-    reflect_every: Count | None = None
-    first_fit: Literal["held-out", "published"] | None = "published"
-    """None where it makes no difference. The default is for config.json files that are older than the setting."""
-    hyperparameters: AlgorithmSettings
-    """The hyperparameters of the algorithm."""
-    credit: CreditSettings
-
+class _Settings(_RunSettings[None]):
     @model_validator(mode="before")
     @classmethod
-    def hyperparameters_of_the_algorithm(cls, values: Any) -> Any:
-        """Read them as those of the named algorithm, because other algorithms may have the same keys."""
-        given = values.get("hyperparameters") if isinstance(values, Mapping) else None
-        if not isinstance(given, Mapping) or values.get("algorithm") not in ALGORITHMS:
+    def _complete_hyperparameters(cls, values: Any) -> Any:
+        """Take hyperparameters that are not given from the algorithm, because names such as td3 and ddpg share a class."""
+        if not isinstance(values, Mapping):
             return values
-        kind = type(ALGORITHMS[values["algorithm"]].settings)
-        return {**values, "hyperparameters": kind(**given)}
+        completed = dict(values)
+        for name in values.keys() & _HYPERPARAMETERS.keys():
+            kind, default = _HYPERPARAMETERS[name]
+            changes = values[name]
+            if isinstance(changes, kind):
+                changes = {field: getattr(changes, field) for field in changes.model_fields_set}
+            if isinstance(changes, Mapping):
+                completed[name] = {**dict(default), **changes}
+        return completed
+
+
+_HYPERPARAMETERS: dict[str, Any] = {name: (type(row.settings), row.settings) for name, row in ALGORITHMS.items()}
+
+
+class Settings(create_model("Settings", __base__=_Settings, __module__=__name__, **_HYPERPARAMETERS)):
+    """The settings of `lare-rl train` and `lare_rl.train`. If a setting is None, the task and the algorithm decide it.
+
+    The hyperparameters of an algorithm have its name: `Settings(td3={"gamma": 0.98})` changes one, and keeps the others as published.
+    """
+
+    if TYPE_CHECKING:  # plugins add fields, which type checkers cannot know
+
+        def __init__(self, **values: Any) -> None: ...
+
+
+class ResolvedSettings(_RunSettings[Never]):
+    """The settings that a run uses. No value is open, except for `judges`, which the task then decides."""
+
+    model_config = ConfigDict(validate_default=True)  # an open value that is missing is an error
+
+    hyperparameters: SerializeAsAny[AlgorithmSettings]
+    """The hyperparameters of the algorithm."""
+
+    @field_validator("hyperparameters", mode="before")
+    @classmethod
+    def _read_hyperparameters(cls, values: Any, info: Any) -> Any:
+        algorithm = info.data.get("algorithm")  # missing if it was not valid
+        if algorithm is None or not isinstance(values, Mapping):
+            return values
+        return type(ALGORITHMS[algorithm].settings).model_validate(values)
 
     @model_validator(mode="after")
-    def whole_iterations(self) -> "ResolvedSettings":
-        asked = {"steps": self.steps, "evaluate_every": self.evaluate_every, "reflect_every": self.reflect_every}
-        for name, steps in asked.items():
-            if steps is not None and steps % self.iteration_steps:
-                near = max(1, round(steps / self.iteration_steps)) * self.iteration_steps
-                raise ValueError(f"{name} = {steps} is not a multiple of {self.described_iteration}: take {near}")
+    def _check_multiples(self) -> "ResolvedSettings":
+        for name in ("steps", "evaluate_every"):
+            steps = getattr(self, name)
+            if remainder := steps % self.iteration_steps:
+                lower, upper = steps - remainder, steps - remainder + self.iteration_steps
+                iteration = f"rollout_steps = {self.rollout_steps}"
+                if self.environments > 1:
+                    iteration = f"{self.iteration_steps} ({iteration} of environments = {self.environments})"
+                numbers = f"{lower} or {upper}" if lower else f"{upper}"
+                raise ValueError(f"{name} = {steps} is not a multiple of {iteration}: use {numbers}")
         return self
 
     @property
@@ -175,108 +161,10 @@ class ResolvedSettings(Checked):
         return self.environments * self.rollout_steps
 
     @property
-    def described_iteration(self) -> str:
-        """The steps of an iteration, for a message."""
-        if self.environments == 1:
-            return f"rollout_steps = {self.rollout_steps}"
-        return f"{self.iteration_steps} (rollout_steps = {self.rollout_steps} of environments = {self.environments})"
-
-    @property
     def warmup(self) -> int:
         """Steps of random actions before the first update."""
         return getattr(self.hyperparameters, "warmup", 0)
 
-    @property
-    def untrained(self) -> str | None:
-        """A warning if all steps are random, so that the policy is never updated."""
-        if self.warmup < self.steps:
-            return None
-        warmup = f"{self.algorithm}.warmup"
-        return (
-            f"all {self.steps:,} steps are random, and the policy is not trained: {warmup} is {self.warmup:,}; take more steps or "
-            f"a smaller {warmup}"
-        )
-
-    @property
-    def rereads(self) -> bool:
-        """Whether steps are read again after the policy has learned from them."""
-        return ALGORITHMS[self.algorithm].consumes is not Consumes.ROLLOUTS or find_method(self.method).fit is not None
-
-    def judged_by(self, task: TaskSpec) -> Judges:
-        """By which observation a step is judged."""
+    def factor_inputs(self, task: TaskSpec) -> FactorInputs:
+        """Return which observations of a step phi reads."""
         return self.judges or task.judges
-
-    def rows(self, longest: int) -> int:
-        """The number of rows of each environment, if an episode has up to `longest` steps."""
-        from lare_rl.data.replay import (
-            room,  # imported here, so that the command line does not import JAX with this file
-        )
-
-        needed = room(self.rollout_steps, longest)
-        wanted = self.capacity // self.environments if self.rereads else needed + RECENT // self.environments
-        return min(wanted, max(needed, 2 * self.steps // self.environments + 2))
-
-    def in_force(self, task: TaskSpec) -> dict[str, Any]:
-        """All settings that make a difference to the run, by dotted names as on the command line."""
-        values = self.model_dump()
-        if self.judges is None:
-            values["judges"] = "as the task says"
-        values[self.algorithm] = values.pop("hyperparameters")
-        return {name: value for name, value in dotted(values) if not among(name, self.idle)}
-
-    @property
-    def idle(self) -> list[str]:
-        """Settings that make no difference to this algorithm and method, by dotted names."""
-        method, consumes = find_method(self.method), ALGORITHMS[self.algorithm].consumes
-        found = [f"credit.{name}" for name in CreditSettings.model_fields if name not in method.settings]
-        apart = method.fit is not None and method.fit.apart
-        if not method.descends or (consumes is not Consumes.ROLLOUTS and not apart):
-            found += ["fit_every", "fit_updates"]
-        if not (method.descends and consumes is Consumes.ROLLOUTS and ALGORITHMS[self.algorithm].many_agents):
-            found.append("first_fit")
-        if not method.follows_judges:
-            found.append("judges")
-        if not method.latent:
-            found += ["draw", "candidates"]
-        if self.reflect_every is None:
-            found.append("reflect_every")
-        if not self.rereads:
-            found.append("capacity")
-        if consumes is Consumes.ROLLOUTS:
-            found.append("scale_rewards")
-        if isinstance(self.hyperparameters, TD3Settings) and not self.hyperparameters.policy_noise:
-            found.append(f"{self.algorithm}.noise_clip")
-        return found
-
-
-def set_in_vain(settings: Settings, resolved: ResolvedSettings, task: TaskSpec) -> dict[str, str]:
-    """Messages, by dotted names, about settings that were set but make no difference to this task, algorithm and method."""
-    usual, found = dict(dotted(Settings().model_dump())), {}
-    known = resolved.in_force(task)
-    others = [name for name in ALGORITHMS if name != resolved.algorithm]
-    for name, value in dotted(settings.model_dump()):
-        if value == usual[name]:
-            continue
-        if among(name, others):
-            instead = f"{resolved.algorithm}.{name.rpartition('.')[2]}"
-            hint = f"; it has {instead}" if instead in known else ""
-            found[name] = f"{name} makes no difference to {resolved.algorithm} on {task.name}{hint}"
-        elif among(name, resolved.idle):
-            by_algorithm = name in ("scale_rewards", f"{resolved.algorithm}.noise_clip")
-            whom = f"{resolved.algorithm} on {task.name}" if by_algorithm else resolved.method
-            found[name] = f"{name} makes no difference to {whom}"
-    return found
-
-
-def among(name: str, groups: list[str]) -> bool:
-    """Whether a dotted name is one of these groups, or lies in one of them."""
-    return any(f"{name}.".startswith(f"{group}.") for group in groups)
-
-
-def dotted(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested settings, flattened: dotted names and values."""
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from dotted(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

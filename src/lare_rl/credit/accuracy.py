@@ -1,7 +1,9 @@
-"""Accuracy of proxy rewards against the true rewards. Only for measurement: nothing is trained on it."""
+"""The accuracy of proxy rewards against the true rewards. It is only measured: nothing is trained on it."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+__all__ = ["correlation", "mean_absolute_error", "metrics"]
 
 
 def metrics(
@@ -9,34 +11,41 @@ def metrics(
     reward: Float[Array, " steps"],
     last: Bool[Array, " steps"],
     mask: Bool[Array, " steps"],
-    in_reward_units: bool,
+    calibrated: bool,
 ) -> dict[str, Float[Array, ""]]:
-    """The accuracy, under the keys of metrics.jsonl.
+    """Return the accuracy, under the keys of metrics.jsonl.
 
-    The error is included only if proxy rewards are in the unit of the true rewards (`in_reward_units`). All values are NaN if only
-    the last steps of episodes have paid a reward: the true rewards of single steps are then unknown.
+    All values are NaN if only last steps of episodes have a reward, because the true rewards of single steps are then unknown.
+
+    Args:
+        r_hat: the proxy rewards.
+        reward: the true rewards.
+        last: which steps are the last of an episode.
+        mask: which steps are valid.
+        calibrated: whether proxy rewards are in the unit of the true rewards. If not, the error is left out.
     """
-    known = jnp.any((reward != 0) & mask & ~last)
-    found = {"credit/correlation": correlation(r_hat, reward, mask)}
-    found |= {"credit/error": mean_error(r_hat, reward, mask)} if in_reward_units else {}
-    return {name: jnp.where(known, value, jnp.nan) for name, value in found.items()}
+    has_step_rewards = jnp.any((reward != 0) & mask & ~last)
+    values = {"credit/correlation": correlation(r_hat, reward, mask)}
+    if calibrated:
+        values["credit/error"] = mean_absolute_error(r_hat, reward, mask)
+    return {name: jnp.where(has_step_rewards, value, jnp.nan) for name, value in values.items()}
 
 
-def mean_error(
+def mean_absolute_error(
     r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"]
 ) -> Float[Array, ""]:
-    """Mean |r_hat - r| over the steps where `mask` is true (the paper's Table F.5)."""
+    """Return the mean of |r_hat - r| over the steps where `mask` is true (the paper's Table F.5)."""
     return jnp.sum(jnp.abs(r_hat - reward) * mask) / jnp.maximum(jnp.sum(mask), 1)
 
 
 def correlation(
     r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"]
 ) -> Float[Array, ""]:
-    """Pearson's correlation of r_hat with r over the steps where `mask` is true; NaN where one of them never varies."""
-    total = jnp.maximum(jnp.sum(mask), 1)
+    """Return Pearson's correlation over the steps where `mask` is true, or NaN where one of the two never varies."""
+    count = jnp.maximum(jnp.sum(mask), 1)
 
-    def centred(x: Float[Array, " steps"]) -> Float[Array, " steps"]:
-        return (x - jnp.sum(x * mask) / total) * mask
+    def centre(x: Float[Array, " steps"]) -> Float[Array, " steps"]:
+        return (x - jnp.sum(x * mask) / count) * mask
 
-    a, b = centred(r_hat), centred(reward)
-    return jnp.clip(jnp.sum(a * b) / jnp.sqrt(jnp.sum(a**2) * jnp.sum(b**2)), -1, 1)  # rounding can exceed 1
+    x, y = centre(r_hat), centre(reward)
+    return jnp.clip(jnp.sum(x * y) / jnp.sqrt(jnp.sum(x**2) * jnp.sum(y**2)), -1, 1)  # rounding can exceed 1

@@ -1,7 +1,7 @@
 """AREL: agent-temporal attention for reward redistribution (Xiao, Ramasubramanian and Poovendran, AAMAS 2022).
 
 Attention over the steps of each agent alternates with attention over the agents of each step. The sum over the agents then
-gives one reward for each step, which every agent receives:
+gives one reward for each step, which all agents receive:
 
     r_hat_{i,t} = y_t = w . sum_i h_{i,t},    penalty = 20 / T^2 E Var_t(y)
 
@@ -20,14 +20,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from lare_rl.credit.decoders import Decoded
-from lare_rl.nn.attention import LayerNorm, attend, causal
+from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
-WIDEST, DEPTH, HEADS, READ_OUT = 100, 3, 3, 50
-"""The largest token width, the number of pairs of blocks, the heads in each block (each head is as wide as a token), and the
-width of the layers before the sum over the agents."""
+__all__ = ["AREL", "Block", "init_arel"]
 
+MAX_WIDTH = 100
+"""The maximum width of a token."""
+DEPTH = 3
+"""The number of pairs of blocks."""
+HEADS = 3
+"""The number of heads in each block. Each head is as wide as a token."""
+READ_OUT_WIDTH = 50
+"""The width of the layers before the sum over the agents."""
 VARIANCE_PENALTY = 20.0
 
 
@@ -51,7 +58,7 @@ class Block(eqx.Module):
         self, x: Float[Array, "*batch tokens size"], mask: Bool[Array, "tokens tokens"] | None
     ) -> Float[Array, "*batch tokens size"]:
         projected = jnp.split(x @ self.projections, 3, axis=-1)
-        query, key, value = (part.reshape(*x.shape[:-1], HEADS, x.shape[-1]) for part in projected)
+        query, key, value = (values.reshape(*x.shape[:-1], HEADS, x.shape[-1]) for values in projected)
         y = self.norms[0](x + self.merge(attend(query, key, value, mask)))
         return self.norms[1](y + self.feed_forward(y))
 
@@ -61,33 +68,38 @@ class AREL(eqx.Module):
 
     embed: Linear
     position: Float[Array, "steps size"]
-    over_time: tuple[Block, ...]
-    over_agents: tuple[Block, ...]
+    time_blocks: tuple[Block, ...]
+    agent_blocks: tuple[Block, ...]
     read_out: tuple[Linear, Linear, Linear]
 
-    def __init__(self, features: int, steps: int, *, key: PRNGKeyArray):
-        size = min(features, WIDEST)
+    def __init__(self, n_features: int, max_steps: int, *, key: PRNGKeyArray):
+        size = min(n_features, MAX_WIDTH)
         embed_key, position_key, time_key, agents_key, *read_keys = jax.random.split(key, 7)
-        self.embed = Linear(features, size, key=embed_key)
-        self.position = jax.random.normal(position_key, (steps, size))
-        self.over_time = tuple(Block(size, key=key) for key in jax.random.split(time_key, DEPTH))
-        self.over_agents = tuple(Block(size, key=key) for key in jax.random.split(agents_key, DEPTH))
+        self.embed = Linear(n_features, size, key=embed_key)
+        self.position = jax.random.normal(position_key, (max_steps, size))
+        self.time_blocks = tuple(Block(size, key=key) for key in jax.random.split(time_key, DEPTH))
+        self.agent_blocks = tuple(Block(size, key=key) for key in jax.random.split(agents_key, DEPTH))
         self.read_out = (
-            Linear(size, READ_OUT, key=read_keys[0]),
-            Linear(READ_OUT, READ_OUT, key=read_keys[1]),
-            Linear(READ_OUT, 1, key=read_keys[2]),
+            Linear(size, READ_OUT_WIDTH, key=read_keys[0]),
+            Linear(READ_OUT_WIDTH, READ_OUT_WIDTH, key=read_keys[1]),
+            Linear(READ_OUT_WIDTH, 1, key=read_keys[2]),
         )
 
-    def __call__(self, features: Float[Array, "rows agents features"], key: PRNGKeyArray | None) -> Decoded:
+    def __call__(self, features: Float[Array, "rows agents features"], key: PRNGKeyArray | None) -> DecoderOutput:
         steps = len(self.position)
         rows, agents = features.shape[:2]
         x = self.embed(features).reshape(-1, steps, agents, self.position.shape[-1])
         x = jnp.swapaxes(x, 1, 2) + self.position
-        for time, agent in zip(self.over_time, self.over_agents, strict=True):
-            x = time(x, causal(steps))
-            x = jnp.swapaxes(agent(jnp.swapaxes(x, 1, 2), None), 1, 2)
+        for time_block, agent_block in zip(self.time_blocks, self.agent_blocks, strict=True):
+            x = time_block(x, causal_mask(steps))
+            x = jnp.swapaxes(agent_block(jnp.swapaxes(x, 1, 2), None), 1, 2)
         first, second, last = self.read_out
         y = math.sqrt(steps) * last(jnp.sum(second(first(x)), axis=1))[..., 0]
         penalty = VARIANCE_PENALTY / steps**2 * jnp.var(y, axis=1, ddof=1, keepdims=True)
-        of_rows = y, jnp.broadcast_to(penalty, y.shape)
-        return Decoded(*(jnp.broadcast_to(values.reshape(rows, 1), (rows, agents)) for values in of_rows))
+        outputs = y, jnp.broadcast_to(penalty, y.shape)
+        return DecoderOutput(*(jnp.broadcast_to(values.reshape(rows, 1), (rows, agents)) for values in outputs))
+
+
+def init_arel(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> AREL:
+    """Return an untrained `AREL`. `settings` is not used."""
+    return AREL(shape.n_inputs, shape.max_steps, key=key)

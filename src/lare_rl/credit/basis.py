@@ -1,20 +1,20 @@
 """The features of a step, in groups. A closed-form decoder is linear in these features.
 
-With u = (x - mean) / deviation over all steps, where x is one of the factors z or of the raw entries of a step:
+With u = (x - mean) / std over all steps, where x is a factor or a raw feature:
 
-    factors             u_i
-    shapes of factors   cos(k pi u_i / 4) / k,  sin(k pi u_i / 4) / k,   k = 1, 2, 3
-    pairs of factors    u_i u_j,  i < j
-    entries             u_i
-    shapes of entries   as those of the factors
-    pairs of entries    as those of the factors, if there are at most 12 entries
+    factors                  u_i
+    shapes of factors        cos(k pi u_i / 4) / k,  sin(k pi u_i / 4) / k,   k = 1, 2, 3
+    pairs of factors         u_i u_j,  i < j
+    raw features             u_i
+    shapes of raw features   as those of the factors
+    pairs of raw features    as those of the factors, if there are at most 12 raw features
 
 Shapes are the first terms of the Fourier series of a function of one number, within four standard deviations of its mean.
-They can express "more is better up to this value", "near this value" or "beyond this value". Pairs express interactions of
-two factors or entries: price times power. The returns decide which groups are needed (`evidence.py`).
+They can express "more is better up to this value", "near this value" or "beyond this value". Pairs express interactions, such as
+price times power. The returns decide which groups are needed (`evidence.py`).
 
-The raw entries are those of the state by which the task judges a step, and of the action: [s', a], [s, a], or [s, s', a]. The
-published s - s' would carry almost no information: its mean over an episode is close to zero, because the differences cancel.
+The raw features are the entries of the states that the factors are computed from, and of the action: [s', a], [s, a], or
+[s, s', a]. The published s - s' would carry almost no information: the differences of an episode cancel, so its mean is close to 0.
 """
 
 from dataclasses import dataclass
@@ -23,106 +23,123 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-FREQUENCIES = 3
+__all__ = ["HALF_PERIOD", "MAX_RAW_FEATURES", "N_FREQUENCIES", "Basis", "expand", "fourier_terms", "pair_products"]
+
+N_FREQUENCIES = 3
+"""The number of frequencies of a shape."""
 HALF_PERIOD = 4.0
-"""In standard deviations. Shapes are constant beyond this distance from the mean."""
-LARGEST = 512
-"""Limit on the number of features. If the shapes of the entries would exceed it, entries get fewer frequencies, or none."""
-MOST_PAIRED = 12
-"""With more raw entries, there are no pairs of them: their number grows with the square of that of the entries."""
-MOST_ENTRIES = 1024
-"""Limit on the number of raw entries. If there are more (images, for example), none is used: the time of a fit grows with the
-cube of the number of features."""
+"""Shapes are constant beyond this number of standard deviations from the mean."""
+MAX_FEATURES = 512
+"""The maximum number of features. If the shapes of raw features would exceed it, these get fewer frequencies, or none."""
+MAX_PAIRED_RAW_FEATURES = 12
+"""With more raw features, there are no pairs of them, because the number of pairs grows with the square."""
+MAX_RAW_FEATURES = 1024
+"""If there are more raw features (images, for example), none is used: the time of a fit grows with the cube of their number."""
 
 
 @dataclass(frozen=True)
 class Basis:
-    """The set of features. An input row has the factors and then the raw entries, or only the parts that the method uses."""
+    """The feature map of an input row, which has the factors and then the raw features. Either may be absent."""
 
-    factors: int
-    entries: int
+    n_factors: int
+    n_raw: int
     extended: bool
     """Whether shapes and pairs are added to the inputs."""
 
     @property
-    def inputs(self) -> int:
+    def n_inputs(self) -> int:
         """The size of an input row."""
-        return self.factors + self.entries
+        return self.n_factors + self.n_raw
 
     @property
-    def sizes(self) -> dict[str, int]:
+    def group_sizes(self) -> dict[str, int]:
         """The number of features in each group that is not empty, in order."""
-        sizes = {"factors": self.factors}
+        sizes = {"factors": self.n_factors}
         if self.extended:
-            sizes |= {"shapes of factors": 2 * FREQUENCIES * self.factors, "pairs of factors": pairs_of(self.factors)}
-        sizes["entries"] = self.used_entries
+            sizes["shapes of factors"] = 2 * N_FREQUENCIES * self.n_factors
+            sizes["pairs of factors"] = _n_pairs(self.n_factors)
+        sizes["raw features"] = self.n_raw_used
         if self.extended:
-            sizes["shapes of entries"] = 2 * self.frequencies_of_entries * self.used_entries
-            sizes["pairs of entries"] = pairs_of(self.paired_entries)
+            sizes["shapes of raw features"] = 2 * self.raw_frequencies * self.n_raw_used
+            sizes["pairs of raw features"] = _n_pairs(self.n_raw_paired)
         return {name: size for name, size in sizes.items() if size}
 
     @property
-    def used_entries(self) -> int:
-        """How many of the entries are features: all or none."""
-        return self.entries if self.entries <= MOST_ENTRIES else 0
+    def n_raw_used(self) -> int:
+        """The number of raw features that are used: all or none."""
+        return self.n_raw if self.n_raw <= MAX_RAW_FEATURES else 0
 
     @property
-    def paired_entries(self) -> int:
-        """How many of the entries are in pairs: all or none."""
-        return self.entries if self.entries <= MOST_PAIRED else 0
+    def n_raw_paired(self) -> int:
+        """The number of raw features that are in pairs: all or none."""
+        return self.n_raw if self.n_raw <= MAX_PAIRED_RAW_FEATURES else 0
 
     @property
-    def frequencies_of_entries(self) -> int:
-        """The number of frequencies for each entry."""
-        factors = self.factors * (1 + 2 * FREQUENCIES) + pairs_of(self.factors)
-        left = max(0, LARGEST - factors - self.entries)
-        return min(FREQUENCIES, left // max(1, 2 * self.entries))
+    def raw_frequencies(self) -> int:
+        """The number of frequencies of the shape of a raw feature."""
+        n_factor_features = self.n_factors * (1 + 2 * N_FREQUENCIES) + _n_pairs(self.n_factors)
+        n_free = max(0, MAX_FEATURES - n_factor_features - self.n_raw)
+        return min(N_FREQUENCIES, n_free // max(1, 2 * self.n_raw))
 
     @property
-    def size(self) -> int:
+    def n_features(self) -> int:
         """The total number of features."""
-        return sum(self.sizes.values())
+        return sum(self.group_sizes.values())
 
     @property
-    def group(self) -> Int[np.ndarray, " features"]:
+    def group_index(self) -> Int[np.ndarray, " features"]:
         """The index of each feature's group."""
-        return np.repeat(np.arange(len(self.sizes)), list(self.sizes.values()))
+        return np.repeat(np.arange(len(self.group_sizes)), list(self.group_sizes.values()))
 
     @property
-    def of_factors(self) -> Bool[np.ndarray, " features"]:
-        """Which features are made of factors alone."""
-        return np.repeat(["factors" in name for name in self.sizes], list(self.sizes.values()))
+    def is_factor_feature(self) -> Bool[np.ndarray, " features"]:
+        """Which features are functions of factors alone."""
+        return np.repeat(["factors" in name for name in self.group_sizes], list(self.group_sizes.values()))
 
 
-def pairs_of(inputs: int) -> int:
-    """The number of pairs of different inputs."""
-    return inputs * (inputs - 1) // 2
+def expand(basis: Basis, u: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
+    """Return the features of standardised inputs."""
+    factors, raw = u[..., : basis.n_factors], u[..., basis.n_factors : basis.n_factors + basis.n_raw_used]
+    if not basis.extended:
+        return jnp.concatenate([factors, raw], axis=-1)
+    return jnp.concatenate(
+        [
+            factors,
+            fourier_terms(factors, N_FREQUENCIES),
+            pair_products(factors),
+            raw,
+            fourier_terms(raw, basis.raw_frequencies),
+            pair_products(raw[..., : basis.n_raw_paired]),
+        ],
+        axis=-1,
+    )
 
 
-def pairs(u: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
-    """u_i u_j for i < j, each within four deviations."""
-    one, other = np.triu_indices(u.shape[-1], 1)
-    within = jnp.clip(u, -HALF_PERIOD, HALF_PERIOD)
-    return within[..., one] * within[..., other]
+def pair_products(u: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
+    """Return u_i u_j for i < j, each clipped to four standard deviations."""
+    i, j = np.triu_indices(u.shape[-1], 1)
+    clipped = jnp.clip(u, -HALF_PERIOD, HALF_PERIOD)
+    return clipped[..., i] * clipped[..., j]
 
 
-def shapes(u: Float[Array, "*batch inputs"], frequencies: int) -> Float[Array, "*batch features"]:
-    """The terms of the Fourier series by frequency. Within a frequency, the cosines of all inputs precede their sines.
+def fourier_terms(u: Float[Array, "*batch inputs"], n_frequencies: int) -> Float[Array, "*batch features"]:
+    """Return the terms of the Fourier series by frequency: first the cosines of all inputs, then their sines.
 
     Only the first frequency is computed directly: cos (k + 1) a = 2 cos a cos k a - cos (k - 1) a, and likewise for sines.
     """
-    waves = cosine_and_sine(jnp.pi / HALF_PERIOD * jnp.clip(u, -HALF_PERIOD, HALF_PERIOD))
-    before, twice, terms = (jnp.ones_like(u), jnp.zeros_like(u)), 2 * waves[0], [u[..., :0]]
-    for k in range(1, frequencies + 1):
+    waves = _cos_sin(jnp.pi / HALF_PERIOD * jnp.clip(u, -HALF_PERIOD, HALF_PERIOD))
+    previous, double_cos, terms = (jnp.ones_like(u), jnp.zeros_like(u)), 2 * waves[0], [u[..., :0]]
+    for k in range(1, n_frequencies + 1):
         terms += [wave / k for wave in waves]
-        before, waves = waves, tuple(twice * wave - last for wave, last in zip(waves, before, strict=True))
+        previous, waves = waves, tuple(double_cos * wave - old for wave, old in zip(waves, previous, strict=True))
     return jnp.concatenate(terms, axis=-1)
 
 
-def cosine_and_sine(angle: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Cosine and sine of angles between -pi and pi, to the precision of float32, by the Taylor series at half of each angle.
+def _cos_sin(angle: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """Return cosine and sine of angles between -pi and pi, to the precision of float32.
 
-    XLA's own functions accept any angle but take fifteen times as long, which would be most of the time of a fit.
+    XLA's own functions accept any angle but take fifteen times as long, which would be most of the time of a fit. Here the Taylor
+    series is evaluated at half of each angle, and the angle is doubled.
     """
     half = angle / 2
     square, cosine, sine = half**2, 1.0, 1.0
@@ -133,19 +150,5 @@ def cosine_and_sine(angle: Float[Array, "*batch"]) -> tuple[Float[Array, "*batch
     return cosine**2 - sine**2, 2 * sine * cosine
 
 
-def expand(basis: Basis, u: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
-    """The features of standardised inputs."""
-    factors, entries = u[..., : basis.factors], u[..., basis.factors : basis.factors + basis.used_entries]
-    if not basis.extended:
-        return jnp.concatenate([factors, entries], axis=-1)
-    return jnp.concatenate(
-        [
-            factors,
-            shapes(factors, FREQUENCIES),
-            pairs(factors),
-            entries,
-            shapes(entries, basis.frequencies_of_entries),
-            pairs(entries[..., : basis.paired_entries]),
-        ],
-        axis=-1,
-    )
+def _n_pairs(n_inputs: int) -> int:
+    return n_inputs * (n_inputs - 1) // 2

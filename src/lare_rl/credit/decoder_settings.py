@@ -4,13 +4,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from lare_rl.errors import Checked
+from lare_rl.errors import CheckedModel
 
-RECENT = 5000
-"""Proxy rewards are compared with the true rewards over this many newest steps, of every agent."""
+__all__ = ["MULTI_AGENT_CREDIT", "RECENT_STEPS", "CreditSettings"]
+
+RECENT_STEPS = 5000
+"""Proxy rewards are compared with the true rewards over this number of newest steps of each agent."""
 
 
-class CreditSettings(Checked):
+class CreditSettings(CheckedModel):
     """How the decoder is fitted."""
 
     hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
@@ -18,7 +20,7 @@ class CreditSettings(Checked):
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Adam's step size."""
     weight_decay: Annotated[float, Field(ge=0)] = 0.0
-    """The weights, times this factor, are added to their gradient."""
+    """The factor by which the weights are added to their gradient."""
     normalise: bool = True
     """Normalise features and returns by running statistics. The published form does not."""
     sum_form: bool = False
@@ -32,13 +34,26 @@ class CreditSettings(Checked):
     """diaster (single agents): whole episodes in one update of its decoder."""
     score: Literal["auto", "sum", "average"] = "auto"
     """Whether the score of an episode is a sum over its steps, or an average or a grade, which does not grow with the number of
-    steps. `auto`: the task's `score` or, without one, the form that has predicted returns better so far."""
+    steps. `auto`: the task's `score` or, without one, the type that has predicted returns better so far."""
     optimism: Annotated[float, Field(ge=0)] = 0.0
-    """lare-bayes and other methods in closed form: the algorithm's reward is the proxy reward plus this many of its posterior
-    deviations. Uncertain steps thus look better."""
+    """lare-bayes and other methods in closed form: the algorithm's reward is the proxy reward plus its posterior standard
+    deviation times this factor. Uncertain steps thus look better."""
     encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of VIB's encoder."""
     bottleneck: Annotated[int, Field(ge=1)] = 8
     """Size of the code in the middle of VIB."""
     divergence: Annotated[float, Field(ge=0)] = 5e-3
     """Weight of the code's divergence relative to the squared error of the mean (with `sum_form`: T^2 times as much)."""
+
+
+MULTI_AGENT_CREDIT = CreditSettings(
+    hidden=(64, 64, 64, 64),
+    learning_rate=5e-4,
+    weight_decay=1e-5,
+    drawn_steps=10,
+    steps=6400,
+    encoder=(256,),
+    bottleneck=4,
+    divergence=1e-3,
+)
+"""The default settings of decoders for many agents. The numbers are those of LaRe's published code, except VIB's divergence."""

@@ -1,77 +1,70 @@
-"""Decoders from the features of a method's encoder to proxy rewards, step by step.
+"""The registry of decoders: networks from the inputs of a step to its proxy reward.
 
-All decoders have the same signature:
+A method names its decoder. `register_decoder` adds another one, for this package and for plugins alike:
 
-    decoder(features [rows *agents features], key) -> Decoded(r_hat [rows *agents], penalty [rows *agents])
-
-The mean of `penalty` over the agents that are alive is added to the loss of the return decomposition. Some decoders draw random
-numbers by `key` during learning. Without a key, a decoder returns the proxy rewards that the algorithm is trained on. Decoders
-that attend across steps and agents are in `arel.py` and `stas.py`; their rows must be whole episodes, one after another.
+    register_decoder(Decoder("squares", init_squares, frozenset({"hidden"})))
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from lare_rl.util.plugins import Registry
 
-from lare_rl.nn.networks import MLP
+if TYPE_CHECKING:  # importing JAX takes longer than all else that the command line does before it shows a message
+    from jaxtyping import PRNGKeyArray
 
+    from lare_rl.credit.decoder_network import DecoderNetwork, DecoderShape
+    from lare_rl.credit.decoder_settings import CreditSettings
 
-class Decoded(NamedTuple):
-    """A decoder's output for some steps."""
-
-    r_hat: Float[Array, "rows *agents"]
-    penalty: Float[Array, "rows *agents"]
-
-
-class StepDecoder(eqx.Module):
-    """f_psi: one MLP for every step of every agent, times a gain."""
-
-    network: MLP
-    gain: float = eqx.field(static=True)
-
-    def __init__(self, features: int, hidden: tuple[int, ...], gain: float, *, key: PRNGKeyArray):
-        self.gain = gain
-        self.network = MLP(features, hidden, 1, key=key)
-
-    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
-        return Decoded(self.gain * self.network(features)[..., 0], jnp.zeros(features.shape[:-1]))
+__all__ = ["DECODERS", "Decoder", "register_decoder"]
 
 
-class Bottleneck(eqx.Module):
-    """VIB: a variational information bottleneck (Alemi et al., 2017) before the decoder; LaRe, appendix F.2.
+@dataclass(frozen=True)
+class Decoder:
+    """A kind of decoder."""
 
-    z ~ N(mu(x), sigma(x)^2),    r_hat = f_psi(z),    penalty = beta E KL(N(mu, sigma^2) || N(0, 1))
+    name: str
+    init: "Callable[[PRNGKeyArray, DecoderShape, CreditSettings], DecoderNetwork] | str"
+    """A function that returns an untrained decoder, or its place as `module:function`, which is imported when it is needed."""
+    settings: frozenset[str] = frozenset()
+    """The names of the `CreditSettings` that `init` reads."""
+    whole_episodes: bool = False
+    """Whether its rows must be whole episodes of the same length, one after another. Such a decoder is for several agents."""
+    single_agent_only: bool = False
+    extended_basis: bool = False
+    """Whether a closed-form decoder has shapes and pairs of its inputs as features (`basis.py`)."""
 
-    Without a key, z is mu(x).
+    def init_network(self, key: "PRNGKeyArray", shape: "DecoderShape", settings: "CreditSettings") -> "DecoderNetwork":
+        """Return an untrained decoder."""
+        init = resolve_name(self.init) if isinstance(self.init, str) else self.init
+        return init(key, shape, settings)
+
+
+DECODERS = Registry[Decoder]("decoder")
+
+
+def register_decoder(decoder: Decoder) -> None:
+    """Add a decoder, which methods can then name.
+
+    Raises:
+        LareError: another decoder has this name.
     """
+    DECODERS.register(decoder.name, decoder)
 
-    encoder: MLP
-    decoder: StepDecoder
-    beta: float = eqx.field(static=True)
 
-    def __init__(
-        self,
-        features: int,
-        encoder: tuple[int, ...],
-        size: int,
-        hidden: tuple[int, ...],
-        beta: float,
-        gain: float,
-        *,
-        key: PRNGKeyArray,
-    ):
-        self.beta = beta
-        encoder_key, decoder_key = jax.random.split(key)
-        self.encoder = MLP(features, encoder, 2 * size, key=encoder_key)
-        self.decoder = StepDecoder(size, hidden, gain, key=decoder_key)
-
-    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
-        mean, log_variance = jnp.split(self.encoder(features), 2, axis=-1)
-        z = mean
-        if key is not None:
-            z = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
-        divergence = 0.5 * jnp.sum(jnp.exp(log_variance) + mean**2 - 1 - log_variance, axis=-1)
-        return Decoded(self.decoder(z, None).r_hat, self.beta * divergence)
+for _decoder in (
+    Decoder("step", "lare_rl.credit.step_decoders:init_step_decoder", frozenset({"hidden"})),
+    Decoder(
+        "bottleneck",
+        "lare_rl.credit.step_decoders:init_bottleneck",
+        frozenset({"hidden", "encoder", "bottleneck", "divergence"}),
+    ),
+    Decoder("arel", "lare_rl.credit.arel:init_arel", whole_episodes=True),
+    Decoder("stas", "lare_rl.credit.stas:init_stas", whole_episodes=True),
+    Decoder("diaster", "lare_rl.credit.diaster:init_diaster", frozenset({"hidden"}), single_agent_only=True),
+    Decoder("linear", "lare_rl.credit.closed_form:init_linear_decoder"),
+    Decoder("additive", "lare_rl.credit.closed_form:init_linear_decoder", extended_basis=True),
+):
+    register_decoder(_decoder)

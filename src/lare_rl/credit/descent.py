@@ -1,97 +1,110 @@
 """Decoders that are fitted by gradient descent: the loss of a method's fit, and one step of Adam on it."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.credit import losses
+from lare_rl.credit.decoder_network import DecoderNetwork
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import Decomposition, Episodes, Network, decode, inputs, over_agents, unit
-from lare_rl.credit.diaster import Diaster
+from lare_rl.credit.decomposition import CreditBatch, Decomposition, agent_mean, decode, decoder_inputs, reward_unit
 from lare_rl.credit.methods import Fit
-from lare_rl.nn.networks import descend
+from lare_rl.nn.networks import adam_step
+
+__all__ = ["loss_and_gradient", "update", "update_in_chunks"]
 
 
 def loss_and_gradient(
-    state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
-) -> tuple[Float[Array, ""], Network]:
-    """The loss of `fit`, and its gradient with respect to the decoder's weights."""
-    loss = loss_of_pieces if fit is Fit.SUBTRAJECTORIES else partial(loss_of_means, fit=fit)
+    state: Decomposition, episodes: CreditBatch, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+) -> tuple[Float[Array, ""], DecoderNetwork]:
+    """Return the loss of `fit`, and its gradient with respect to the decoder's weights."""
+    loss = _decoder_loss if fit is Fit.DECODER_LOSS else partial(_mean_loss, fit=fit)
     return jax.value_and_grad(loss)(state.decoder, state, episodes, key, settings=settings)
 
 
-def targets(
-    state: Decomposition, episodes: Episodes, settings: CreditSettings
-) -> tuple[Float[Array, " episodes"], Float[Array, " episodes"]]:
-    """The target of each episode (R/T, or R if the score is an average) in the decoder's `unit`, and its weight."""
-    target = episodes.mean_reward * jnp.where(state.average, episodes.length, 1) / unit(state, settings)
-    return target, losses.episode_weight(episodes.length, episodes.mask, settings.sum_form)
-
-
-def loss_of_means(
-    decoder: Network, state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
-) -> Float[Array, ""]:
-    """The loss of RD, RRD and RRD-unbiased: mean r_hat of an episode's steps against R/T, plus the decoder's penalty."""
-    target, weight = targets(state, episodes, settings)
-    decoded = decode(decoder, state, episodes.features, settings, key)
-    r_hat, penalty = (over_agents(values, episodes.share) for values in decoded)
-    steps = jnp.minimum(episodes.length, len(r_hat) // len(target)) if fit.draws_steps else episodes.length
-    mean = losses.episode_means(r_hat, episodes.episode, steps)
-    if fit is Fit.DRAWN_STEPS_UNBIASED:
-        variance = losses.subsampling_variance(r_hat.reshape(len(target), -1), episodes.length)
-        loss = losses.unbiased_squared_error(mean, target, weight, variance)
-    else:
-        loss = losses.squared_error(mean, target, weight)
-    belongs = (episodes.episode >= 0) & (episodes.episode < len(target))
-    penalty = jnp.sum(jnp.where(belongs, penalty, 0)) / jnp.maximum(jnp.sum(belongs), 1)
-    return loss + penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
-
-
-def loss_of_pieces(
-    decoder: Network, state: Decomposition, episodes: Episodes, key: PRNGKeyArray, settings: CreditSettings
-) -> Float[Array, ""]:
-    """The loss of Diaster."""
-    assert isinstance(decoder, Diaster)
-    target, _ = targets(state, episodes, settings)
-    whole = episodes.features.reshape(len(target), -1, episodes.features.shape[-1])
-    return decoder.loss(inputs(state, whole, settings), episodes.length, target, episodes.mask, key)
-
-
 def update(
-    state: Decomposition, episodes: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+    state: Decomposition, episodes: CreditBatch, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """One step of gradient descent on a batch of episodes; returns the new state, and `credit/loss`.
+    """Take one step of gradient descent on a batch of episodes. Return the new state, and the metric `credit/loss`.
 
     The loss is in squared units of `scale`, or of the reward if `normalise` is off.
     """
-    return step(state, *loss_and_gradient(state, episodes, key, fit, settings), settings)
+    return _step(state, *loss_and_gradient(state, episodes, key, fit, settings), settings)
 
 
-def update_in_parts(
-    state: Decomposition, parts: Episodes, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+def update_in_chunks(
+    state: Decomposition, chunks: CreditBatch, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """One step by the mean of the gradients of several parts. Each part has the same number of episodes, none of them masked.
+    """Take one step by the mean of the gradients of several chunks of a batch.
 
-    `parts` has a leading axis. The gradient equals that of all episodes together, but intermediate arrays are only as large
-    as for one part, so that they stay in the processor's cache.
+    The gradient equals that of all episodes together, but intermediate arrays are only as large as for one chunk, so that they stay
+    in the processor's cache.
+
+    Args:
+        state: the state.
+        chunks: the chunks, along a leading axis. Each has the same number of episodes, and all masks are 1.
+        key: the random key.
+        fit: the fit of the method.
+        settings: the settings of the decoder.
     """
-    keys = jax.random.split(key, len(parts.length))
+    n_chunks = len(chunks.length)
 
-    def add(total: tuple[Array, Network], part: tuple[Episodes, PRNGKeyArray]):
-        return jax.tree.map(jnp.add, total, loss_and_gradient(state, *part, fit, settings)), None
+    def body(total: tuple[Array, DecoderNetwork], chunk: tuple[CreditBatch, PRNGKeyArray]):
+        return jax.tree.map(jnp.add, total, loss_and_gradient(state, *chunk, fit, settings)), None
 
-    none = jnp.zeros(()), jax.tree.map(jnp.zeros_like, state.decoder)
-    total, _ = jax.lax.scan(add, none, (parts, keys))
-    loss, gradient = jax.tree.map(lambda one: one / len(keys), total)
-    return step(state, loss, gradient, settings)
+    zero = jnp.zeros(()), jax.tree.map(jnp.zeros_like, state.decoder)
+    total, _ = jax.lax.scan(body, zero, (chunks, jax.random.split(key, n_chunks)))
+    loss, gradient = jax.tree.map(lambda leaf: leaf / n_chunks, total)
+    return _step(state, loss, gradient, settings)
 
 
-def step(
-    state: Decomposition, loss: Float[Array, ""], gradient: Network, settings: CreditSettings
+def _step(
+    state: Decomposition, loss: Float[Array, ""], gradient: DecoderNetwork, settings: CreditSettings
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
-    """One step of Adam, with the weight decay added to the gradient."""
+    """Take one step of Adam, with the weight decay added to the gradient."""
     gradient = jax.tree.map(lambda slope, weight: slope + settings.weight_decay * weight, gradient, state.decoder)
-    decoder, optimizer = descend(state.decoder, gradient, state.optimizer, settings.learning_rate)
+    decoder, optimizer = adam_step(state.decoder, gradient, state.optimizer, settings.learning_rate)
     return state._replace(decoder=decoder, optimizer=optimizer), {"credit/loss": loss}
+
+
+def _mean_loss(
+    decoder: DecoderNetwork,
+    state: Decomposition,
+    episodes: CreditBatch,
+    key: PRNGKeyArray,
+    fit: Fit,
+    settings: CreditSettings,
+) -> Float[Array, ""]:
+    """Return the loss of RD, RRD or RRD-unbiased: mean r_hat of an episode's steps against R/T, plus the decoder's penalty."""
+    target, n_episodes = _targets(state, episodes, settings), len(episodes.length)
+    weight = losses.episode_weight(episodes.length, episodes.mask, settings.sum_form)
+    output = decode(decoder, state, episodes.features, settings, key)
+    r_hat, penalty = (agent_mean(values, episodes.share) for values in output)
+    n_steps = jnp.minimum(episodes.length, len(r_hat) // n_episodes) if fit.samples_steps else episodes.length
+    mean = losses.episode_means(r_hat, episodes.episode_index, n_steps)
+    if fit is Fit.SAMPLED_STEPS_UNBIASED:
+        variance = losses.subsampling_variance(r_hat.reshape(n_episodes, -1), episodes.length)
+        loss = losses.unbiased_squared_error(mean, target, weight, variance)
+    else:
+        loss = losses.squared_error(mean, target, weight)
+    valid = (episodes.episode_index >= 0) & (episodes.episode_index < n_episodes)
+    penalty = jnp.sum(jnp.where(valid, penalty, 0)) / jnp.maximum(jnp.sum(valid), 1)
+    return loss + penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
+
+
+def _decoder_loss(
+    decoder: Any, state: Decomposition, episodes: CreditBatch, key: PRNGKeyArray, settings: CreditSettings
+) -> Float[Array, ""]:
+    """Return the decoder's `loss` on whole episodes, which are padded to the same length."""
+    target = _targets(state, episodes, settings)
+    features = decoder_inputs(state, episodes.features, settings)
+    features = features.reshape(len(target), -1, *features.shape[1:])
+    return decoder.loss(features, episodes.length, target, episodes.mask, key)
+
+
+def _targets(state: Decomposition, episodes: CreditBatch, settings: CreditSettings) -> Float[Array, " episodes"]:
+    """Return R/T of each episode, or R if the score is a mean, in the decoder's unit."""
+    return episodes.mean_reward * jnp.where(state.is_mean, episodes.length, 1) / reward_unit(state, settings)

@@ -7,7 +7,7 @@ the return:
 
 The reward of a step is the difference of F for two prefixes. A step model learns this difference from the step alone:
 
-    (r_hat(s_t, a_t) - (F(0..t+1) - F(0..t)))^2,    with R in the place of F(0..T)
+    (r_hat(s_t, a_t) - (F(0..t+1) - F(0..t)))^2,    with R instead of F(0..T)
 
 F is a GRU (Cho et al., 2014) over the steps of a piece, with an initial state of zeros. With L the length of the longest
 episode, the unit of F is L times the scale of R/T, so that F is around 1. The step model is in units of the scale, and so
@@ -19,61 +19,77 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lare_rl.credit.decoders import Decoded
+from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
+from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.networks import GRU, MLP, Linear
+
+__all__ = ["Diaster", "init_diaster"]
 
 
 class Diaster(eqx.Module):
     """The sub-trajectory model and the step model."""
 
-    recurrent: GRU
+    gru: GRU
     value: Linear
     step: MLP
 
-    def __init__(self, features: int, hidden: tuple[int, ...], *, key: PRNGKeyArray):
-        recurrent_key, value_key, step_key = jax.random.split(key, 3)
-        self.recurrent = GRU(features, hidden[0], key=recurrent_key)
+    def __init__(self, n_features: int, hidden: tuple[int, ...], *, key: PRNGKeyArray):
+        gru_key, value_key, step_key = jax.random.split(key, 3)
+        self.gru = GRU(n_features, hidden[0], key=gru_key)
         self.value = Linear(hidden[0], 1, key=value_key)
-        self.step = MLP(features, hidden, 1, key=step_key)
+        self.step = MLP(n_features, hidden, 1, key=step_key)
 
-    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> Decoded:
-        """The output of the step model."""
-        return Decoded(self.step(features)[..., 0], jnp.zeros(features.shape[:-1]))
+    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> DecoderOutput:
+        """Return the output of the step model."""
+        return DecoderOutput(self.step(features)[..., 0], jnp.zeros(features.shape[:-1]))
 
-    def pieces(
-        self, features: Float[Array, "batch steps features"], begins: Bool[Array, "batch steps"]
-    ) -> Float[Array, "batch steps"]:
-        """F of the piece that ends with each step. A piece begins wherever `begins` is true."""
+    def piece_rewards(
+        self, features: Float[Array, "episodes steps features"], begins: Bool[Array, "episodes steps"]
+    ) -> Float[Array, "episodes steps"]:
+        """Return F of the piece that ends with each step. A piece begins at each step where `begins` is true."""
 
-        def one(h: Float[Array, "batch size"], turn: tuple[Array, Array]):
-            given, first = turn
-            h = self.recurrent(given, jnp.where(first[:, None], 0, h))
+        def body(h: Float[Array, "episodes size"], step: tuple[Array, Array]):
+            projected, first = step
+            h = self.gru(projected, jnp.where(first[:, None], 0, h))
             return h, self.value(h)[:, 0]
 
-        given = jnp.swapaxes(self.recurrent.given(features), 0, 1)
-        nothing = jnp.zeros((len(features), self.value.weight.shape[0]))
-        return jax.lax.scan(one, nothing, (given, begins.T))[1].T
+        projected = jnp.swapaxes(self.gru.input_projection(features), 0, 1)
+        h = jnp.zeros((len(features), self.value.weight.shape[0]))
+        return jax.lax.scan(body, h, (projected, begins.T))[1].T
 
     def loss(
         self,
-        features: Float[Array, "batch steps features"],
-        length: Int[Array, " batch"],
-        target: Float[Array, " batch"],
-        weight: Float[Array, " batch"],
+        features: Float[Array, "episodes steps features"],
+        length: Int[Array, " episodes"],
+        target: Float[Array, " episodes"],
+        mask: Float[Array, " episodes"],
         key: PRNGKeyArray,
     ) -> Float[Array, ""]:
-        """The sum of both losses. `target` is R/T in units of the scale. Steps beyond an episode's length are padding."""
-        steps = features.shape[1]
-        number, last = jnp.arange(steps), jnp.maximum(length - 1, 0)[:, None]
-        total = target * length / steps
+        """Return the sum of both losses, as the mean over the episodes where `mask` is 1.
+
+        Args:
+            features: the inputs at the steps. Steps beyond an episode's length are padding.
+            length: T of each episode.
+            target: R/T in units of the scale.
+            mask: 1 for an episode, 0 for padding.
+            key: the random key of the cuts.
+        """
+        max_steps = features.shape[1]
+        t, last = jnp.arange(max_steps), jnp.maximum(length - 1, 0)[:, None]
+        total = target * length / max_steps  # R in the unit of F
         cut = jax.random.randint(key, length.shape, 1, jnp.maximum(length, 2))[:, None]
-        ends = self.pieces(features, number == cut)
-        first = jnp.take_along_axis(ends, jnp.minimum(cut - 1, last), axis=1)[:, 0]
-        second = jnp.where(length > 1, jnp.take_along_axis(ends, last, axis=1)[:, 0], 0)
-        apart = (first + second - total) ** 2
-        prefix = jax.lax.stop_gradient(self.pieces(features, jnp.zeros_like(features[..., 0], bool)))
-        prefix = jnp.where(number == last, total[:, None], prefix)
-        paid = steps * jnp.diff(prefix, axis=1, prepend=0)
-        inside = number < length[:, None]
-        missed = jnp.sum(inside * (self.step(features)[..., 0] - paid) ** 2, axis=1) / jnp.maximum(length, 1)
-        return jnp.sum(weight * (apart + missed)) / jnp.maximum(jnp.sum(weight > 0), 1)
+        f_ends = self.piece_rewards(features, t == cut)
+        f_first = jnp.take_along_axis(f_ends, jnp.minimum(cut - 1, last), axis=1)[:, 0]
+        f_second = jnp.where(length > 1, jnp.take_along_axis(f_ends, last, axis=1)[:, 0], 0)
+        piece_loss = (f_first + f_second - total) ** 2
+        f_prefix = jax.lax.stop_gradient(self.piece_rewards(features, jnp.zeros_like(features[..., 0], bool)))
+        f_prefix = jnp.where(t == last, total[:, None], f_prefix)
+        step_target = max_steps * jnp.diff(f_prefix, axis=1, prepend=0)
+        squared_error = (self.step(features)[..., 0] - step_target) ** 2
+        step_loss = jnp.sum((t < length[:, None]) * squared_error, axis=1) / jnp.maximum(length, 1)
+        return jnp.sum(mask * (piece_loss + step_loss)) / jnp.maximum(jnp.sum(mask > 0), 1)
+
+
+def init_diaster(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> Diaster:
+    """Return an untrained `Diaster`."""
+    return Diaster(shape.n_inputs, settings.hidden, key=key)

@@ -1,28 +1,28 @@
 """How much of the variation of returns the factors explain, which factors do, and what correlates with the residual.
 
-Everything is computed from the sums of a closed-form fit; S, p and q are those of `evidence.py`. With N episodes, and precision
+Everything is computed from the sums of a closed-form fit. S, p and q are those of `evidence.py`. With N episodes, and precision
 beta of the noise of a step, a fit explains the share
 
-    1 - (1 / beta) / (q / (N - 1))
+    R^2 = 1 - (1 / beta) / (q / (N - 1))
 
-of the variation. This is an R^2 that is corrected for the degrees of freedom of the fit. A factor's part of this share is
-proportional to the covariance of its features with the prediction, the sum of their mu_i (S mu)_i. The parts of all factors add up
-to the share. A part is negative if the factor offsets others: if it pays less in episodes in which they pay more. The parts of raw
-entries are those of a fit on factors and entries together. The correlation of the residual of a fit on the factors alone with the
-mean of raw entry j over an episode is
+of the variation, which is corrected for the degrees of freedom of the fit. A factor's share of the variation is proportional to the
+covariance of its features with the prediction, the sum of their mu_i (S mu)_i. The shares of all factors add up to R^2. The share of
+a factor is negative if it offsets others: if its effect is low in episodes in which theirs is high. The shares of raw features are
+those of a fit on factors and raw features together. The residual of a fit on the factors alone correlates with the episode mean of
+raw feature j by
 
     (p - S mu)_j / sqrt(S_jj (q - 2 mu . p + mu . S mu))
 
 The effect of factor i is g_i(u_i) = w_i . f_i(u_i), the sum of its linear feature and its shapes times their weights. The weights
-alone do not tell how the reward rises with the factor, because a sine can take the place of a line. Let C_i be the covariance of
-the features f_i over all steps, with the linear feature first. The line that is closest to the effect has the slope and the part of
-the effect's variance
+alone do not say how the reward rises with the factor, because a sine can replace a line. Let C_i be the covariance of the features
+f_i over all steps, with the linear feature first. The line that is closest to the effect has this slope, and this share of the
+effect's variance:
 
-    e . w_i,  e = C_i[0] / C_i[0, 0]        (e . w_i)^2 C_i[0, 0] / (w_i . C_i w_i)
+    e_i . w_i,  e_i = C_i[0] / C_i[0, 0]        (e_i . w_i)^2 C_i[0, 0] / (w_i . C_i w_i)
 
-and the slopes of two factors have the posterior covariance e_i . Sigma_ij e_j. If a factor has two values, such as an event that
-happens or not, all of its features are one line: the slope is known as soon as returns tell what the event pays, though the weights
-are not.
+The slopes of two factors have the posterior covariance e_i . Sigma_ij e_j. If a factor has two values, such as an event that
+happens or not, all of its features are the same line. The slope is then known as soon as the returns determine the effect of the
+event, though they do not determine the weights.
 """
 
 from typing import NamedTuple
@@ -32,185 +32,221 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence
-from lare_rl.credit.basis import FREQUENCIES, Basis
-from lare_rl.credit.decomposition import AVERAGE, SUM
-from lare_rl.credit.evidence import Posterior, Problem, Sums
+from lare_rl.credit.basis import N_FREQUENCIES, Basis
+from lare_rl.credit.evidence import Posterior, Regression, SufficientStatistics
+from lare_rl.credit.score_type import ScoreType
 
-ROUNDS = 100
-"""Maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
-SAME = 1e-5
-"""Episode means of a standardised factor that deviate by less than this are the same: they differ by rounding."""
-SHAPED = 1 + 2 * FREQUENCIES
-"""The number of features that a factor has alone: itself and its shapes."""
+__all__ = ["Explanation", "StepStatistics", "add_steps", "empty_step_statistics", "explain"]
+
+MAX_ROUNDS = 100
+"""The maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
+MIN_MEAN_STD = 1e-5
+"""The means of a standardised factor over episodes vary by more than rounding if their standard deviation exceeds this."""
 
 
-class Steps(NamedTuple):
-    """Sums over steps of the features that each factor has alone, and of their products."""
+class StepStatistics(NamedTuple):
+    """Sums over steps of each factor's own features, which are the factor and its shapes, and of their products."""
 
-    number: Float[Array, ""]
-    total: Float[Array, "factors own"]
-    products: Float[Array, "factors own own"]
+    n_steps: Float[Array, ""]
+    total: Float[Array, "factors single"]
+    products: Float[Array, "factors single single"]
 
 
 class Explanation(NamedTuple):
-    """The explanation of one team's score."""
+    """The explanation of one team's returns."""
 
-    episodes: Float[Array, ""]
-    of_steps: Bool[Array, ""]
-    """Whether the shares are of the variation of R/T, not of R: the score is a sum, and episodes differ in length."""
-    varied: Bool[Array, " factors"]
-    """Whether a factor's mean has differed between episodes by more than rounding."""
-    by_factors: Float[Array, ""]
-    """Share of the returns' variation that the factors explain, with their shapes and pairs; 0 if there are no factors."""
-    by_all: Float[Array, ""]
-    """Share of the variation that factors and raw entries explain together."""
-    of_entries: Float[Array, " entries"]
-    """The part of `by_all` that each raw entry has, with its shapes and half of its pairs."""
+    n_episodes: Float[Array, ""]
+    explains_mean_reward: Bool[Array, ""]
+    """Whether R/T is explained, not R: the score is a sum, and episodes differ in length."""
+    total_r2: Float[Array, ""]
+    """R^2 of factors and raw features together. NaN if there are too few returns, or if they do not vary."""
+    raw_feature_shares: Float[Array, " raw"]
+    """The share of the variation that each raw feature explains, with its shapes and half of its pairs. It is a part of `total_r2`."""
+    factors_r2: Float[Array, ""]
+    """R^2 of the factors alone, with their shapes and pairs; 0 if there are no factors."""
+    factor_varies: Bool[Array, " factors"]
+    """Whether a factor's mean differs between episodes by more than rounding."""
+    factor_shares: Float[Array, " factors"]
+    """The share of the variation that each factor explains, with its shapes and half of its pairs. It is negative if the factor offsets
+    others. The shares add up to `factors_r2`."""
+    pair_shares: Float[Array, " factors"]
+    """The part of `factor_shares` that comes from the factor's pairs with other factors."""
     slope: Float[Array, " factors"]
-    """How much a step's reward rises if a factor rises by one standard deviation: the slope of the line that is closest to its
-    effect in the fit on factors; 0 if its mean has not varied. If the score is an average: the rise for a step of an episode of
-    average length."""
-    uncertainty: Float[Array, "factors factors"]
-    """Posterior covariance of `slope`."""
-    linear: Float[Array, " factors"]
-    """The part of the variance of each factor's effect that this line has; 1 for a factor without effect."""
-    share: Float[Array, " factors"]
-    """Share of the returns' variation that each factor explains, with its shapes and half of its pairs; below 0 if it offsets
-    others."""
-    paired: Float[Array, " factors"]
-    """The part of `share` that comes from the factor's pairs with other factors."""
-    left: Float[Array, " entries"]
-    """Correlation of each raw entry with the residual of the fit on factors; 0 for an entry that has never varied."""
+    """How much a step's reward rises if a factor rises by one standard deviation: the slope of the line that is closest to its effect
+    in the fit on factors; 0 if its mean does not vary. If the score is a mean, it is that of a step of an episode of average length."""
+    slope_covariance: Float[Array, "factors factors"]
+    """The posterior covariance of `slope`."""
+    linear_share: Float[Array, " factors"]
+    """The share of the variance of each factor's effect that this line has; 1 for a factor without effect."""
+    residual_correlation: Float[Array, " raw"]
+    """The correlation of each raw feature with the residual of the fit on factors; 0 for a raw feature that has never varied."""
 
 
-def own_features(basis: Basis) -> Int[np.ndarray, "factors own"]:
-    """The indices of the features that each factor has alone, the linear one first."""
-    return np.arange(basis.factors)[:, None] + basis.factors * np.arange(SHAPED if basis.extended else 1)
-
-
-def no_steps(basis: Basis) -> Steps:
-    """The sums over no steps."""
-    factors, own = own_features(basis).shape
-    return Steps(jnp.zeros(()), jnp.zeros((factors, own)), jnp.zeros((factors, own, own)))
+def empty_step_statistics(basis: Basis) -> StepStatistics:
+    """Return the sums over no steps."""
+    factors, single = _single_features(basis).shape
+    return StepStatistics(jnp.zeros(()), jnp.zeros((factors, single)), jnp.zeros((factors, single, single)))
 
 
 def add_steps(
-    steps: Steps, features: Float[Array, "*batch features"], counts: Bool[Array, "*batch"], basis: Basis
-) -> Steps:
-    """Add the features of rows to the sums, in float64. Rows where `counts` is false are ignored."""
-    own = jnp.where(counts[..., None, None], features[..., own_features(basis)].astype(float), 0)
-    return Steps(
-        steps.number + jnp.sum(counts),
-        steps.total + jnp.einsum("...fi->fi", own),
-        steps.products + jnp.einsum("...fi,...fj->fij", own, own),
+    statistics: StepStatistics, features: Float[Array, "*batch features"], mask: Bool[Array, "*batch"], basis: Basis
+) -> StepStatistics:
+    """Add the features of steps to the sums, within `float64()`. Steps where `mask` is false are ignored."""
+    single = jnp.where(mask[..., None, None], features[..., _single_features(basis)].astype(float), 0)
+    return StepStatistics(
+        statistics.n_steps + jnp.sum(mask),
+        statistics.total + jnp.einsum("...fi->fi", single),
+        statistics.products + jnp.einsum("...fi,...fj->fij", single, single),
     )
 
 
-def explain(sums: Sums, steps: Steps, form: Int[Array, ""] | int, basis: Basis) -> Explanation:
-    """Explain returns by sums over the features of a basis, in float64."""
-    group, of_factors = basis.group, basis.of_factors
-    whole = evidence.fit(sums, form, group, evidence.unknown(basis.size, len(basis.sizes)), ROUNDS)
-    every = evidence.problem(sums, form, group)
-    by_all, shaped = explained(every, whole), int(basis.extended)
-    part, waves = parts(every, whole, by_all)[~of_factors], shaped * basis.frequencies_of_entries
-    of_entries = jnp.add(*of_each(part, basis.used_entries, waves, shaped * basis.paired_entries))
-    of_steps, none = (form == SUM) & lengths_differ(sums), jnp.zeros(0)
-    if not of_factors.any():
-        left = jnp.zeros(basis.used_entries)
-        of_none = none, jnp.zeros((0, 0)), none, none, none
-        return Explanation(sums.episodes, of_steps, none > 0, jnp.zeros(()), by_all, of_entries, *of_none, left)
-    alone, numbers = restricted(sums, np.flatnonzero(of_factors)), group[of_factors]
-    fitted = evidence.fit(alone, form, numbers, evidence.unknown(len(numbers), int(numbers.max()) + 1), ROUNDS)
-    sigma = evidence.covariance(alone, form, numbers, fitted)
-    given = evidence.problem(alone, form, numbers)
-    by_factors = explained(given, fitted)
-    part = parts(given, fitted, by_factors)
-    own, paired = of_each(part, basis.factors, shaped * FREQUENCIES, shaped * basis.factors)
-    slope, uncertainty, linear = effects(fitted.weight, sigma, steps, basis)
-    # r_hat of an average is divided by T
-    length = jnp.where(form == AVERAGE, sums.steps / jnp.maximum(sums.episodes, 1), 1)
-    return Explanation(
-        sums.episodes,
-        of_steps,
-        jnp.diagonal(given.s)[: basis.factors] > SAME**2 * sums.steps,
-        by_factors,
-        jnp.maximum(by_all, by_factors),
-        of_entries,
-        slope / length,
-        uncertainty / length**2,
-        linear,
-        own + paired,
-        paired,
-        residual(every, basis, fitted, of_factors),
+def explain(
+    statistics: SufficientStatistics, step_statistics: StepStatistics, score_type: Int[Array, ""] | int, basis: Basis
+) -> Explanation:
+    """Explain returns by the features of a basis, within `float64()`.
+
+    Args:
+        statistics: the sums over episodes.
+        step_statistics: the sums over their steps.
+        score_type: a `ScoreType`.
+        basis: the features.
+    """
+    is_factor, extended = basis.is_factor_feature, int(basis.extended)
+    full = _fit(statistics, score_type, basis.group_index)
+    raw_single, raw_pairs = _input_shares(
+        full.feature_shares[~is_factor],
+        basis.n_raw_used,
+        extended * basis.raw_frequencies,
+        extended * basis.n_raw_paired,
+    )
+    no_factor = jnp.zeros(0)
+    explanation = Explanation(
+        n_episodes=statistics.n_episodes,
+        explains_mean_reward=(score_type == ScoreType.SUM) & _lengths_differ(statistics),
+        total_r2=full.r2,
+        raw_feature_shares=raw_single + raw_pairs,
+        factors_r2=jnp.zeros(()),
+        factor_varies=no_factor > 0,
+        factor_shares=no_factor,
+        pair_shares=no_factor,
+        slope=no_factor,
+        slope_covariance=jnp.zeros((0, 0)),
+        linear_share=no_factor,
+        residual_correlation=jnp.zeros(basis.n_raw_used),
+    )
+    if not is_factor.any():
+        return explanation
+    factor_statistics, group_index = _select(statistics, np.flatnonzero(is_factor)), basis.group_index[is_factor]
+    factors = _fit(factor_statistics, score_type, group_index)
+    single, pairs = _input_shares(
+        factors.feature_shares, basis.n_factors, extended * N_FREQUENCIES, extended * basis.n_factors
+    )
+    root = evidence.posterior_spread(factor_statistics, score_type, group_index, factors.posterior).root
+    slope, slope_covariance, linear_share = _slopes(factors.posterior.weight, root.T @ root, step_statistics, basis)
+    mean_length = statistics.n_steps / jnp.maximum(statistics.n_episodes, 1)
+    divisor = jnp.where(score_type == ScoreType.MEAN, mean_length, 1)  # r_hat of a mean is divided by T
+    return explanation._replace(
+        total_r2=jnp.maximum(full.r2, factors.r2),
+        factors_r2=factors.r2,
+        factor_varies=jnp.diagonal(factors.problem.s)[: basis.n_factors] > MIN_MEAN_STD**2 * statistics.n_steps,
+        factor_shares=single + pairs,
+        pair_shares=pairs,
+        slope=slope / divisor,
+        slope_covariance=slope_covariance / divisor**2,
+        linear_share=linear_share,
+        residual_correlation=_residual_correlation(full.problem, basis, factors.posterior),
     )
 
 
-def lengths_differ(sums: Sums) -> Bool[Array, ""]:
-    """Whether R is more than the same multiple of R/T in all episodes, which it is if all of them have one length."""
-    length = sums.steps / jnp.maximum(sums.episodes, 1)
-    (yy, yr), (_, rr) = sums.products[-2:, -2:]
+class _Fit(NamedTuple):
+    problem: Regression
+    posterior: Posterior
+    r2: Float[Array, ""]
+    feature_shares: Float[Array, " features"]
+    """The share of the variation that each feature explains. The shares add up to `r2`."""
+
+
+def _fit(
+    statistics: SufficientStatistics, score_type: Int[Array, ""] | int, group_index: Int[np.ndarray, " features"]
+) -> _Fit:
+    problem = evidence.regression(statistics, score_type, group_index)
+    start = evidence.init_posterior(len(group_index), int(group_index.max()) + 1)
+    posterior = evidence.fit(statistics, score_type, group_index, start, MAX_ROUNDS)
+    r2 = 1 - problem.dof / (problem.q * jnp.where(posterior.beta > 0, posterior.beta, 1))
+    r2 = jnp.where((problem.dof > 1) & (problem.y_std > 0), jnp.clip(r2, 0, 1), jnp.nan)
+    weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)
+    covariance = weight * (problem.s @ weight)
+    total = jnp.sum(covariance)
+    return _Fit(problem, posterior, r2, feature_shares=r2 * covariance / jnp.where(total > 0, total, 1))
+
+
+def _lengths_differ(statistics: SufficientStatistics) -> Bool[Array, ""]:
+    """Return whether R is not the same multiple of R/T in all episodes, which it is if all of them have the same length."""
+    length = statistics.n_steps / jnp.maximum(statistics.n_episodes, 1)
+    (yy, yr), (_, rr) = statistics.products[-2:, -2:]
     return rr - 2 * length * yr + length**2 * yy > 1e-6 * rr
 
 
-def restricted(sums: Sums, features: Int[np.ndarray, " some"]) -> Sums:
-    """The sums over some of the features."""
-    size = len(sums.mean) - 2
-    keep = np.append(features, [size, size + 1])
-    return sums._replace(mean=sums.mean[keep], products=sums.products[np.ix_(keep, keep)])
+def _select(statistics: SufficientStatistics, features: Int[np.ndarray, " selected"]) -> SufficientStatistics:
+    """Return the sums of some of the features."""
+    n_features = len(statistics.mean) - 2
+    columns = np.append(features, [n_features, n_features + 1])  # the last two are R/T and R
+    return statistics._replace(mean=statistics.mean[columns], products=statistics.products[np.ix_(columns, columns)])
 
 
-def explained(given: Problem, known: Posterior) -> Float[Array, ""]:
-    """The share of the variation that a fit explains; NaN if returns are too few or do not vary."""
-    share = 1 - given.free / (given.q * jnp.where(known.beta > 0, known.beta, 1))
-    return jnp.where((given.free > 1) & (given.unit > 0), jnp.clip(share, 0, 1), jnp.nan)
+def _single_features(basis: Basis) -> Int[np.ndarray, "factors single"]:
+    """Return the indices of the features of each factor alone, the linear one first."""
+    n_single = 1 + 2 * N_FREQUENCIES if basis.extended else 1
+    return np.arange(basis.n_factors)[:, None] + basis.n_factors * np.arange(n_single)
 
 
-def parts(given: Problem, known: Posterior, share: Float[Array, ""]) -> Float[Array, " features"]:
-    """The part of the explained share that each feature has."""
-    weight = known.weight / jnp.where(given.unit > 0, given.unit, 1)
-    part = weight * (given.s @ weight)
-    return share * part / jnp.where(jnp.sum(part) > 0, jnp.sum(part), 1)
-
-
-def of_each(
-    part: Float[Array, " features"], inputs: int, frequencies: int, paired: int
+def _input_shares(
+    feature_shares: Float[Array, " features"], n_inputs: int, n_frequencies: int, n_paired: int
 ) -> tuple[Float[Array, " inputs"], Float[Array, " inputs"]]:
-    """The sums of the features' parts for each factor, or for each entry: of its own features, and of its pairs.
+    """Return the sums of the shares of each input's own features, and of its pairs.
 
-    A pair gives half to each of its inputs. Either all of the inputs are paired, or none.
+    A pair gives half to each of its inputs. Either all inputs are paired, or none.
     """
-    single, (one, other) = 1 + 2 * frequencies, np.triu_indices(paired, 1)
-    own = jnp.sum(part[: single * inputs].reshape(single, inputs), axis=0)
-    pairs = part[single * inputs :] / 2
-    return own, jnp.zeros_like(own).at[one].add(pairs).at[other].add(pairs)
+    n_single, (i, j) = 1 + 2 * n_frequencies, np.triu_indices(n_paired, 1)
+    single = jnp.sum(feature_shares[: n_single * n_inputs].reshape(n_single, n_inputs), axis=0)
+    half = feature_shares[n_single * n_inputs :] / 2
+    return single, jnp.zeros_like(single).at[i].add(half).at[j].add(half)
 
 
-def effects(
-    weight: Float[Array, " features"], sigma: Float[Array, "features features"], steps: Steps, basis: Basis
+def _slopes(
+    weight: Float[Array, " features"],
+    sigma: Float[Array, "features features"],
+    statistics: StepStatistics,
+    basis: Basis,
 ) -> tuple[Float[Array, " factors"], Float[Array, "factors factors"], Float[Array, " factors"]]:
-    """Slope of each factor's effect, the posterior covariance of these slopes, and the linear part of each effect's variance."""
-    own = own_features(basis)
-    number = jnp.maximum(steps.number, 1)
-    mean = steps.total / number
-    covariance = steps.products / number - mean[:, :, None] * mean[:, None, :]
-    of_own, of_sigma = weight[own], sigma[own[:, :, None, None], own]
-    first = covariance[:, 0, 0]
-    line = covariance[:, 0] / jnp.where(first > 0, first, 1)[:, None]
-    slope = jnp.sum(line * of_own, axis=1)
-    variance = jnp.einsum("fi,fij,fj->f", of_own, covariance, of_own)
-    uncertainty = jnp.einsum("fi,figj,gj->fg", line, of_sigma, line)
-    return slope, uncertainty, jnp.where(variance > 0, slope**2 * first / jnp.where(variance > 0, variance, 1), 1)
+    """Return the slope of each factor's effect, their posterior covariance, and the linear share of each effect's variance."""
+    single = _single_features(basis)
+    n_steps = jnp.maximum(statistics.n_steps, 1)
+    mean = statistics.total / n_steps
+    covariance = statistics.products / n_steps - mean[:, :, None] * mean[:, None, :]  # C_i
+    single_weight, single_sigma = weight[single], sigma[single[:, :, None, None], single]
+    variance = covariance[:, 0, 0]
+    line = covariance[:, 0] / jnp.where(variance > 0, variance, 1)[:, None]  # e_i
+    slope = jnp.sum(line * single_weight, axis=1)
+    slope_covariance = jnp.einsum("fi,figj,gj->fg", line, single_sigma, line)
+    effect_variance = jnp.einsum("fi,fij,fj->f", single_weight, covariance, single_weight)
+    linear_share = slope**2 * variance / jnp.where(effect_variance > 0, effect_variance, 1)
+    return slope, slope_covariance, jnp.where(effect_variance > 0, linear_share, 1)
 
 
-def residual(
-    given: Problem, basis: Basis, fitted: Posterior, of_factors: Bool[np.ndarray, " features"]
-) -> Float[Array, " entries"]:
-    """Correlation of the raw entries with the residual of a fit on the factors. `given` is the problem with all features."""
-    unit = jnp.where(given.unit > 0, given.unit, 1)
-    weight = jnp.zeros(basis.size).at[np.flatnonzero(of_factors)].set(fitted.weight / unit)
-    after = given.p - given.s @ weight
-    left = given.q - 2 * weight @ given.p + weight @ given.s @ weight
-    first = int(np.sum(of_factors))
-    entries = slice(first, first + basis.used_entries)
-    size = jnp.sqrt(jnp.maximum(jnp.diagonal(given.s)[entries] * left, 0))
-    return jnp.where(size > 0, after[entries] / jnp.where(size > 0, size, 1), 0)
+def _residual_correlation(problem: Regression, basis: Basis, posterior: Posterior) -> Float[Array, " raw"]:
+    """Return the correlation of the raw features with the residual of a fit on the factors.
+
+    Args:
+        problem: the regression on all features.
+        basis: the features.
+        posterior: the posterior of the fit on the factors.
+    """
+    n_factor_features = int(np.sum(basis.is_factor_feature))
+    weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)
+    weight = jnp.zeros(basis.n_features).at[:n_factor_features].set(weight)
+    residual_variance = problem.q - 2 * weight @ problem.p + weight @ problem.s @ weight
+    raw = slice(n_factor_features, n_factor_features + basis.n_raw_used)
+    covariance = (problem.p - problem.s @ weight)[raw]
+    size = jnp.sqrt(jnp.maximum(jnp.diagonal(problem.s)[raw] * residual_variance, 0))
+    return jnp.where(size > 0, covariance / jnp.where(size > 0, size, 1), 0)

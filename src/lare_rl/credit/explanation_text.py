@@ -1,188 +1,256 @@
-"""Sentences that say how well the factors explain returns, which factors matter, and what may be missing."""
+"""What the returns say about the factors: how much they explain, which of them matter, and what may be missing."""
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.returns import FormFound
+from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.util.findings import Finding, render
 
-FEWEST = 20
-"""With fewer episodes, there are no sentences."""
-NEXT_TO_NOTHING = 0.1
-"""There is a warning if the factors explain less than this share of the variation of the returns."""
-NOTICEABLE = 0.05
-"""The form of a factor's effect is only reported if its share of the variation is larger than this."""
-STRAIGHT = 0.8
-"""The effect of a factor is curved if the closest line has less than this part of its variance."""
-MUCH = 0.1
-"""The raw entries that explain most are named if they add more than this share of the variation to what the factors explain."""
-KNOWN, CANCELLED = 2.0, 0.1
-"""The change of a factor is paid if its effects before and after a step are each larger than so many of their deviations, and their
-sum is smaller than this part of the larger one."""
-STRIKING = 0.3
-"""A raw entry is reported if its correlation with the residual of the factors is larger than this."""
-FORMS = ("a sum", "an average")
-"""The forms that a score may have."""
+__all__ = ["MESSAGES", "MIN_EPISODES", "explanation_findings", "explanation_lines", "raw_feature_names"]
+
+MIN_EPISODES = 20
+"""With fewer episodes, nothing is said."""
+LITTLE_SHARE = 0.1
+"""Factors that explain a smaller share of the variation of the returns explain next to nothing."""
+COMPLETE_SHARE = 0.95
+"""No factor is missing if the factors explain a larger share."""
+NOTICEABLE_SHARE = 0.05
+"""Nothing is said about the effect of a factor, or about a raw feature, with a smaller share."""
+LARGE_SHARE = 0.1
+"""Raw features are named if they add a larger share to that of the factors."""
+STRAIGHT_SHARE = 0.8
+"""The effect of a factor is curved if the closest line has a smaller share of its variance."""
+CLEAR_STDS = 2.0
+"""An effect is known if it is larger than this number of its posterior standard deviations."""
+CANCELLED_FRACTION = 0.1
+"""The effects before and after a step cancel if their sum is smaller than this fraction of the larger effect."""
+STRIKING_CORRELATION = 0.3
+"""A raw feature is reported if its correlation with the residual of the factors is larger."""
+N_LARGEST = 3
+"""The number of raw features that are named."""
+
+_SET_SCORE_TYPE = (
+    'This may change. If you know which of them it is, set it: `score = "sum"` or `score = "average"` in the task file, '
+    "`--credit.score`, or `CreditSettings(score=...)`."
+)
+
+MESSAGES = {
+    "equal_returns": (
+        "There is nothing to explain: in all episodes the return is the same, or, if the score is a sum, the mean reward of a step."
+    ),
+    "score_type_is_certain": (
+        "The score is treated as {this} over the steps of an episode: so far, this predicts returns better than {other}. "
+        f"{_SET_SCORE_TYPE}"
+    ),
+    "score_type_is_uncertain": (
+        "The score is treated as {this} over the steps of an episode: so far, {other} predicts returns about as well. "
+        f"{_SET_SCORE_TYPE}"
+    ),
+    "sum": "a sum",
+    "mean": "an average",
+    "returns": "the returns of {n_episodes} episodes",
+    "mean_rewards": "the mean reward of a step in {n_episodes} episodes",
+    "raw_features_explain": "Raw entries explain {share:.0%} of the variation of {target}.{largest}",
+    "largest": " The largest shares: {features}.",
+    "feature_share": "{name} {share:.0%}",
+    "factors_explain": "The factors explain {share:.0%} of the variation of {target}{raw}.",
+    "raw_features_add": ", raw entries another {share:.0%}",
+    "phi_explains_little": (
+        "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of, or the episodes are too "
+        "few or too much alike to show it."
+    ),
+    "about_factors": (
+        "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes; below "
+        "0%: it offsets others), and by how much a step's reward rises with one standard deviation of it:"
+    ),
+    "unknown_factor": "- {name}: {effect}",
+    "factor": "- {name}: {share:z.0%}, {effect}{states}{shape}",
+    "effect": "{slope:+.3g} ± {std:.1g}",
+    "change_pays": "its change in a step is paid",
+    "equal_means": "its mean is the same in all episodes, so returns do not tell what it pays",
+    "before_and_after": " (before: {before}; after: {after})",
+    "depends_on_factor": " (its effect depends on another factor)",
+    "is_curved": " (its effect is curved)",
+    "about_states": (
+        "In brackets are the parts of the states before and after the step. If their ± are as large as the numbers, the fit cannot "
+        "tell the two apart, and only their sum counts. If they are much larger than their sum, the change of the factor in a step "
+        "is paid."
+    ),
+    "phi_lacks_features": (
+        "In a fit on factors and raw entries, these entries have the largest shares: {features}. phi may lack a factor that is "
+        "computed from them."
+    ),
+    "high_when_large": (
+        "Returns are higher than the factors predict when {name} is large (correlation {correlation:+.2f}): a factor may be missing"
+        "{judges}."
+    ),
+    "high_when_small": (
+        "Returns are higher than the factors predict when {name} is small (correlation {correlation:+.2f}): a factor may be missing"
+        "{judges}."
+    ),
+    "judges_may_be_wrong": ", or the task's `judges` may be wrong",
+}
+"""The sentences, by the codes of the findings."""
 
 
-def entry_names(observation: str, action: str, entries: int, action_size: int, both: bool) -> list[str]:
-    """Names of the raw entries, from a task's texts: the line `7: angle of the foot` names entry 7.
+def raw_feature_names(observation: str, action: str, n_features: int, action_size: int, both: bool) -> list[str]:
+    """Return names of the raw features, from a task's texts: the line `7: angle of the foot` names entry 7.
 
     Args:
         observation: the text that describes the observation.
         action: the text that describes the action.
-        entries: the number of raw entries: 0, or at least `action_size`.
+        n_features: the number of raw features: 0, or at least `action_size`.
         action_size: the number of entries of the action, which come last.
-        both: whether there are the entries of two observations, first those of the one before the step.
+        both: whether there are two observations, first the one before the step.
     """
 
-    def named(text: str, count: int, kind: str) -> list[str]:
+    def names(text: str, size: int, kind: str) -> list[str]:
         lines = dict(re.findall(r"^[\s\-*\[]*(\d+)\]?\s*[:.)]\s*(.+)$", text, flags=re.MULTILINE))
         return [
-            f"entry {i} of the {kind}" + (f" ({lines[str(i)].strip()})" if str(i) in lines else "")
-            for i in range(count)
+            f"entry {i} of the {kind}" + (f" ({lines[str(i)].strip()})" if str(i) in lines else "") for i in range(size)
         ]
 
-    shown = max(0, entries - action_size)
+    n_observed = max(0, n_features - action_size)
     kinds = ["observation before the step", "observation after the step"] if both else ["observation"]
-    of_observations = [name for kind in kinds for name in named(observation, shown // len(kinds), kind)]
-    return of_observations + named(action, entries - shown, "action")
+    observation_names = [name for kind in kinds for name in names(observation, n_observed // len(kinds), kind)]
+    return observation_names + names(action, n_features - n_observed, "action")
 
 
-def form_of_effect(found: Explanation, factor: int) -> str:
-    """A remark on a factor whose reward does not simply rise or fall with it; empty if it does."""
-    if found.share[factor] <= NOTICEABLE:
-        return ""
-    if found.paired[factor] > found.share[factor] / 2:
-        return " (its effect depends on another factor)"
-    return " (its effect is curved)" if found.linear[factor] < STRAIGHT else ""
+def explanation_lines(
+    explanation: Explanation, score_type: ScoreTypeEstimate | None, factors: Sequence[str], raw_features: Sequence[str]
+) -> list[str]:
+    """Return the sentences of `explanation_findings`."""
+    return [
+        render(finding, MESSAGES) for finding in explanation_findings(explanation, score_type, factors, raw_features)
+    ]
 
 
-def factor_lines(found: Explanation, names: list[str]) -> list[str]:
-    """A line on each factor, those with the largest shares first. Its values before and after a step have one line."""
-    places: dict[str, list[int]] = {}
-    for place, name in enumerate(names):
-        places.setdefault(name.removesuffix(" (before)").removesuffix(" (after)"), []).append(place)
-    order = sorted(places, key=lambda name: -abs(float(found.share[places[name]].sum())))
-    lines = [factor_line(found, name, places[name]) for name in order]
-    if any(len(some) == 2 and found.varied[some].all() for some in places.values()):
-        lines.append(
-            "In brackets are the parts of the states before and after the step. If their ± are as large as the numbers, the fit "
-            "cannot tell the two apart, and only their sum counts. If they are much larger than their sum, the change of the "
-            "factor in a step is paid."
-        )
-    return lines
+def explanation_findings(
+    explanation: Explanation, score_type: ScoreTypeEstimate | None, factors: Sequence[str], raw_features: Sequence[str]
+) -> list[Finding]:
+    """Return what an explanation says.
+
+    Args:
+        explanation: the explanation of one team's score.
+        score_type: the estimated type of the score. None if it is set, or makes no difference.
+        factors: names of the factors; empty for a method without factors.
+        raw_features: names of the raw features; empty if they have none. Then nothing is said of single features.
+    """
+    n_episodes, factors_r2 = int(explanation.n_episodes), float(explanation.factors_r2)
+    if n_episodes < MIN_EPISODES:
+        return []
+    if not np.isfinite(explanation.total_r2):
+        return [Finding("equal_returns")]
+    target = Finding("mean_rewards" if explanation.explains_mean_reward else "returns", {"n_episodes": n_episodes})
+    largest = _largest_raw_features(explanation, raw_features)
+    findings = [] if score_type is None else [_score_type(score_type)]
+    if not factors:
+        largest_features = Finding("largest", {"features": largest}) if largest else None
+        values = {"share": float(explanation.total_r2), "target": target, "largest": largest_features}
+        return [*findings, Finding("raw_features_explain", values)]
+    added = float(explanation.total_r2) - factors_r2
+    raw = Finding("raw_features_add", {"share": added}) if raw_features and added >= 0.01 else None
+    findings.append(Finding("factors_explain", {"share": factors_r2, "target": target, "raw": raw}))
+    if factors_r2 < LITTLE_SHARE:
+        findings.append(Finding("phi_explains_little"))
+    else:
+        findings += [Finding("about_factors"), *_factor_findings(explanation, factors)]
+    if largest and added > LARGE_SHARE:
+        findings.append(Finding("phi_lacks_features", {"features": largest}))
+    if raw_features and factors_r2 < COMPLETE_SHARE:
+        findings += _residual_findings(explanation, factors, raw_features)
+    return findings
 
 
-SAME_MEAN = "its mean is the same in all episodes, so returns do not tell what it pays"
+def _score_type(estimate: ScoreTypeEstimate) -> Finding:
+    types = Finding("sum"), Finding("mean")
+    this, other = types if estimate.score_type == ScoreType.SUM else types[::-1]
+    code = "score_type_is_certain" if estimate.is_certain else "score_type_is_uncertain"
+    return Finding(code, {"this": this, "other": other})
 
 
-def factor_line(found: Explanation, name: str, places: list[int]) -> str:
-    """The line on a factor that has one place or two: before and after the step."""
-    varied = [place for place in places if found.varied[place]]
+def _largest_raw_features(explanation: Explanation, names: Sequence[str]) -> tuple[Finding, ...]:
+    """Return the raw features with the largest noticeable shares; none if they have no names."""
+    shares = np.asarray(explanation.raw_feature_shares)
+    largest = np.argsort(-shares)[:N_LARGEST] if names else ()
+    return tuple(
+        Finding("feature_share", {"name": names[i], "share": float(shares[i])})
+        for i in largest
+        if shares[i] > NOTICEABLE_SHARE
+    )
+
+
+def _residual_findings(explanation: Explanation, factors: Sequence[str], raw_features: Sequence[str]) -> list[Finding]:
+    """Report the raw feature that correlates most with the residual of the factors."""
+    correlations = np.asarray(explanation.residual_correlation)
+    largest = int(np.argmax(np.abs(correlations)))
+    correlation = float(correlations[largest])
+    if abs(correlation) <= STRIKING_CORRELATION:
+        return []
+    reads_both = any(name.endswith(" (after)") for name in factors)
+    judges = None if reads_both else Finding("judges_may_be_wrong")
+    values = {"name": raw_features[largest], "correlation": correlation, "judges": judges}
+    return [Finding("high_when_large" if correlation > 0 else "high_when_small", values)]
+
+
+def _factor_findings(explanation: Explanation, names: Sequence[str]) -> list[Finding]:
+    """Report each factor, those with the largest shares first. Its values before and after a step are reported together."""
+    indices: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        indices.setdefault(name.removesuffix(" (before)").removesuffix(" (after)"), []).append(i)
+    shares = np.asarray(explanation.factor_shares)
+    order = sorted(indices, key=lambda name: -abs(float(shares[indices[name]].sum())))
+    findings = [_factor(explanation, name, indices[name]) for name in order]
+    if any(len(pair) == 2 and explanation.factor_varies[pair].all() for pair in indices.values()):
+        findings.append(Finding("about_states"))
+    return findings
+
+
+def _factor(explanation: Explanation, name: str, indices: list[int]) -> Finding:
+    """Report a factor with one index or two: before and after the step."""
+    varied = [i for i in indices if explanation.factor_varies[i]]
     if not varied:
-        return f"- {name}: {SAME_MEAN}"
-    effects = [effect(found, [place]) if place in varied else SAME_MEAN for place in places]
-    parts = f" (before: {effects[0]}; after: {effects[1]})" if len(places) == 2 else ""
-    remark = next((said for place in varied if (said := form_of_effect(found, place))), "")
-    sum_of_both = "its change in a step is paid" if is_change(found, varied) else effect(found, varied)
-    return f"- {name}: {found.share[varied].sum():z.0%}, {sum_of_both}{parts}{remark}"
+        return Finding("unknown_factor", {"name": name, "effect": Finding("equal_means")})
+    states = None
+    if len(indices) == 2:
+        before, after = (_effect(explanation, [i]) if i in varied else Finding("equal_means") for i in indices)
+        states = Finding("before_and_after", {"before": before, "after": after})
+    shapes = (_effect_shape(explanation, i) for i in varied)
+    values = {
+        "name": name,
+        "share": float(explanation.factor_shares[varied].sum()),
+        "effect": Finding("change_pays") if _change_pays(explanation, varied) else _effect(explanation, varied),
+        "states": states,
+        "shape": next((shape for shape in shapes if shape is not None), None),
+    }
+    return Finding("factor", values)
 
 
-def is_change(found: Explanation, places: list[int]) -> bool:
-    """Whether the effects before and after a step cancel, so that only the change of the factor matters.
+def _effect(explanation: Explanation, indices: list[int]) -> Finding:
+    """Report the sum of some slopes, with its posterior standard deviation."""
+    variance = float(explanation.slope_covariance[np.ix_(indices, indices)].sum())
+    values = {"slope": float(explanation.slope[indices].sum()), "std": float(np.sqrt(max(variance, 0)))}
+    return Finding("effect", values)
+
+
+def _effect_shape(explanation: Explanation, i: int) -> Finding | None:
+    """Report a factor if the reward does not simply rise or fall with it."""
+    share = explanation.factor_shares[i]
+    if share <= NOTICEABLE_SHARE:
+        return None
+    if explanation.pair_shares[i] > share / 2:
+        return Finding("depends_on_factor")
+    return Finding("is_curved") if explanation.linear_share[i] < STRAIGHT_SHARE else None
+
+
+def _change_pays(explanation: Explanation, indices: list[int]) -> bool:
+    """Return whether the effects before and after a step cancel, so that only the change of the factor matters.
 
     Their sum says nothing then: it is small, and its sign may come from a difference between the two standard deviations.
     """
-    slope, deviation = found.slope[places], np.sqrt(np.diagonal(found.uncertainty)[places])
-    known = np.all(np.abs(slope) > KNOWN * deviation)
-    return bool(len(places) == 2 and known and abs(slope.sum()) < CANCELLED * np.abs(slope).max())
-
-
-def effect(found: Explanation, places: list[int]) -> str:
-    """The sum of the slopes at some places, with its posterior deviation."""
-    variance = float(found.uncertainty[np.ix_(places, places)].sum())
-    return f"{found.slope[places].sum():+.3g} ± {np.sqrt(max(variance, 0)):.1g}"
-
-
-def words(found: Explanation, form: FormFound | None, factors: list[str], entries: list[str]) -> list[str]:
-    """The sentences, one in each string.
-
-    Args:
-        found: the explanation of one team's score.
-        form: the form as which the score is treated; None if it is given or makes no difference.
-        factors: names of the factors; empty for a method without factors.
-        entries: names of the raw entries; empty if they have none. Then nothing is said of single entries.
-    """
-    count = int(found.episodes)
-    if count < FEWEST:
-        return []
-    if not np.isfinite(found.by_all):
-        return [
-            "There is nothing to explain: in all episodes the return is the same, or, if the score is a sum, the mean reward of a "
-            "step."
-        ]
-    said = []
-    if form is not None:
-        this, other = FORMS[int(form.average)], FORMS[1 - int(form.average)]
-        why = (
-            f"this predicts returns better than {other}" if form.decided else f"{other} predicts returns about as well"
-        )
-        said.append(
-            f"The score is treated as {this} over the steps of an episode: so far, {why}. This may change. If you know which of "
-            'them it is, set it: `score = "sum"` or `score = "average"` in the task file, `--credit.score`, or '
-            "`CreditSettings(score=...)`."
-        )
-    what = f"the mean reward of a step in {count} episodes" if found.of_steps else f"the returns of {count} episodes"
-    if not factors:
-        shares = f" The largest shares: {named}." if (named := largest(found, entries)) else ""
-        return [*said, f"Raw entries explain {found.by_all:.0%} of the variation of {what}.{shares}"]
-    more = float(found.by_all - found.by_factors)
-    said.append(
-        f"The factors explain {found.by_factors:.0%} of the variation of {what}"
-        + (f", raw entries another {more:.0%}." if entries and more >= 0.01 else ".")
-    )
-    if found.by_factors < NEXT_TO_NOTHING:
-        said.append(
-            "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of, or the episodes "
-            "are too few or too much alike to show it."
-        )
-    else:
-        said.append(
-            "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes; "
-            "below 0%: it offsets others), and by how much a step's reward rises with one standard deviation of it:"
-        )
-        said += factor_lines(found, factors)
-    if entries and more > MUCH and (named := largest(found, entries)):
-        said.append(
-            f"In a fit on factors and raw entries, these entries have the largest shares: {named}. phi may lack a factor that is "
-            "computed from them."
-        )
-    if entries and found.by_factors < 0.95 and np.abs(found.left).max() > STRIKING:
-        place = int(np.argmax(np.abs(found.left)))
-        way = "large" if found.left[place] > 0 else "small"
-        both = any(name.endswith(" (after)") for name in factors)
-        other_states = "" if both else ", or the task's `judges` may be wrong"
-        said.append(
-            f"Returns are higher than the factors predict when {entries[place]} is {way} "
-            f"(correlation {found.left[place]:+.2f}): a factor may be missing{other_states}."
-        )
-    return said
-
-
-def largest(found: Explanation, entries: list[str]) -> str:
-    """The three raw entries with the largest shares, and these; empty if none is noticeable, or if they have no names."""
-    order = np.argsort(-np.asarray(found.of_entries))[:3] if entries else ()
-    noticeable = [place for place in order if found.of_entries[place] > NOTICEABLE]
-    return ", ".join(f"{entries[place]} {found.of_entries[place]:.0%}" for place in noticeable)
-
-
-def r2_shown(value: float) -> str:
-    """An R^2 as text, with a third digit near 1."""
-    return f"{value:.3f}" if value > 0.99 else f"{value:.2f}"
-
-
-def error_shown(error: float) -> str:
-    """The standard error of an R^2 as text."""
-    return f"{error:.1g}" if error >= 0.001 else "less than 0.001"
+    slope, std = explanation.slope[indices], np.sqrt(np.diagonal(explanation.slope_covariance)[indices])
+    is_clear = np.all(np.abs(slope) > CLEAR_STDS * std)
+    return bool(len(indices) == 2 and is_clear and abs(slope.sum()) < CANCELLED_FRACTION * np.abs(slope).max())

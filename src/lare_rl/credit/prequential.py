@@ -2,9 +2,9 @@
 
     R^2 = 1 - sum_k (R_k - R_hat_k)^2 / sum_k (R_k - mean R)^2
 
-over the last episodes, where R_hat_k is the sum of the proxy rewards that the decoder gave to the steps of episode k before
-it had seen R_k. R^2 needs no true rewards of steps: if the environment pays only at the end, it is the only measure of the
-quality of proxy rewards. If it is below 0, the mean return predicts better than the decoder.
+The sums run over the last episodes. R_hat_k is the sum of the proxy rewards that the decoder gave to the steps of episode k before it
+was fitted to R_k. R^2 needs no true rewards of steps: if the environment pays only at the end, it is the only measure of the quality
+of proxy rewards. If it is below 0, the mean return predicts better than the decoder.
 """
 
 from typing import NamedTuple
@@ -12,53 +12,56 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-LAST = 32
-"""R^2 is computed over this many last episodes."""
-FEWEST = 8
+__all__ = ["WINDOW", "Predictions", "add_predictions", "empty_predictions", "r2", "squared_errors"]
+
+WINDOW = 32
+"""R^2 is computed over this number of last episodes."""
+MIN_EPISODES = 8
 """With fewer episodes, R^2 is NaN."""
 
 
 class Predictions(NamedTuple):
-    """Returns of the last episodes, in no particular order, and the predictions of one or more ways to predict."""
+    """Returns of the last episodes, in no particular order, and their predictions by one or more decoders."""
 
-    episodes: Float[Array, ""]
+    n_episodes: Float[Array, ""]
     """The number of episodes that were ever predicted."""
-    returns: Float[Array, " last"]
-    predicted: Float[Array, "last ways"]
+    returns: Float[Array, " window"]
+    predicted: Float[Array, "window decoders"]
 
 
-def no_predictions(ways: int) -> Predictions:
-    """The state before the first prediction."""
-    return Predictions(jnp.zeros(()), jnp.zeros(LAST), jnp.zeros((LAST, ways)))
+def empty_predictions(n_decoders: int) -> Predictions:
+    """Return the state before the first prediction."""
+    return Predictions(jnp.zeros(()), jnp.zeros(WINDOW), jnp.zeros((WINDOW, n_decoders)))
 
 
-def remember(
-    before: Predictions,
+def add_predictions(
+    predictions: Predictions,
     returns: Float[Array, " episodes"],
-    predicted: Float[Array, "episodes ways"],
+    predicted: Float[Array, "episodes decoders"],
     mask: Bool[Array, " episodes"],
 ) -> Predictions:
-    """Add new episodes, at most `LAST` of them. Episodes where `mask` is false are ignored."""
-    place = (before.episodes.astype(jnp.int32) + jnp.cumsum(mask) - 1) % LAST
-    place = jnp.where(mask, place, LAST)  # an index out of bounds, which is dropped
+    """Add new episodes, at most `WINDOW` of them. Episodes where `mask` is false are ignored."""
+    slot = (predictions.n_episodes.astype(jnp.int32) + jnp.cumsum(mask) - 1) % WINDOW
+    slot = jnp.where(mask, slot, WINDOW)  # an index out of bounds, which is dropped
     return Predictions(
-        before.episodes + jnp.sum(mask),
-        before.returns.at[place].set(returns.astype(jnp.float32), mode="drop"),
-        before.predicted.at[place].set(predicted.astype(jnp.float32), mode="drop"),
+        predictions.n_episodes + jnp.sum(mask),
+        predictions.returns.at[slot].set(returns.astype(jnp.float32), mode="drop"),
+        predictions.predicted.at[slot].set(predicted.astype(jnp.float32), mode="drop"),
     )
 
 
-def squared_errors(known: Predictions) -> Float[Array, " ways"]:
-    """sum_k (R_k - R_hat_k)^2 of each way."""
-    there = jnp.arange(LAST) < known.episodes
-    return jnp.sum(jnp.where(there[:, None], (known.returns[:, None] - known.predicted) ** 2, 0), axis=0)
+def squared_errors(predictions: Predictions) -> Float[Array, " decoders"]:
+    """Return sum_k (R_k - R_hat_k)^2 of each decoder."""
+    valid = jnp.arange(WINDOW) < predictions.n_episodes
+    errors = (predictions.returns[:, None] - predictions.predicted) ** 2
+    return jnp.sum(jnp.where(valid[:, None], errors, 0), axis=0)
 
 
-def r2(known: Predictions) -> Float[Array, " ways"]:
-    """R^2 of each way; NaN if there are too few episodes or all returns are equal."""
-    there = jnp.arange(LAST) < known.episodes
-    count = jnp.sum(there)
-    mean = jnp.sum(jnp.where(there, known.returns, 0)) / jnp.maximum(count, 1)
-    spread = jnp.sum(jnp.where(there, (known.returns - mean) ** 2, 0))
-    told = (count >= FEWEST) & (spread > 1e-10 * count * mean**2)
-    return jnp.where(told, 1 - squared_errors(known) / jnp.where(told, spread, 1), jnp.nan)
+def r2(predictions: Predictions) -> Float[Array, " decoders"]:
+    """Return R^2 of each decoder, or NaN if there are too few episodes or all returns are equal."""
+    valid = jnp.arange(WINDOW) < predictions.n_episodes
+    count = jnp.sum(valid)
+    mean = jnp.sum(jnp.where(valid, predictions.returns, 0)) / jnp.maximum(count, 1)
+    total = jnp.sum(jnp.where(valid, (predictions.returns - mean) ** 2, 0))
+    is_defined = (count >= MIN_EPISODES) & (total > 1e-10 * count * mean**2)
+    return jnp.where(is_defined, 1 - squared_errors(predictions) / jnp.where(is_defined, total, 1), jnp.nan)

@@ -5,8 +5,8 @@ The mean over the coalitions approximates the Shapley value of an agent:
 
     r_hat_{i,t} = w . mean_k attention(h_t, mask_k)_i,    mask_k ~ Bernoulli(1/2)^{n x n}, 1 on the diagonal
 
-During learning, each part of a batch has its own draws of coalitions, agent numbers and dropout. The published code also draws
-when it computes rewards. Here a reward is the mean over `USED` draws, the same at every call.
+During learning, each batch has its own samples of coalitions, agent numbers and dropout. The published code also samples when it
+computes rewards. Here a reward is the mean over `REWARD_SAMPLES` samples, which are the same at each call.
 """
 
 from functools import partial
@@ -16,14 +16,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.credit.decoders import Decoded
-from lare_rl.nn.attention import LayerNorm, attend, causal
+from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
-SIZE, HEADS, LAYERS, COALITIONS = 128, 4, 3, 5
+__all__ = ["STAS", "Coalitions", "TimeLayer", "dropout", "init_stas"]
 
-USED = 8
-"""The policy's reward is the mean over this many draws of coalitions and agent numbers."""
+SIZE, HEADS, LAYERS, COALITIONS = 128, 4, 3, 5
+"""The width of a token, the number of heads, of layers over time, and of sampled coalitions."""
+REWARD_SAMPLES = 8
+"""The algorithm's reward is the mean over this number of samples of coalitions and agent numbers."""
 
 
 def dropout(x: Float[Array, "..."], key: PRNGKeyArray | None) -> Float[Array, "..."]:
@@ -35,17 +38,17 @@ def dropout(x: Float[Array, "..."], key: PRNGKeyArray | None) -> Float[Array, ".
     return 2 * x * coins[: x.size].reshape(x.shape)
 
 
-def gelu(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The exact GELU: x times the probability that a standard normal variable is below x (Hendrycks and Gimpel, 2016)."""
+def _gelu(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the exact GELU: x times the probability that a standard normal variable is below x (Hendrycks and Gimpel, 2016)."""
     return jax.nn.gelu(x, approximate=False)
 
 
-def heads(x: Float[Array, "*batch size"]) -> Float[Array, "*batch heads part"]:
+def _split_heads(x: Float[Array, "*batch size"]) -> Float[Array, "*batch heads head_size"]:
     return x.reshape(*x.shape[:-1], HEADS, SIZE // HEADS)
 
 
 class TimeLayer(eqx.Module):
-    """a = attention(x), out = LN(FF(LN(x + a)) + 2 a): as published, x itself is not added again."""
+    """a = attention(x), out = LN(FF(LN(x + a)) + 2 a). As published, x itself is not added again."""
 
     query: Linear
     key: Linear
@@ -55,27 +58,27 @@ class TimeLayer(eqx.Module):
     norms: tuple[LayerNorm, LayerNorm]
 
     def __init__(self, *, key: PRNGKeyArray):
-        *keys, last = jax.random.split(key, 5)
+        *keys, last_key = jax.random.split(key, 5)
         self.query, self.key, self.value, self.merge = (Linear(SIZE, SIZE, key=key) for key in keys)
-        self.feed_forward = MLP(SIZE, (SIZE,), SIZE, key=last, activation=gelu)
+        self.feed_forward = MLP(SIZE, (SIZE,), SIZE, key=last_key, activation=_gelu)
         self.norms = LayerNorm(SIZE, 1e-12), LayerNorm(SIZE, 1e-12)
 
     def __call__(
         self, x: Float[Array, "*batch steps size"], key: PRNGKeyArray | None
     ) -> Float[Array, "*batch steps size"]:
-        keys = (None,) * 3 if key is None else jax.random.split(key, 3)
-        query, keys_of_x, value = (heads(part(x)) for part in (self.query, self.key, self.value))
-        found = attend(query, keys_of_x, value, causal(x.shape[-2]), partial(dropout, key=keys[0]))
-        a = dropout(self.merge(found), keys[1])
+        dropout_keys = (None,) * 3 if key is None else jax.random.split(key, 3)
+        query, keys, value = (_split_heads(layer(x)) for layer in (self.query, self.key, self.value))
+        attention = attend(query, keys, value, causal_mask(x.shape[-2]), partial(dropout, key=dropout_keys[0]))
+        a = dropout(self.merge(attention), dropout_keys[1])
         hidden = self.norms[0](x + a)
-        return self.norms[1](dropout(self.feed_forward(hidden), keys[2]) + 2 * a)
+        return self.norms[1](dropout(self.feed_forward(hidden), dropout_keys[2]) + 2 * a)
 
 
 class Coalitions(eqx.Module):
     """Attention over agents, averaged over random coalitions. Each agent has its own projection to queries."""
 
     query: Linear
-    """One layer for each agent, stacked."""
+    """The layers of all agents, stacked."""
     key: Linear
     value: Linear
     merge: Linear
@@ -86,21 +89,20 @@ class Coalitions(eqx.Module):
         self.key, self.value, self.merge = (Linear(SIZE, SIZE, key=key) for key in keys)
 
     def __call__(
-        self, x: Float[Array, "*batch agents size"], key: PRNGKeyArray, drop: PRNGKeyArray | None
+        self, x: Float[Array, "*batch agents size"], key: PRNGKeyArray, dropout_key: PRNGKeyArray | None
     ) -> Float[Array, "*batch agents size"]:
         agents = x.shape[-2]
-        drops = (None,) * 2 if drop is None else jax.random.split(drop)
-        query = heads(jnp.einsum("...ad,ade->...ae", x, self.query.weight) + self.query.bias)
-        joined = jax.random.bernoulli(key, 0.5, (COALITIONS, agents, agents)) | jnp.eye(agents, dtype=bool)
-        # Each agent needs one query for every coalition.
-        found = attend(
-            jnp.tile(query, (COALITIONS, 1, 1)),
-            heads(self.key(x)),
-            heads(self.value(x)),
-            joined.reshape(-1, agents),
-            partial(dropout, key=drops[0]),
+        dropout_keys = (None,) * 2 if dropout_key is None else jax.random.split(dropout_key)
+        query = _split_heads(jnp.einsum("...ad,ade->...ae", x, self.query.weight) + self.query.bias)
+        mask = jax.random.bernoulli(key, 0.5, (COALITIONS, agents, agents)) | jnp.eye(agents, dtype=bool)
+        attention = attend(
+            jnp.tile(query, (COALITIONS, 1, 1)),  # each agent needs a query for each coalition
+            _split_heads(self.key(x)),
+            _split_heads(self.value(x)),
+            mask.reshape(-1, agents),
+            partial(dropout, key=dropout_keys[0]),
         )
-        merged = dropout(self.merge(found), drops[1])
+        merged = dropout(self.merge(attention), dropout_keys[1])
         return jnp.mean(merged.reshape(*x.shape[:-2], COALITIONS, agents, SIZE), axis=-3)
 
 
@@ -109,43 +111,48 @@ class STAS(eqx.Module):
 
     embed: Linear
     """Embeds the observation and the one-hot action."""
-    step: Float[Array, "steps size"]
-    number: Float[Array, "agents size"]
+    position: Float[Array, "steps size"]
+    agent_number: Float[Array, "agents size"]
     """Embeddings of agent numbers, which are assigned at random."""
     layers: tuple[TimeLayer, ...]
     coalitions: Coalitions
-    last: Linear
+    head: Linear
     gain: float = eqx.field(static=True)
 
-    def __init__(self, features: int, steps: int, agents: int, gain: float, *, key: PRNGKeyArray):
+    def __init__(self, n_features: int, max_steps: int, n_agents: int, gain: float, *, key: PRNGKeyArray):
         self.gain = gain
-        embed_key, step_key, number_key, layers_key, coalitions_key, last_key = jax.random.split(key, 6)
-        self.embed = Linear(features, SIZE, key=embed_key)
-        self.step = jax.random.normal(step_key, (steps, SIZE))
-        self.number = jax.random.normal(number_key, (agents, SIZE))
+        embed_key, position_key, number_key, layers_key, coalitions_key, head_key = jax.random.split(key, 6)
+        self.embed = Linear(n_features, SIZE, key=embed_key)
+        self.position = jax.random.normal(position_key, (max_steps, SIZE))
+        self.agent_number = jax.random.normal(number_key, (n_agents, SIZE))
         self.layers = tuple(TimeLayer(key=key) for key in jax.random.split(layers_key, LAYERS))
-        self.coalitions = Coalitions(agents, key=coalitions_key)
-        self.last = Linear(SIZE, 1, key=last_key)
+        self.coalitions = Coalitions(n_agents, key=coalitions_key)
+        self.head = Linear(SIZE, 1, key=head_key)
 
-    def __call__(self, features: Float[Array, "rows agents features"], key: PRNGKeyArray | None) -> Decoded:
+    def __call__(self, features: Float[Array, "rows agents features"], key: PRNGKeyArray | None) -> DecoderOutput:
         rows, agents = features.shape[:2]
-        x = self.embed(features).reshape(-1, len(self.step), agents, SIZE)
-        x = jnp.swapaxes(x, 1, 2) + self.step
-        drawn_key, drop, *keys = [None] * (2 + LAYERS) if key is None else jax.random.split(key, 2 + LAYERS)
+        x = self.embed(features).reshape(-1, len(self.position), agents, SIZE)
+        x = jnp.swapaxes(x, 1, 2) + self.position
+        sample_key, dropout_key, *keys = [None] * (2 + LAYERS) if key is None else jax.random.split(key, 2 + LAYERS)
         for layer, layer_key in zip(self.layers, keys, strict=True):
             x = layer(x, layer_key)
         x = jnp.swapaxes(x, 1, 2)
-        if drawn_key is not None:
-            r_hat = self.among_agents(x, drawn_key, drop)
+        if sample_key is not None:
+            r_hat = self.agent_rewards(x, sample_key, dropout_key)
         else:
-            draws = jax.lax.map(lambda one: self.among_agents(x, one, None), jax.random.split(jax.random.key(0), USED))
-            r_hat = jnp.mean(draws, axis=0)
-        return Decoded(r_hat.reshape(rows, agents), jnp.zeros((rows, agents)))
+            sample_keys = jax.random.split(jax.random.key(0), REWARD_SAMPLES)
+            r_hat = jnp.mean(jax.lax.map(lambda key: self.agent_rewards(x, key, None), sample_keys), axis=0)
+        return DecoderOutput(r_hat.reshape(rows, agents), jnp.zeros((rows, agents)))
 
-    def among_agents(
-        self, x: Float[Array, "episodes steps agents size"], key: PRNGKeyArray, drop: PRNGKeyArray | None
+    def agent_rewards(
+        self, x: Float[Array, "episodes steps agents size"], key: PRNGKeyArray, dropout_key: PRNGKeyArray | None
     ) -> Float[Array, "episodes steps agents"]:
-        """The agents' rewards for one draw of coalitions and of agent numbers."""
+        """Return the agents' rewards for one sample of coalitions and of agent numbers."""
         coalitions_key, order_key = jax.random.split(key)
-        order = jax.random.permutation(order_key, len(self.number))
-        return self.gain * self.last(self.coalitions(x + self.number[order], coalitions_key, drop))[..., 0]
+        order = jax.random.permutation(order_key, len(self.agent_number))
+        return self.gain * self.head(self.coalitions(x + self.agent_number[order], coalitions_key, dropout_key))[..., 0]
+
+
+def init_stas(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> STAS:
+    """Return an untrained `STAS`. `settings` is not used."""
+    return STAS(shape.n_inputs, shape.max_steps, shape.n_agents, shape.gain, key=key)

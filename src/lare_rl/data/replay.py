@@ -1,4 +1,4 @@
-"""Replay of trajectories: each observation stored once, every draw O(batch).
+"""A replay of trajectories: each observation is stored once, and a draw costs O(batch).
 
 An episode of T steps takes T + 1 rows that follow each other, so that s' of a step is the next row:
 
@@ -23,8 +23,8 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-SHOWN = ("observation", "state", "available", "alive")
-"""Columns that an environment shows before and after a step. The values after a step are in the next row."""
+STEP_COLUMNS = ("observation", "state", "available", "alive")
+"""Columns that exist before and after a step. The values after a step are in the next row."""
 
 BY_ROW = "columns"
 """The field of the replay that a checkpoint saves by row."""
@@ -67,10 +67,10 @@ class Index(NamedTuple):
 class StoredSteps(NamedTuple):
     """Transitions, read from the replay."""
 
-    before: dict[str, Array]
+    columns: dict[str, Array]
     """Every column, [*batch ...], of the step's row: the observation before the step, the action, the reward."""
-    after: dict[str, Array]
-    """The columns of `SHOWN` that are stored, after the step."""
+    next_columns: dict[str, Array]
+    """The columns of `STEP_COLUMNS` that are stored, after the step."""
     episodic_reward: Float[Array, "*batch teams"]
     """The whole return at the last step of a finished episode, else 0."""
     mean_reward: Float[Array, "*batch teams"]
@@ -83,8 +83,8 @@ class StoredSteps(NamedTuple):
     """Steps of its episode; if that has not finished, at least the mean length of the finished ones."""
 
 
-def empty(columns: Mapping[str, jax.ShapeDtypeStruct], envs: int, capacity: int, teams: int) -> Replay:
-    """An empty replay; `columns` are the shapes of a single row."""
+def init_replay(columns: Mapping[str, jax.ShapeDtypeStruct], envs: int, capacity: int, teams: int) -> Replay:
+    """Return an empty replay. `columns` are the shapes of a single row."""
     episodes = capacity // 2 + 1  # the shortest episode takes two rows; one more is running
 
     def zeros(*shape: int, dtype: DTypeLike = jnp.int32) -> Array:
@@ -105,152 +105,160 @@ def empty(columns: Mapping[str, jax.ShapeDtypeStruct], envs: int, capacity: int,
 
 
 def capacity(replay: Replay) -> int:
-    """Rows of each environment."""
+    """Return the number of rows of each environment."""
     return replay.row.shape[-1]
 
 
 def oldest_transition(replay: Replay) -> Int[Array, " envs"]:
-    """The number of the oldest transition that is still stored."""
-    known = replay.oldest < replay.episodes + replay.running
+    """Return the number of the oldest transition that is still stored."""
+    has_episode = replay.oldest < replay.episodes + replay.running
     first = jnp.take_along_axis(replay.first, (replay.oldest % replay.first.shape[-1])[:, None], axis=1)[:, 0]
-    return jnp.where(known, first, replay.transitions)
+    return jnp.where(has_episode, first, replay.transitions)
 
 
-def size(replay: Replay) -> Int[Array, " envs"]:
-    """Transitions that can be drawn."""
+def n_transitions(replay: Replay) -> Int[Array, " envs"]:
+    """Return the number of transitions that can be drawn."""
     return replay.transitions - oldest_transition(replay)
 
 
-def finished(replay: Replay) -> Int[Array, " envs"]:
-    """Finished episodes that can be drawn."""
+def n_finished(replay: Replay) -> Int[Array, " envs"]:
+    """Return the number of finished episodes that can be drawn."""
     return replay.episodes - replay.oldest
 
 
 def extend(
     replay: Replay,
-    before: Mapping[str, Array | np.ndarray],
-    after: Mapping[str, Array | np.ndarray],
+    columns: Mapping[str, Array | np.ndarray],
+    next_columns: Mapping[str, Array | np.ndarray],
     team_reward: Float[Array | np.ndarray, "time envs teams"],
     ended: Bool[Array | np.ndarray, "time envs"],
 ) -> Replay:
     """Store consecutive steps.
 
     Args:
-        replay: it must have room for all of the steps and the running episode; see `room`.
-        before: every column, [time envs ...].
-        after: the columns of `SHOWN`, after the steps.
+        replay: it must be large enough for all of the steps and the running episode (`required_capacity`).
+        columns: every column, [time envs ...].
+        next_columns: the columns of `STEP_COLUMNS`, after the steps.
         team_reward: the true reward of each team.
         ended: whether a step was the last of its episode.
     """
-    lead = jax.tree.map(jnp.asarray, (dict(before), dict(after), team_reward, ended))
-    return jax.vmap(extend_one)(replay, *jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), lead))
+    lead = jax.tree.map(jnp.asarray, (dict(columns), dict(next_columns), team_reward, ended))
+    return jax.vmap(_extend_env)(replay, *jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), lead))
 
 
-def room(steps: int, longest: int) -> int:
-    """The largest number of rows that an environment needs for so many steps and the running episode before them."""
+def required_capacity(steps: int, longest: int) -> int:
+    """Return how many rows an environment needs for `steps` new steps and the running episode before them, at most."""
     return 2 * steps + longest
 
 
-def extend_one(
+def _extend_env(
     replay: Replay,
-    before: Columns,
-    after: Columns,
+    columns: Columns,
+    next_columns: Columns,
     team_reward: Float[Array, "time teams"],
     ended: Bool[Array, " time"],
 ) -> Replay:
-    """Store the steps of one environment, all at once. The oldest episodes are removed if their rows are needed."""
+    """Store the steps of one environment, all at once. Remove the oldest episodes if their rows are needed."""
     rows, slots, steps = replay.row.shape[0], replay.first.shape[0], ended.shape[0]
-    over = jnp.cumsum(ended)
-    earlier = over - ended  # episodes that have ended before each step
+    n_ended = jnp.cumsum(ended)
+    earlier = n_ended - ended  # episodes that have ended before each step
     row = replay.next_row + jnp.arange(steps) + earlier
     number, episode = replay.transitions + jnp.arange(steps), replay.episodes + earlier
-    oldest = oldest_with_room(replay, row[-1] + 1)
-    begins = jnp.append(~replay.running, ended[:-1])
+    oldest = _remove_oldest(replay, row[-1] + 1)
+    is_first = jnp.append(~replay.running, ended[:-1])
     slot = episode % slots
-    begun = jnp.where(begins, slot, slots)  # an index out of range, which is dropped
-    columns = dict(replay.columns)
-    for name, values in after.items():  # first, because the next step of the same episode overwrites the row
-        columns[name] = columns[name].at[(row + 1) % rows].set(values)
-    for name, values in before.items():
-        columns[name] = columns[name].at[row % rows].set(values)
+    first_slot = jnp.where(is_first, slot, slots)  # other steps get an index out of range, which is dropped
+    stored = dict(replay.columns)
+    for name, values in next_columns.items():  # first, because the next step of the same episode overwrites the row
+        stored[name] = stored[name].at[(row + 1) % rows].set(values)
+    for name, values in columns.items():
+        stored[name] = stored[name].at[row % rows].set(values)
     return Replay(
-        columns=columns,
+        columns=stored,
         row=replay.row.at[number % rows].set(row),
         episode=replay.episode.at[number % rows].set(episode),
-        first=replay.first.at[begun].set(number, mode="drop"),
-        episode_return=replay.episode_return.at[begun].set(0, mode="drop").at[slot].add(team_reward),
+        first=replay.first.at[first_slot].set(number, mode="drop"),
+        episode_return=replay.episode_return.at[first_slot].set(0, mode="drop").at[slot].add(team_reward),
         next_row=row[-1] + 1 + ended[-1],
         transitions=replay.transitions + steps,
         oldest=oldest,
-        episodes=replay.episodes + over[-1],
+        episodes=replay.episodes + n_ended[-1],
         running=~ended[-1],
     )
 
 
-def oldest_with_room(replay: Replay, last: Int[Array, ""]) -> Int[Array, ""]:
-    """The oldest episode that can stay when rows up to `last` are written: none of its rows is overwritten."""
+def _remove_oldest(replay: Replay, last: Int[Array, ""]) -> Int[Array, ""]:
+    """Return the oldest episode that stays when rows up to `last` are written: none of its rows is overwritten."""
     rows, slots = replay.row.shape[0], replay.first.shape[0]
 
-    def crowded(oldest: Int[Array, ""]) -> Bool[Array, ""]:
+    def is_overwritten(oldest: Int[Array, ""]) -> Bool[Array, ""]:
         row = replay.row[replay.first[oldest % slots] % rows]
         return (oldest < replay.episodes) & (last - row >= rows)
 
-    return jax.lax.while_loop(crowded, lambda oldest: oldest + 1, replay.oldest)
+    return jax.lax.while_loop(is_overwritten, lambda oldest: oldest + 1, replay.oldest)
 
 
-def drop_running(replay: Replay, dropped: Bool[Array, " envs"]) -> Replay:
+def abandon_running(replay: Replay, abandoned: Bool[Array, " envs"]) -> Replay:
     """Forget the running episodes of some environments."""
     slot = (replay.episodes % replay.first.shape[-1])[:, None]
     first = jnp.take_along_axis(replay.first, slot, axis=1)
     row = jnp.take_along_axis(replay.row, first % capacity(replay), axis=1)[:, 0]
-    gone = dropped & replay.running
+    removed = abandoned & replay.running
     return replay._replace(
-        transitions=jnp.where(gone, first[:, 0], replay.transitions),
-        next_row=jnp.where(gone, row, replay.next_row),
-        running=replay.running & ~gone,
+        transitions=jnp.where(removed, first[:, 0], replay.transitions),
+        next_row=jnp.where(removed, row, replay.next_row),
+        running=replay.running & ~removed,
     )
 
 
-def flat(values: Array) -> Array:
+def hide_newest(replay: Replay, count: Int[Array, "*seeds envs"]) -> Replay:
+    """Return the replay as if the newest finished episodes of each environment, `count` of them, were still running.
+
+    Nothing is removed: the same columns with the earlier `episodes` and `running` show these episodes again.
+    """
+    return replay._replace(episodes=replay.episodes - count, running=replay.running | (count > 0))
+
+
+def flatten_envs(values: Array) -> Array:
     """Merge the axes of environments and rows."""
     return values.reshape(-1, *values.shape[2:])
 
 
 def read(replay: Replay, index: Index) -> StoredSteps:
-    """The transitions at this index."""
+    """Read the transitions at this index."""
     rows = capacity(replay)
     slots = replay.first.shape[-1]
-    place = index.env * rows
-    at = index.number % rows + place
-    row = flat(replay.row)[at]
-    episode = flat(replay.episode)[at]
-    here, next_one = row % rows + place, (row + 1) % rows + place
+    first_row = index.env * rows
+    transition = index.number % rows + first_row
+    row = flatten_envs(replay.row)[transition]
+    episode = flatten_envs(replay.episode)[transition]
+    here, following = row % rows + first_row, (row + 1) % rows + first_row
     slot = episode % slots + index.env * slots
-    end, done = end_of(replay, index.env, episode), episode < replay.episodes[index.env]
-    total, length = flat(replay.episode_return)[slot], end - flat(replay.first)[slot]
-    last = (index.number + 1 == end) & done
-    usual = jnp.sum(replay.transitions) // jnp.maximum(jnp.sum(replay.episodes), 1)
-    columns = {name: flat(values) for name, values in replay.columns.items()}
+    end, finished = end_of_episode(replay, index.env, episode), episode < replay.episodes[index.env]
+    return_, length = flatten_envs(replay.episode_return)[slot], end - flatten_envs(replay.first)[slot]
+    last = (index.number + 1 == end) & finished
+    mean_length = jnp.sum(replay.transitions) // jnp.maximum(jnp.sum(replay.episodes), 1)
+    columns = {name: flatten_envs(values) for name, values in replay.columns.items()}
     return StoredSteps(
-        before={name: values[here] for name, values in columns.items()},
-        after={name: values[next_one] for name, values in columns.items() if name in SHOWN},
-        episodic_reward=jnp.where(last[..., None], total, 0),
-        mean_reward=total / jnp.maximum(length, 1)[..., None],
-        finished=done,
+        columns={name: values[here] for name, values in columns.items()},
+        next_columns={name: values[following] for name, values in columns.items() if name in STEP_COLUMNS},
+        episodic_reward=jnp.where(last[..., None], return_, 0),
+        mean_reward=return_ / jnp.maximum(length, 1)[..., None],
+        finished=finished,
         last=last,
-        length=jnp.where(done, length, jnp.maximum(length, usual)),
+        length=jnp.where(finished, length, jnp.maximum(length, mean_length)),
     )
 
 
-def end_of(replay: Replay, env: Int[Array, "*batch"], episode: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
-    """The number of the transition after an episode's last one."""
+def end_of_episode(replay: Replay, env: Int[Array, "*batch"], episode: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
+    """Return the number of the transition after an episode's last one."""
     slots = replay.first.shape[-1]
-    following = flat(replay.first)[(episode + 1) % slots + env * slots]
+    next_first = flatten_envs(replay.first)[(episode + 1) % slots + env * slots]
     newest = replay.episodes + replay.running - 1
-    return jnp.where(episode >= newest[env], replay.transitions[env], following)
+    return jnp.where(episode >= newest[env], replay.transitions[env], next_first)
 
 
-def newest(replay: Replay, steps: int) -> Index:
-    """The last steps of every environment: [envs steps]. At least so many must have been stored."""
+def newest_steps(replay: Replay, steps: int) -> Index:
+    """Return the index of the last steps of every environment: [envs steps]. At least `steps` of each must have been stored."""
     number = replay.transitions[:, None] - steps + jnp.arange(steps)
     return Index(jnp.broadcast_to(jnp.arange(len(number))[:, None], number.shape), number)

@@ -1,13 +1,35 @@
-"""The choice of the stored steps that an update reads. Only their numbers are drawn here; the rows are read later."""
+"""Draw the stored steps that an update reads. Only their numbers are drawn here; the rows are read later."""
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
-from lare_rl.data.replay import Index, Replay, end_of, finished, flat, oldest_transition, size
+from lare_rl.data.layouts import Layout, lay_out_drawn, lay_out_packed, lay_out_padded, sample_step_numbers
+from lare_rl.data.replay import (
+    Index,
+    Replay,
+    end_of_episode,
+    flatten_envs,
+    n_finished,
+    n_transitions,
+    oldest_transition,
+)
+
+__all__ = [
+    "CreditSample",
+    "EpisodeSample",
+    "count_episodes_since",
+    "episodes_in_order",
+    "get_episodes",
+    "sample_distinct_episodes",
+    "sample_drawn",
+    "sample_episodes",
+    "sample_packed",
+    "sample_padded",
+    "sample_transitions",
+]
 
 
 class EpisodeSample(NamedTuple):
@@ -23,17 +45,17 @@ class EpisodeSample(NamedTuple):
 
 
 class CreditSample(NamedTuple):
-    """Which steps one update of a decoder reads, and of which episodes."""
+    """The steps that one update of a decoder reads, and their episodes."""
 
     steps: Index
     """[*updates rows]."""
     episode: Int[Array, "*updates rows"]
-    """The index of the episode that a row belongs to; for padding, the number of episodes."""
+    """The index of each row's episode; for padding, the number of episodes."""
     episodes: EpisodeSample
 
 
-def one_of(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
-    """Uniform draws from the items of all environments, of which each has `counts`; `number` counts from 0 in each environment."""
+def _sample_items(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
+    """Draw uniformly from the items of all environments. `number` counts from 0 in each environment."""
     ends = jnp.cumsum(counts)
     number = jax.random.randint(key, shape, 0, jnp.maximum(ends[-1], 1))
     env = jnp.minimum(jnp.searchsorted(ends, number, side="right"), len(counts) - 1)
@@ -41,148 +63,110 @@ def one_of(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[int, ...
 
 
 def sample_transitions(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
-    """Transitions, uniform over all that are stored, finished episode or not."""
-    chosen = one_of(size(replay), key, shape)
-    return Index(chosen.env, oldest_transition(replay)[chosen.env] + chosen.number)
+    """Draw transitions uniformly, of finished and of running episodes."""
+    item = _sample_items(n_transitions(replay), key, shape)
+    return Index(item.env, oldest_transition(replay)[item.env] + item.number)
 
 
 def sample_episodes(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> EpisodeSample:
-    """Finished episodes, uniform, with replacement."""
-    return episodes_at(replay, one_of(finished(replay), key, shape))
+    """Draw finished episodes uniformly, with replacement."""
+    return get_episodes(replay, _sample_items(n_finished(replay), key, shape))
 
 
 def sample_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> EpisodeSample:
-    """Finished episodes, uniform, without replacement: the first of a random order of all slots that hold one.
-
-    If there are fewer than `count`, `mask` is 0 for the entries that are left.
-    """
-    there, slots = finished(replay), replay.first.shape[-1]
-    stored = jnp.arange(slots) < there[:, None]
-    order = jnp.where(stored, jax.random.uniform(key, stored.shape), jnp.inf).ravel()
-    _, chosen = jax.lax.top_k(-order, min(count, order.size))
-    chosen = jnp.pad(chosen, (0, count - len(chosen)))
-    drawn = episodes_at(replay, Index(chosen // slots, chosen % slots))
-    return drawn._replace(mask=drawn.mask * (jnp.arange(count) < jnp.sum(there)))
+    """Draw finished episodes uniformly, without replacement. If there are fewer than `count`, the mask of the others is 0."""
+    available, slots = n_finished(replay), replay.first.shape[-1]
+    has_episode = jnp.arange(slots) < available[:, None]
+    # The first episodes of a random order of all slots.
+    order = jnp.where(has_episode, jax.random.uniform(key, has_episode.shape), jnp.inf).ravel()
+    _, slot = jax.lax.top_k(-order, min(count, order.size))
+    slot = jnp.pad(slot, (0, count - len(slot)))
+    episodes = get_episodes(replay, Index(slot // slots, slot % slots))
+    return episodes._replace(mask=episodes.mask * (jnp.arange(count) < jnp.sum(available)))
 
 
-def episodes_at(replay: Replay, place: Index) -> EpisodeSample:
-    """Finished episodes; `place` numbers them from each environment's oldest."""
+def get_episodes(replay: Replay, index: Index) -> EpisodeSample:
+    """Return finished episodes. `index.number` counts from the oldest episode of each environment."""
     slots = replay.first.shape[-1]
-    episode = replay.oldest[place.env] + place.number
-    slot = episode % slots + place.env * slots
-    first = flat(replay.first)[slot]
-    length = jnp.maximum(end_of(replay, place.env, episode) - first, 1)
-    some = jnp.sum(finished(replay)) > 0
+    episode = replay.oldest[index.env] + index.number
+    slot = episode % slots + index.env * slots
+    first = flatten_envs(replay.first)[slot]
+    length = jnp.maximum(end_of_episode(replay, index.env, episode) - first, 1)
+    has_episodes = jnp.sum(n_finished(replay)) > 0
     return EpisodeSample(
-        Index(place.env, first),
-        length,
-        flat(replay.episode_return)[slot] / length[..., None],
-        jnp.broadcast_to(some.astype(jnp.float32), first.shape),
+        first=Index(index.env, first),
+        length=length,
+        mean_reward=flatten_envs(replay.episode_return)[slot] / length[..., None],
+        mask=jnp.broadcast_to(has_episodes.astype(jnp.float32), first.shape),
     )
 
 
-def steps_of(
-    episodes: EpisodeSample, number: Int[Array, "*episodes steps"], episode: Int[Array, "*episodes steps"]
-) -> CreditSample:
-    """Steps of drawn episodes (their last axis), given by their number within each, flattened into one axis."""
-    index = Index(
-        jnp.broadcast_to(episodes.first.env[..., None], number.shape), episodes.first.number[..., None] + number
-    )
+def _credit_sample(episodes: EpisodeSample, layout: Layout) -> CreditSample:
+    """Return the sample with this layout, which has the same number of rows for each episode."""
     lead = episodes.length.shape[:-1]
-    return CreditSample(jax.tree.map(lambda x: x.reshape(*lead, -1), index), episode.reshape(*lead, -1), episodes)
+    env = jnp.broadcast_to(episodes.first.env[..., None], layout.number.shape)
+    number = episodes.first.number[..., None] + layout.number
+    return CreditSample(
+        Index(env.reshape(*lead, -1), number.reshape(*lead, -1)), layout.slot.reshape(*lead, -1), episodes
+    )
 
 
-def sample_parts(replay: Replay, key: PRNGKeyArray, updates: int, count: int, drawn: int) -> CreditSample:
-    """`drawn` steps of each of `count` episodes, for RRD. A shorter episode gives all its steps, and padding."""
+def sample_drawn(replay: Replay, key: PRNGKeyArray, updates: int, count: int, steps: int) -> CreditSample:
+    """Draw `steps` steps of each of `count` episodes, for RRD."""
     episodes_key, steps_key = jax.random.split(key)
     episodes = sample_episodes(replay, episodes_key, (updates, count))
-    number = sample_steps(steps_key, episodes.length, drawn)
-    belongs = jnp.arange(drawn) < episodes.length[..., None]
-    return steps_of(episodes, number, jnp.where(belongs, jnp.arange(count)[:, None], count))
+    number = sample_step_numbers(steps_key, episodes.length, steps)
+    return _credit_sample(episodes, lay_out_drawn(episodes.length, number))
 
 
 def sample_padded(replay: Replay, key: PRNGKeyArray, updates: int, count: int, longest: int) -> CreditSample:
-    """All steps of some episodes. The last step of each is repeated until there are `longest`."""
+    """Draw whole episodes, each padded to `longest` steps by copies of its last step."""
     episodes = sample_episodes(replay, key, (updates, count))
-    number = jnp.minimum(jnp.arange(longest), episodes.length[..., None] - 1)
-    return steps_of(episodes, number, jnp.broadcast_to(jnp.arange(count)[:, None], number.shape))
+    return _credit_sample(episodes, lay_out_padded(episodes.length, longest))
 
 
 def sample_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, longest: int) -> CreditSample:
-    """All steps of max(1, steps // mean length) episodes, one after the other, for RD.
+    """Draw max(1, steps / mean length) whole episodes, and put them one after the other into max(steps, longest) rows, for RD."""
 
-    There are max(steps, longest) rows. An episode that does not fit into them is left out as a whole. Rows after the last
-    episode belong to none.
-    """
-    return jax.vmap(partial(pack, replay, steps=steps, longest=longest))(jax.random.split(key, updates))
+    def sample_update(key: PRNGKeyArray) -> CreditSample:
+        episodes = sample_episodes(replay, key, (steps,))
+        count = steps * jnp.sum(n_finished(replay)) // jnp.maximum(_n_finished_steps(replay), 1)
+        mask = episodes.mask * (jnp.arange(steps) < jnp.maximum(count, 1))
+        return _pack(episodes._replace(mask=mask), max(steps, longest))
 
-
-def pack(replay: Replay, key: PRNGKeyArray, steps: int, longest: int) -> CreditSample:
-    """`sample_packed` for one update."""
-    drawn = sample_episodes(replay, key, (steps,))
-    wanted = steps * jnp.sum(finished(replay)) // jnp.maximum(stored_steps(replay), 1)
-    mask = drawn.mask * (jnp.arange(steps) < jnp.maximum(wanted, 1))
-    return one_behind_the_other(drawn._replace(mask=mask), max(steps, longest))
+    return jax.vmap(sample_update)(jax.random.split(key, updates))
 
 
-def one_behind_the_other(episodes: EpisodeSample, rows: int) -> CreditSample:
-    """All steps of the episodes that fit into so many rows, one after the other. Rows after the last episode belong to none."""
-    end, places = jnp.cumsum(episodes.length), len(episodes.length)
-    mask = episodes.mask * (end <= rows)
-    row = jnp.arange(rows)
-    place = jnp.minimum(jnp.searchsorted(end, row, side="right"), places - 1)
-    number = episodes.first.number[place] + row - (end - episodes.length)[place]
-    belongs = (mask[place] > 0) & (row < end[place])
-    index = Index(
-        jnp.where(belongs, episodes.first.env[place], episodes.first.env[0]),
-        jnp.where(belongs, number, episodes.first.number[0]),
-    )
-    return CreditSample(index, jnp.where(belongs, place, places), episodes._replace(mask=mask))
+def _pack(episodes: EpisodeSample, rows: int) -> CreditSample:
+    """Put whole episodes one after the other. Those that do not fit into the rows are left out."""
+    layout, mask = lay_out_packed(episodes.length, episodes.mask, rows)
+    slot = jnp.where(layout.slot < len(mask), layout.slot, 0)  # padding reads a step that is certainly stored
+    steps = Index(episodes.first.env[slot], episodes.first.number[slot] + layout.number)
+    return CreditSample(steps, layout.slot, episodes._replace(mask=mask))
 
 
-def episodes_since(replay: Replay, since: Int[Array, " envs"]) -> Int[Array, " envs"]:
-    """How many finished episodes of each environment have this number or a later one, and are still stored."""
+def count_episodes_since(replay: Replay, since: Int[Array, " envs"]) -> Int[Array, " envs"]:
+    """Return how many finished episodes of each environment have this number or a later one, and are still stored."""
     return jnp.maximum(replay.episodes - jnp.maximum(since, replay.oldest), 0)
 
 
-def in_order(
-    replay: Replay, since: Int[Array, " envs"], start: Int[Scalar, ""], places: int, rows: int
+def episodes_in_order(
+    replay: Replay, since: Int[Array, " envs"], start: Int[Scalar, ""], count: int, rows: int
 ) -> CreditSample:
-    """The finished episodes that `episodes_since` counts, one environment after the other, from the `start`-th on.
+    """Return the episodes that `count_episodes_since` counts, one environment after the other, from the `start`-th on.
 
-    At most `places` of them, and only those that fit into the rows as a whole.
+    These are at most `count` episodes, and only those that fit into the rows as a whole.
     """
-    counts = episodes_since(replay, since)
+    counts = count_episodes_since(replay, since)
     ends = jnp.cumsum(counts)
-    at = start + jnp.arange(places)
-    env = jnp.minimum(jnp.searchsorted(ends, at, side="right"), len(counts) - 1)
-    number = jnp.maximum(since, replay.oldest)[env] + at - (ends - counts)[env]
-    found = episodes_at(replay, Index(env, number - replay.oldest[env]))
-    return one_behind_the_other(found._replace(mask=found.mask * (at < ends[-1])), rows)
+    position = start + jnp.arange(count)
+    env = jnp.minimum(jnp.searchsorted(ends, position, side="right"), len(counts) - 1)
+    number = jnp.maximum(since, replay.oldest)[env] + position - (ends - counts)[env]
+    episodes = get_episodes(replay, Index(env, number - replay.oldest[env]))
+    return _pack(episodes._replace(mask=episodes.mask * (position < ends[-1])), rows)
 
 
-def stored_steps(replay: Replay) -> Int[Scalar, ""]:
-    """Number of steps of the finished episodes that are still stored."""
-    last = end_of(replay, jnp.arange(len(replay.episodes)), replay.episodes - 1)
-    return jnp.sum(last - oldest_transition(replay))
-
-
-def sample_steps(key: PRNGKeyArray, length: Int[Array, "*episodes"], drawn: int) -> Int[Array, "*episodes {drawn}"]:
-    """K of the steps 0..T-1 of each episode, without replacement; if T < K, all of them and copies of the last one.
-
-    Floyd's algorithm (Bentley and Floyd, 1987): for j = T-K .. T-1 take a uniform t of 0..j, or j if t was taken before.
-    O(K^2) on K numbers, independent of T, for all the episodes at once.
-    """
-    uniform = jax.random.uniform(key, (drawn, *length.shape))
-
-    def take(chosen: Int[Array, "*episodes K"], turn: tuple[Int[Scalar, ""], Float[Array, "*episodes"]]):
-        i, u = turn
-        j = length - drawn + i
-        t = jnp.minimum(jnp.floor(u * (j + 1)).astype(jnp.int32), j)
-        t = jnp.where(jnp.any(chosen == t[..., None], axis=-1), j, t)
-        return chosen.at[..., i].set(t), None
-
-    nothing = jnp.full((*length.shape, drawn), -1, jnp.int32)
-    distinct, _ = jax.lax.scan(take, nothing, (jnp.arange(drawn), uniform))
-    whole = jnp.minimum(jnp.arange(drawn), length[..., None] - 1)
-    return jnp.where((length >= drawn)[..., None], distinct, whole)
+def _n_finished_steps(replay: Replay) -> Int[Scalar, ""]:
+    """Return the number of steps of the finished episodes that are stored."""
+    end = end_of_episode(replay, jnp.arange(len(replay.episodes)), replay.episodes - 1)
+    return jnp.sum(end - oldest_transition(replay))

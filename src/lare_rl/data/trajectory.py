@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from jaxtyping import Bool, Float
 
-from lare_rl.envs.interface import Numbers, Timestep
+from lare_rl.envs.interface import AnyArray, Timestep
 
 
 class Trajectory(NamedTuple):
@@ -13,16 +13,16 @@ class Trajectory(NamedTuple):
     `*lead` is the seeds' axis, or nothing within functions of one seed.
     """
 
-    before: Timestep
+    timestep: Timestep
     """What the environment showed before each action: [*lead time envs ...]."""
-    action: Float[Numbers, "*lead time envs agents action"]
+    action: Float[AnyArray, "*lead time envs agents action"]
     """The policy's action: in [-1, 1], or one-hot."""
-    taken: Float[Numbers, "*lead time envs agents action"]
+    env_action: Float[AnyArray, "*lead time envs agents action"]
     """The same action in the environment's units."""
-    after: Timestep
+    next_timestep: Timestep
     """What the environment showed after each action. At the end of an episode this is its final time step, not the next reset."""
 
     @property
-    def ended(self) -> Bool[Numbers, "*lead time envs"]:
+    def ended(self) -> Bool[AnyArray, "*lead time envs"]:
         """Whether the step was the last of its episode: terminated or truncated."""
-        return self.after.terminated | self.after.truncated
+        return self.next_timestep.terminated | self.next_timestep.truncated

@@ -1,4 +1,4 @@
-"""The episodic setting: the whole return of an episode is paid at its last step, and nothing before."""
+"""The episodic setting: the agent receives the return of an episode at its last step, and 0 before."""
 
 import math
 from collections.abc import Mapping
@@ -7,16 +7,18 @@ from typing import Any
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
-from lare_rl.errors import LareError, shortened
+from lare_rl.errors import LareError, short_repr
+
+__all__ = ["TRUE_REWARD", "EpisodicReward", "read_score"]
 
 TRUE_REWARD = "true_reward"
 """The key of `info` for the true reward of the step."""
 
 
 class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
-    """Pays 0 until the last step of an episode, and there the sum of all its rewards.
+    """Replaces the reward by 0 until the last step of an episode, and there by the sum of all its rewards.
 
-    The true reward of each step stays in `info["true_reward"]`. It must be the outermost wrapper that changes rewards
+    The true reward of each step stays in `info["true_reward"]`. This must be the outermost wrapper that changes rewards
     or ends episodes.
 
     >>> environment = EpisodicReward(gymnasium.make("Reacher-v5"))
@@ -32,29 +34,29 @@ class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
 
         Args:
             env: the environment.
-            score: a key of the last step's `info` that holds the score of the episode, which is paid instead of the sum.
+            score: a key of the last step's `info` with the score of the episode, which replaces the sum of rewards.
         """
         RecordConstructorArgs.__init__(self, score=score)
         gymnasium.Wrapper.__init__(self, env)
         self.score = score
-        self.so_far = 0.0
+        self._return = 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self.so_far = 0.0
+        self._return = 0.0
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One step. Raises `LareError` if a score must be paid, and the last step's `info` has none."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self.so_far += float(reward)
-        paid = 0.0
+        """Make one step. Raises `LareError` if the last step's `info` has no score."""
+        observation, true_reward, terminated, truncated, info = self.env.step(action)
+        self._return += float(true_reward)
+        reward = 0.0
         if terminated or truncated:
-            paid = self.so_far if self.score is None else score_in(info, self.score)
-        return observation, paid, terminated, truncated, {**info, TRUE_REWARD: float(reward)}
+            reward = self._return if self.score is None else read_score(info, self.score)
+        return observation, reward, terminated, truncated, {**info, TRUE_REWARD: float(true_reward)}
 
 
-def score_in(info: Mapping[str, Any], key: str) -> float:
-    """The score of an episode, from the `info` of its last step.
+def read_score(info: Mapping[str, Any], key: str) -> float:
+    """Return the score of an episode from the `info` of its last step.
 
     Raises:
         LareError: it is missing or is not a finite number.
@@ -64,7 +66,7 @@ def score_in(info: Mapping[str, Any], key: str) -> float:
     try:
         score = float(info[key])
     except (TypeError, ValueError):
-        raise LareError(f"info[{key!r}] of the last step is {shortened(info[key])}, which is not a number") from None
+        raise LareError(f"info[{key!r}] of the last step is {short_repr(info[key])}, which is not a number") from None
     if not math.isfinite(score):
-        raise LareError(f"info[{key!r}] of the last step is {score}: a score must be finite")
+        raise LareError(f"info[{key!r}] of the last step is {score}, which is not finite")
     return score

@@ -1,104 +1,97 @@
-"""The table of families, which maps the name of a task's environment to the environment.
+"""Families of environments: they map the environment's name in a task to the environment.
 
-The part before the first slash is the family's name; all other names belong to Gymnasium. A new family is one module with a
-class that is a `JaxEnv` or a `HostEnv`, and one row here, which lists the keys of a task that the family reads.
+The part of the name before the first slash is the family. All names without a registered family belong to Gymnasium.
 """
 
 import functools
+import importlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from lare_rl.envs.interface import EnvSpec, HostEnv, JaxEnv
 from lare_rl.errors import LareError
-from lare_rl.tasks.spec import NO_ENVIRONMENT, OF_THE_ENVIRONMENT, TaskSpec
+from lare_rl.tasks.spec import NO_ENVIRONMENT, SHARED_KEYS, TaskSpec
+from lare_rl.util.plugins import Registry
 
-NOT_FOR_ALL = ("max_episode_steps", "arguments", "agents")
-"""Keys of a task that only some families read. The other families refuse them, because ignoring them would mislead the user."""
+__all__ = [
+    "FAMILIES",
+    "Family",
+    "check_logs",
+    "find_score",
+    "load_env_spec",
+    "make_env",
+    "make_host_env",
+    "register_family",
+]
+
+Maker = Callable[..., JaxEnv | HostEnv]
+
+OPTIONAL_KEYS = ("max_episode_steps", "arguments", "agents")
+"""Keys of a task that only some families read. Other families refuse them, because ignoring them would mislead the user."""
 
 
 class Family(NamedTuple):
-    """A row of the table."""
+    """A family of environments."""
 
-    make: Callable[..., JaxEnv | HostEnv]
-    """Makes the environment of a task."""
+    maker: Maker | str
+    """The function that makes the environment of a task, or its location, MODULE:ATTRIBUTE, which is imported when needed."""
     reads: tuple[str, ...] = ()
-    """Which of `NOT_FOR_ALL` this family reads."""
+    """The keys of `OPTIONAL_KEYS` that the family reads."""
     score: str | None = None
-    """Whether the score of all its tasks is a sum or an average over the steps, if that is known."""
+    """Whether the return of all tasks of the family is a "sum" or an "average" over the steps, if known."""
 
 
-def particles(task: TaskSpec, **_: Any) -> JaxEnv:
-    from lare_rl.envs.particles.particle_env import ParticleJaxEnv
-
-    return ParticleJaxEnv(task.environment_name)
-
-
-def gymnasium(task: TaskSpec, **kwargs: Any) -> HostEnv:
-    from lare_rl.envs.gymnasium_env import GymnasiumEnv
-
-    return GymnasiumEnv(task, **kwargs)
+FAMILIES = Registry[Family]("family of environments")
+_GYMNASIUM = Family("lare_rl.envs.gymnasium_env:GymnasiumEnv", reads=("max_episode_steps",))
+_LOGS_ONLY = Family("lare_rl.envs.families:_refuse_to_make", reads=("max_episode_steps",))
 
 
-def smax(task: TaskSpec, **_: Any) -> JaxEnv:
-    from lare_rl.envs.smax.smax_env import SMAX
+def register_family(name: str, maker: Maker | str, *, reads: tuple[str, ...] = (), score: str | None = None) -> None:
+    """Add a family of environments: a task with `environment = "NAME/..."` then uses its maker.
 
-    return SMAX(task.environment_name)
+    Args:
+        name: the part of the environment's name before the first slash.
+        maker: a function or class that is called with the `TaskSpec`, and with `render_mode="rgb_array"` for films. It returns a
+            `JaxEnv` or a `HostEnv`. The text "MODULE:ATTRIBUTE" is imported when the first environment is made.
+        reads: the keys among "max_episode_steps", "arguments" and "agents" that the maker reads. Tasks with the others are refused.
+        score: "sum" or "average" if the returns of all tasks of the family are sums or averages over the steps.
 
-
-def smac(task: TaskSpec, **_: Any) -> HostEnv:
-    from lare_rl.envs.starcraft import StarCraft
-
-    return StarCraft(task.environment_name)
-
-
-def pettingzoo(task: TaskSpec, **kwargs: Any) -> HostEnv:
-    from lare_rl.envs.pettingzoo_env import make
-
-    return make(task, **kwargs)
+    Raises:
+        LareError: another family has this name.
+    """
+    FAMILIES.register(name, Family(maker, tuple(reads), score))
 
 
-FAMILIES = {
-    "particles": Family(particles),
-    "smax": Family(smax, score="sum"),
-    "smac": Family(smac, score="sum"),
-    "pettingzoo": Family(pettingzoo, reads=("max_episode_steps", "arguments", "agents")),
-}
+register_family("particles", "lare_rl.envs.particles.particle_env:make")
+register_family("smax", "lare_rl.envs.smax.smax_env:make", score="sum")
+register_family("smac", "lare_rl.envs.starcraft:make", score="sum")
+register_family("pettingzoo", "lare_rl.envs.pettingzoo_env:make", reads=OPTIONAL_KEYS)
 
 
-def no_environment(task: TaskSpec, **_: Any) -> HostEnv:
-    raise LareError(
-        f"task {task.name!r} has no environment (environment = {NO_ENVIRONMENT!r}), so that nothing can be played or trained: "
-        "lare-rl relabel works on its logs; lare-rl design and lare-rl verify need them, by --data"
-    )
-
-
-LOGS = Family(no_environment, reads=("max_episode_steps",))
-"""The family of a task with logs only."""
-
-GYMNASIUM = Family(gymnasium, reads=("max_episode_steps",))
-"""The family of all other names."""
-
-
-def family_of(task: TaskSpec) -> Family:
-    return LOGS if task.environment == NO_ENVIRONMENT else FAMILIES.get(task.family, GYMNASIUM)
-
-
-def known_score(task: TaskSpec) -> str | None:
-    """`sum` or `average` over the steps of an episode, if the task or its family says so."""
-    return task.score or family_of(task).score
+def find_score(task: TaskSpec) -> str | None:
+    """Return "sum" or "average" (over the steps of an episode) if the task or its family says so."""
+    return task.score or _find_family(task).score
 
 
 def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
-    """A task's environment. `kwargs` are passed to the constructor of an environment on the host.
+    """Make a task's environment.
+
+    Args:
+        task: the task.
+        kwargs: arguments for the family's maker, such as `render_mode`.
 
     Raises:
         LareError: the environment cannot be made, or does not match the task.
     """
-    family = family_of(task)
-    check_keys(task, family)
-    env = family.make(task, **kwargs)
+    family = _find_family(task)
+    _check_keys(task, family)
+    maker = family.maker
+    if isinstance(maker, str):
+        module, _, attribute = maker.partition(":")
+        maker = getattr(importlib.import_module(module), attribute)
+    env = maker(task, **kwargs)
     try:
-        check(task, env.spec)
+        _check_spec(task, env.spec)
     except LareError:
         if isinstance(env, HostEnv):
             env.close()
@@ -106,14 +99,24 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
     return env
 
 
-def env_spec(task: TaskSpec) -> EnvSpec:
-    """Sizes and bounds of a task's environment, which is made once to read them. Raises `LareError` as `make_env` does."""
-    return known_spec(task.model_dump_json())
+def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
+    """Make a task's environment as a `HostEnv`, even if it is a `JaxEnv`. See `make_env`."""
+    env = make_env(task, **kwargs)
+    if isinstance(env, HostEnv):
+        return env
+    from lare_rl.envs.jax_on_host import JaxOnHost
+
+    return JaxOnHost(env)
+
+
+def load_env_spec(task: TaskSpec) -> EnvSpec:
+    """Return the sizes and bounds of a task's environment. It is made once to read them. Raises `LareError` like `make_env`."""
+    return _load_env_spec(task.model_dump_json())
 
 
 @functools.lru_cache(maxsize=64)
-def known_spec(task: str) -> EnvSpec:
-    env = make_env(TaskSpec.model_validate_json(task))
+def _load_env_spec(task_json: str) -> EnvSpec:
+    env = make_env(TaskSpec.model_validate_json(task_json))
     if isinstance(env, HostEnv):
         env.close()
     return env.spec
@@ -121,89 +124,83 @@ def known_spec(task: str) -> EnvSpec:
 
 def check_logs(task: TaskSpec) -> None:
     """Raise `LareError` if a task with logs only has keys that need an environment."""
-    check_keys(task, LOGS)
-    usual = {"teams": (), "team": None, "measures": (), "judged_from": "observation"}
-    for key, nothing in usual.items():
-        if getattr(task, key) != nothing:
-            raise LareError(f"task {task.name!r}: {key} makes no difference to logs: leave it out")
+    _check_keys(task, _LOGS_ONLY)
+    defaults = {"teams": (), "team": None, "measures": (), "judged_from": "observation"}
+    for key, default in defaults.items():
+        if getattr(task, key) != default:
+            raise LareError(f"task {task.name!r}: {key} has no effect on logs. Remove it.")
 
 
-def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
-    """A task's environment as a `HostEnv`, even if it is a `JaxEnv`."""
-    env = make_env(task, **kwargs)
-    if isinstance(env, HostEnv):
-        return env
-    from lare_rl.envs.jax_on_host import OnHost
-
-    return OnHost(env)
+def _find_family(task: TaskSpec) -> Family:
+    if task.environment == NO_ENVIRONMENT:
+        return _LOGS_ONLY
+    return FAMILIES.get(task.family, _GYMNASIUM) if task.family else _GYMNASIUM
 
 
-def check_keys(task: TaskSpec, family: Family) -> None:
+def _refuse_to_make(task: TaskSpec, **_: Any) -> HostEnv:
+    raise LareError(
+        f"task {task.name!r} has no environment (environment = {NO_ENVIRONMENT!r}), so nothing can be trained. "
+        "Use lare-rl relabel with its logs, or lare-rl design and lare-rl verify with --data."
+    )
+
+
+def _check_keys(task: TaskSpec, family: Family) -> None:
     """Raise `LareError` at the first key that would be ignored."""
     for role in (task, *task.teams):
-        for key in NOT_FOR_ALL:
+        for key in OPTIONAL_KEYS:
             if getattr(role, key) and key not in family.reads:
-                own = "" if family is not GYMNASIUM or key != "arguments" else ", and give kwargs where you register it"
-                raise LareError(
-                    f"task {role.name!r}: {key} makes no difference to {task.environment}: leave it out{own}"
-                )
+                advice = "Remove it."
+                if family is _GYMNASIUM and key == "arguments":
+                    advice = "Remove it, and pass kwargs to gymnasium.register."
+                raise LareError(f"task {role.name!r}: {key} has no effect on {task.environment}. {advice}")
     if not task.teams:
         return
     for key in ("agents", "team"):
         if getattr(task, key):
-            raise LareError(
-                f"task {task.name!r}: {key} makes no difference to a task with teams: set it in the spec of a team"
-            )
+            raise LareError(f"task {task.name!r}: {key} has no effect on a task with teams. Set it in a team's file.")
     for role in task.teams:
         if role.teams:
-            raise LareError(f"task {role.name!r} is a team of {task.name!r} and cannot have teams: leave them out")
+            raise LareError(f"task {role.name!r} is a team of {task.name!r} and cannot have teams. Remove them.")
 
 
-def check(task: TaskSpec, spec: EnvSpec) -> None:
-    """Raise `LareError` at the first mismatch between an environment and a task."""
-    names = [team.name for team in spec.teams]
+def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
+    """Raise `LareError` at the first mismatch between a task and its environment."""
+
+    def fail(role: TaskSpec, mismatch: str) -> LareError:
+        return LareError(f"task {role.name!r}: {mismatch}")
+
+    env, names = task.environment, [team.name for team in spec.teams]
     if task.teams and [role.team for role in task.teams] != names:
-        raise LareError(f"the teams of {task.environment} must be {', '.join(names)}, in this order")
+        raise LareError(f"the teams of {env} must be {', '.join(names)}, in this order")
     if len(names) > 1 and not task.teams and task.team is None:
         raise LareError(
-            f"{task.environment} has the teams {', '.join(names)}: name a spec for each of them, in this order"
+            f"{env} has the teams {', '.join(names)}. Write a task file for each of them, and list them as teams."
         )
     for role in task.teams:
-        for key in OF_THE_ENVIRONMENT:  # training reads only the task's keys, verification only the team's
-            own, whole = getattr(role, key), getattr(task, key)
-            if own != whole:
-                raise LareError(
-                    f"task {role.name!r}: {key} = {own!r}, but {task.name!r}, of which it is a team, has {whole!r}: "
-                    "say the same in both"
+        for key in SHARED_KEYS:  # training reads only the task's keys, verification only the team's
+            team_value, task_value = getattr(role, key), getattr(task, key)
+            if team_value != task_value:
+                raise fail(
+                    role, f"{key} = {team_value!r}, but {task_value!r} in {task.name!r}. Use the same value in both."
                 )
     if not task.teams and task.team not in (None, *names):
-        raise LareError(
-            f"task {task.name!r}: team = {task.team!r}, but {task.environment} has no such team, only {', '.join(names)}"
-        )
+        raise fail(task, f"team = {task.team!r}, but the teams of {env} are {', '.join(names)}")
     if task.max_episode_steps not in (None, spec.max_steps):
-        raise LareError(
-            f"task {task.name!r}: max_episode_steps = {task.max_episode_steps}, but an episode of {task.environment} takes "
-            f"{spec.max_steps} steps: leave it out"
-        )
+        raise fail(task, f"max_episode_steps = {task.max_episode_steps}, but {spec.max_steps} in {env}. Remove it.")
     for name in task.measures:
         if name not in spec.measures:
-            raise LareError(f"task {task.name!r}: {task.environment} does not measure {name!r}")
-    of_state = task.judged_from == "state"
-    if of_state and not spec.state_size:
-        raise LareError(f"task {task.name!r}: judged_from = 'state', but {task.environment} has no global state")
+            raise fail(task, f"{env} has no measure {name!r}")
+    from_state = task.judged_from == "state"
+    if from_state and not spec.state_size:
+        raise fail(task, f"judged_from = 'state', but {env} has no global state")
     for role in task.roles:
         team = spec.teams[names.index(role.team)] if role.team in names else spec.teams[0]
-        if of_state:
-            sizes = (
-                ("observation_size", "states", spec.state_size),
-                ("action_size", "joint actions", spec.action_size * team.size),
-            )
-        else:
-            sizes = (
-                ("observation_size", "observations", spec.observation_size),
-                ("action_size", "actions", spec.action_size),
-            )
-        for key, what, size in sizes:
-            said = getattr(role, key)
-            if said != size:
-                raise LareError(f"task {role.name!r}: {key} = {said}, but {task.environment} has {what} of size {size}")
+        sizes = {
+            "observation_size": ("states", spec.state_size) if from_state else ("observations", spec.observation_size),
+            "action_size": ("joint actions", spec.action_size * team.n_agents)
+            if from_state
+            else ("actions", spec.action_size),
+        }
+        for key, (content, size) in sizes.items():
+            if getattr(role, key) != size:
+                raise fail(role, f"{key} = {getattr(role, key)}, but {env} has {content} of size {size}")

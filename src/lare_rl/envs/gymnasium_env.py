@@ -1,106 +1,135 @@
 """Gymnasium environments: one team of one agent, on the host."""
 
+import os
+import warnings
 from typing import Any
 
+import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
 from jaxtyping import Float
 
-from lare_rl.envs.guarded_gymnasium import EnvironmentFault, limit_of, make, measured
+from lare_rl.envs import mujoco_rewards
+from lare_rl.envs.env_errors import EnvOutputError, one_line_errors, read_measure, to_float
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
-from lare_rl.envs.spaces import OneHot
-from lare_rl.errors import LareError, shortened
+from lare_rl.envs.spaces import OneHot, check_spaces, finite_array, flatten_spaces
+from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
+
+__all__ = ["GymnasiumEnv", "make_gymnasium"]
+
+mujoco_rewards.register()
+
+
+def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: Any) -> gymnasium.Env:
+    """Make an environment with flat observations and actions. See `gymnasium.make` for the arguments.
+
+    Raises:
+        LareError: the environment cannot be made, or its spaces cannot be flattened.
+    """
+
+    def make_hint(error: BaseException) -> str:
+        if isinstance(error, AttributeError) and (library := os.environ.get("MUJOCO_GL")):
+            return f" (is MUJOCO_GL={library} installed?)"
+        if isinstance(error, gymnasium.error.NameNotFound) and ":" not in name:
+            return f" (for an environment of your own, write MODULE:{name}, where MODULE registers it)"
+        if isinstance(error, ModuleNotFoundError):
+            return " (a module in this folder is found with PYTHONPATH=.)"
+        if "render_mode" in kwargs and "render_mode" in str(error):
+            return ' (to be filmed, it must accept render_mode="rgb_array")'
+        return ""
+
+    with warnings.catch_warnings(), one_line_errors(f"environment {name!r} cannot be made", make_hint):
+        # The user chooses the version: scores of v4 and v5 cannot be compared.
+        warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
+        warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
+        env = gymnasium.make(name, max_episode_steps=max_episode_steps, **kwargs)
+        try:
+            check_spaces(name, env.observation_space, env.action_space)
+            if len(env.action_space.shape or ()) > 1:
+                raise LareError(f"the action space of {name} is {env.action_space}, not a Box with one axis")
+            return flatten_spaces(env)
+        except Exception:
+            env.close()
+            raise
 
 
 class GymnasiumEnv:
-    """A Gymnasium environment as a `HostEnv`. All values that the environment returns are checked.
-
-    Raises:
-        LareError: the environment does not match the task, or has no time limit.
-    """
+    """A Gymnasium environment as a `HostEnv`. All values that the environment returns are checked."""
 
     def __init__(self, task: TaskSpec, **kwargs: Any):
-        self.environment = make(task.environment, task.max_episode_steps, **kwargs)
-        try:
-            self.spec = spec_of(task, self.environment.observation_space, self.environment.action_space)
-        except LareError:
+        """Make the environment of a task.
+
+        Args:
+            task: the task.
+            kwargs: arguments of `gymnasium.make`.
+
+        Raises:
+            LareError: the environment cannot be made, or has no time limit.
+        """
+        self._name = task.environment
+        self.environment = make_gymnasium(task.environment, task.max_episode_steps, **kwargs)
+        if not (self.environment.spec and self.environment.spec.max_episode_steps):
             self.close()
-            raise
-        one = np.ones((1, self.spec.action_size), bool), np.ones(1, bool)
-        self.around = {"state": np.zeros(0, np.float32), "available": one[0], "alive": one[1]}
+            raise LareError(
+                f"task {task.name!r}: {task.environment} has no time limit, so an episode may never end. "
+                "Set max_episode_steps in the task file, to the length of its longest episode or more."
+            )
+        observation_space, action_space = self.environment.observation_space, self.environment.action_space
+        dtype = np.result_type(action_space.dtype or np.float32, np.float32)  # bounds stay as precise as they are
+        self.spec = EnvSpec(
+            teams=(Team("agent", 0, 1),),
+            observation_size=observation_space.shape[0],  # type: ignore[index]
+            action_size=action_space.shape[0],  # type: ignore[index]
+            discrete=isinstance(action_space, OneHot),
+            max_steps=self.environment.spec.max_episode_steps,
+            low=action_space.low[None].astype(dtype),  # type: ignore[attr-defined]
+            high=action_space.high[None].astype(dtype),  # type: ignore[attr-defined]
+            measures=task.measures,
+        )
 
     def reset(self, seed: int) -> Timestep:
-        """The first step of an episode."""
-        observation, _ = self.environment.reset(seed=seed)
-        return self.timestep(observation, 0.0, False, False, {})
+        """Start an episode."""
+        with one_line_errors(f"environment {self._name!r} failed in reset"):
+            observation, info = self.environment.reset(seed=seed)
+        return self._make_timestep(observation, 0.0, False, False, info)
 
     def step(self, action: Float[np.ndarray, "1 action"]) -> Timestep:
-        """One step."""
-        return self.timestep(*self.environment.step(action[0]))
+        """Make one step."""
+        with one_line_errors(f"environment {self._name!r} failed in step"):
+            observation, reward, terminated, truncated, info = self.environment.step(action[0])
+            terminated, truncated = bool(terminated), bool(truncated)  # fails for arrays with several elements
+        return self._make_timestep(observation, reward, terminated, truncated, info)
 
-    def timestep(self, observation: Any, reward: Any, terminated: Any, truncated: Any, info: dict) -> Timestep:
-        """Check the values that the environment returned, and convert them."""
-        row = checked(observation, "observation", self.environment.observation_space.shape)
-        paid = checked(reward, "reward", ())
-        names = self.spec.measures
-        at_the_end = bool(terminated or truncated)
-        found = {name: np.float32(measured(info, name) if at_the_end else 0) for name in names}
+    def _make_timestep(self, observation: Any, reward: Any, terminated: bool, truncated: bool, info: Any) -> Timestep:
+        if not isinstance(info, dict):
+            raise LareError(
+                f"environment {self._name!r} returned the info {short_repr(info)}, which is not a dictionary"
+            )
+        name = "observation"
+        try:
+            observation = finite_array(observation, (self.spec.observation_size,))
+            name = "reward"
+            reward = finite_array(to_float(reward))
+        except ValueError as error:
+            raise EnvOutputError(f"environment {self._name!r}: the {name} {error}") from None
+        last = terminated or truncated
         return Timestep(
-            observation=row[None],
-            reward=paid[None],
+            observation=observation[None],
+            state=np.zeros(0, np.float32),
+            available=np.ones((1, self.spec.action_size), bool),
+            alive=np.ones(1, bool),
+            reward=reward[None],
             terminated=np.bool_(terminated),
             truncated=np.bool_(truncated),
-            measures=found,
-            **self.around,
+            measures={key: np.float32(read_measure([info], key) if last else 0) for key in self.spec.measures},
         )
 
     def render(self) -> Any:
-        """The environment as pixels."""
-        return self.environment.render()
+        """Return the environment's picture."""
+        with one_line_errors(f"environment {self._name!r} failed in render"):
+            return self.environment.render()
 
     def close(self) -> None:
         """Close the environment."""
-        self.environment.close()
-
-
-def spec_of(task: TaskSpec, observations: Any, actions: Any) -> EnvSpec:
-    """Sizes and bounds of the environment. Raises `LareError` if the spaces or the time limit cannot be used."""
-    for key, space in (("observation", observations), ("action", actions)):
-        if not isinstance(space, Box) or len(space.shape) != 1:
-            raise LareError(
-                f"task {task.name!r}: the {key} space of {task.environment} is {space}, not a Box of one axis"
-            )
-    if not actions.is_bounded():
-        raise LareError(f"task {task.name!r}: the actions of {task.environment} have no bounds: {actions}")
-    limit = task.max_episode_steps or limit_of(task.environment)
-    if limit is None:
-        raise LareError(
-            f"task {task.name!r}: {task.environment} has no time limit, so an episode may never pay; "
-            "set max_episode_steps in the task file, to the length of its longest episode or more"
-        )
-    precise = np.result_type(actions.dtype, np.float32)
-    return EnvSpec(
-        teams=(Team("agent", 0, 1),),
-        observation_size=observations.shape[0],
-        action_size=actions.shape[0],
-        discrete=isinstance(actions, OneHot),
-        max_steps=limit,
-        low=actions.low[None].astype(precise),
-        high=actions.high[None].astype(precise),
-        measures=task.measures,
-    )
-
-
-def checked(value: object, what: str, shape: tuple[int, ...] | None) -> np.ndarray:
-    """A value from the environment, copied to an array. Raises `EnvironmentFault` if it cannot be used for training."""
-    try:
-        with np.errstate(over="ignore"):  # infinity is refused below
-            array = np.array(value, np.float32)  # a copy: the environment may write the next one into the same memory
-    except (TypeError, ValueError, OverflowError):
-        raise EnvironmentFault(f"the environment gave {shortened(value)} for its {what}") from None
-    if array.shape != shape:
-        raise EnvironmentFault(f"the environment gave its {what} in shape {array.shape}, not {shape}")
-    if not np.isfinite(array).all():
-        raise EnvironmentFault(f"the environment gave {array[~np.isfinite(array)][0]} in its {what}")
-    return array
+        with one_line_errors(f"environment {self._name!r} failed in close"):
+            self.environment.close()

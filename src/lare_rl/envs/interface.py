@@ -1,7 +1,7 @@
-"""The interface of environments in this package: any number of agents in teams, in JAX or on the host.
+"""The interface of environments: any number of agents in teams, in JAX or on the host.
 
-A Gymnasium environment has one team of one agent. Every array of a step has an axis for the agents, even for a single agent.
-A family of environments is one module that makes a `JaxEnv` or a `HostEnv` from a task (see `table.py`).
+A Gymnasium environment has one team of one agent. Arrays always have an axis of agents, even for a single agent. An environment is
+a `JaxEnv` or a `HostEnv`; `families.py` maps the name of a task's environment to it.
 """
 
 from dataclasses import dataclass, field
@@ -10,8 +10,10 @@ from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-Numbers = Any
-"""JAX arrays in compiled code, NumPy arrays on the host. The type is `Any`, so that this module need not import JAX."""
+__all__ = ["AnyArray", "EnvSpec", "HostEnv", "JaxEnv", "Team", "Timestep", "alive_mean", "team_mean", "to_env_action"]
+
+AnyArray = Any
+"""A JAX array in compiled code, a NumPy array on the host. The type is `Any`, so that this module need not import JAX."""
 
 
 @dataclass(frozen=True)
@@ -23,98 +25,99 @@ class Team:
     stop: int
 
     @property
-    def size(self) -> int:
+    def n_agents(self) -> int:
         return self.stop - self.start
 
     @property
     def agents(self) -> slice:
-        """The team's places on the agents' axis."""
+        """The team's slice of an axis of agents."""
         return slice(self.start, self.stop)
 
 
 @dataclass(frozen=True, eq=False)
 class EnvSpec:
-    """The sizes and bounds that training needs before the first step of an environment."""
+    """The sizes and bounds of an environment, which training needs before the first step."""
 
     teams: tuple[Team, ...]
     """The teams of all agents, in order."""
     observation_size: int
     """The size of each agent's observation. Shorter observations are padded with zeros."""
     action_size: int
-    """The size of a continuous action, or the number of choices."""
+    """The size of a continuous action, or the number of discrete actions."""
     discrete: bool
-    """Whether an action is a choice, encoded one-hot."""
+    """Whether actions are discrete. They are encoded one-hot."""
     max_steps: int
-    """The most steps that an episode can have."""
+    """The maximum length of an episode."""
     state_size: int = 0
-    """The size of the global state; 0 if there is none."""
+    """The size of the global state; 0 for an environment without a state."""
     low: Float[np.ndarray, "agents action"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     high: Float[np.ndarray, "agents action"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """The bounds of continuous actions, in the environment's units. Empty for discrete actions."""
     fixed_length: bool = False
-    """Whether every episode has `max_steps` steps and no agent leaves before the end."""
+    """Whether all episodes have `max_steps` steps and no agent leaves before the end."""
     agents_leave: bool = False
     """Whether an agent may leave before the episode ends."""
     masks_actions: bool = False
     """Whether an action may be unavailable at a step."""
-    in_jax: bool = False
-    """Whether it is a `JaxEnv`, of which many copies are cheap."""
+    is_jax: bool = False
+    """Whether the environment is a `JaxEnv`. Many copies of it are cheap."""
     measures: tuple[str, ...] = ()
-    """The names of the values of an episode's last step that are reported in addition to the return."""
+    """The names of values at an episode's last step that are reported in addition to the return."""
 
     @property
-    def agents(self) -> int:
+    def n_agents(self) -> int:
         return self.teams[-1].stop
 
 
 class Timestep(NamedTuple):
     """The result of `reset` or `step`. `*batch` is empty for a single environment."""
 
-    observation: Float[Numbers, "*batch agents observation"]
-    """An agent that has left observes zeros."""
-    state: Float[Numbers, "*batch state"]
-    available: Bool[Numbers, "*batch agents action"]
-    """The available choices of each agent: at least one, even for an agent that has left. All true for continuous actions."""
-    alive: Bool[Numbers, "*batch agents"]
+    observation: Float[AnyArray, "*batch agents observation"]
+    """Agents that have left observe zeros."""
+    state: Float[AnyArray, "*batch state"]
+    available: Bool[AnyArray, "*batch agents action"]
+    """The available actions of each agent: at least one, even for an agent that has left. All true for continuous actions."""
+    alive: Bool[AnyArray, "*batch agents"]
     """Which agents act now."""
-    reward: Float[Numbers, "*batch agents"]
-    """The reward of this step for each agent that was alive before it; 0 for other agents, and after `reset`."""
-    terminated: Bool[Numbers, "*batch"]
+    reward: Float[AnyArray, "*batch agents"]
+    """The rewards of this step. Agents that were not alive before it receive 0, and so do all agents after `reset`."""
+    terminated: Bool[AnyArray, "*batch"]
     """Whether the episode has ended in a terminal state."""
-    truncated: Bool[Numbers, "*batch"]
-    """Whether the time limit is reached."""
-    measures: dict[str, Float[Numbers, "*batch"]]
-    """Values by the names of `EnvSpec.measures`. They are only valid at the last step of an episode."""
+    truncated: Bool[AnyArray, "*batch"]
+    """Whether the episode has reached its time limit."""
+    measures: dict[str, Float[AnyArray, "*batch"]]
+    """Values by the names of `EnvSpec.measures`. They are valid only at the last step of an episode."""
 
 
 def team_mean(
-    values: Float[Numbers, "*batch agents"], alive: Bool[Numbers, "*batch agents"], team: Team
-) -> Float[Numbers, "*batch"]:
-    """The mean over a team's agents that are alive; 0 if none is.
+    values: Float[AnyArray, "*batch agents"], alive: Bool[AnyArray, "*batch agents"], team: Team
+) -> Float[AnyArray, "*batch"]:
+    """Return the mean over a team's agents that are alive, or 0 without such agents.
 
-    This function alone defines the reward of a team for a step. The team's return R is the sum of these rewards over the episode.
+    This mean of rewards is the reward of a team for a step. The team's return R is the sum of these rewards over the episode.
     """
     return alive_mean(values[..., team.agents], alive[..., team.agents])
 
 
 def alive_mean(
-    values: Float[Numbers, "*batch agents"], alive: Bool[Numbers, "*batch agents"]
-) -> Float[Numbers, "*batch"]:
-    """The mean over the agents that are alive; 0 if none is."""
-    return (values * alive).sum(axis=-1) / array_module(values).maximum(alive.sum(axis=-1), 1)
+    values: Float[AnyArray, "*batch agents"], alive: Bool[AnyArray, "*batch agents"]
+) -> Float[AnyArray, "*batch"]:
+    """Return the mean over the agents that are alive, or 0 without such agents."""
+    return (values * alive).sum(axis=-1) / _array_module(values).maximum(alive.sum(axis=-1), 1)
 
 
-def env_action(action: Float[Numbers, "*batch agents action"], spec: EnvSpec) -> Float[Numbers, "*batch agents action"]:
-    """Scale a continuous action from [-1, 1], after clipping, to the environment's units. Encode a discrete one by its argmax."""
-    numpy = array_module(action)
+def to_env_action(
+    action: Float[AnyArray, "*batch agents action"], spec: EnvSpec
+) -> Float[AnyArray, "*batch agents action"]:
+    """Clip a continuous action to [-1, 1] and scale it to the environment's units. Encode a discrete action by its argmax."""
+    xp = _array_module(action)
     if spec.discrete:
-        return numpy.eye(spec.action_size, dtype=np.float32)[numpy.argmax(action, axis=-1)]
-    scaled = spec.low + (numpy.clip(action, -1, 1) + 1) / 2 * (spec.high - spec.low)
-    return numpy.clip(scaled, spec.low, spec.high)  # rounding may exceed the bounds
+        return xp.eye(spec.action_size, dtype=np.float32)[xp.argmax(action, axis=-1)]
+    scaled = spec.low + (xp.clip(action, -1, 1) + 1) / 2 * (spec.high - spec.low)
+    return xp.clip(scaled, spec.low, spec.high)  # rounding may exceed the bounds
 
 
-def array_module(array: Any) -> Any:
-    """`numpy` for NumPy arrays, `jax.numpy` for others."""
+def _array_module(array: AnyArray) -> Any:
     if isinstance(array, np.ndarray):
         return np
     import jax.numpy
@@ -132,15 +135,15 @@ class JaxEnv(Protocol[State]):
     spec: EnvSpec
 
     def reset(self, key: Any) -> tuple[State, Timestep]:
-        """The first state and step of an episode."""
+        """Start an episode."""
         ...
 
-    def step(self, state: State, action: Float[Numbers, "agents action"], key: Any) -> tuple[State, Timestep]:
-        """One step. Continuous actions are in the environment's units; choices are rows with a single 1."""
+    def step(self, state: State, action: Float[AnyArray, "agents action"], key: Any) -> tuple[State, Timestep]:
+        """Make one step. Continuous actions are in the environment's units, discrete actions are one-hot."""
         ...
 
     def frames(self, states: State, credit: Float[np.ndarray, "steps agents"] | None = None) -> list[np.ndarray]:
-        """An episode's states (leading axis: steps) as pictures (height, width, 3), with each agent's credit if it is given."""
+        """Return an episode's states (leading axis: steps) as pictures (height, width, 3), with each agent's credit."""
         ...
 
 
@@ -151,15 +154,15 @@ class HostEnv(Protocol):
     spec: EnvSpec
 
     def reset(self, seed: int) -> Timestep:
-        """The first step of an episode: the same for the same seed."""
+        """Start an episode. The same seed gives the same episode."""
         ...
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        """One step. Continuous actions are in the environment's units; choices are rows with a single 1."""
+        """Make one step. Continuous actions are in the environment's units, discrete actions are one-hot."""
         ...
 
     def render(self) -> Any:
-        """The environment as pixels (height, width, 3)."""
+        """Return a picture of the environment (height, width, 3)."""
         ...
 
     def close(self) -> None:

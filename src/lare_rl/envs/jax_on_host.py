@@ -9,29 +9,33 @@ from jaxtyping import Float
 from lare_rl.envs.interface import JaxEnv, Timestep
 from lare_rl.errors import LareError
 
+__all__ = ["JaxOnHost"]
 
-class OnHost:
+
+class JaxOnHost:
     """A `JaxEnv` as a `HostEnv`."""
 
     def __init__(self, env: JaxEnv):
         self.env, self.spec = env, env.spec
-        self.begin, self.advance = jax.jit(env.reset), jax.jit(env.step)
+        self._reset, self._step = jax.jit(env.reset), jax.jit(env.step)
 
     def reset(self, seed: int) -> Timestep:
-        """The first step of an episode."""
-        key, self.key = jax.random.split(jax.random.key(seed))
-        self.state, timestep = self.begin(key)
+        """Start an episode."""
+        key, self._key = jax.random.split(jax.random.key(seed))
+        self._state, timestep = self._reset(key)
         return jax.tree.map(np.asarray, timestep)
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        """One step."""
-        self.key, key = jax.random.split(self.key)
-        self.state, timestep = self.advance(self.state, action, key)
+        """Make one step."""
+        self._key, key = jax.random.split(self._key)
+        self._state, timestep = self._step(self._state, action, key)
         return jax.tree.map(np.asarray, timestep)
 
     def render(self) -> Any:
-        """Not available: `JaxEnv.frames` draws such environments."""
-        raise LareError("an environment in JAX cannot be rendered step by step: its frames() draws whole episodes")
+        """Refuse: `JaxEnv.frames` draws such environments."""
+        raise LareError(
+            "an environment in JAX cannot be rendered step by step. Call its frames() on the states of an episode."
+        )
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """Do nothing."""

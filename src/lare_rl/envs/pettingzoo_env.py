@@ -1,29 +1,32 @@
 """A PettingZoo environment as a `HostEnv`: `pettingzoo/MODULE:NAME`, where NAME makes a ParallelEnv.
 
-All its output comes from foreign code, and is checked. A run must not learn from invalid values or wait for agents that have left.
+Agents and spaces are checked once. The values of each step are checked, so that a run never learns from invalid ones.
 """
 
 import contextlib
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lare_rl.envs import agent_arrays as rows_of
-from lare_rl.envs.agent_arrays import MASK, Agent
-from lare_rl.envs.guarded_gymnasium import fault, number
-from lare_rl.envs.interface import EnvSpec, Numbers, Timestep
-from lare_rl.envs.pettingzoo_construct import construct, limit_of
-from lare_rl.errors import LareError, shortened
+from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
+from lare_rl.envs.agent_teams import group_by_team
+from lare_rl.envs.env_errors import EnvOutputError, as_lare_error, one_line_errors, read_measure, to_float
+from lare_rl.envs.interface import EnvSpec, Timestep
+from lare_rl.envs.pettingzoo_construct import find_time_limit, make_parallel_env
+from lare_rl.envs.spaces import finite_array
+from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
+
+__all__ = ["ParallelHost", "make"]
 
 
 def make(task: TaskSpec, render_mode: str | None = None) -> "ParallelHost":
-    """The task's environment. Raises `LareError` if it cannot be made, or does not match the task."""
-    shown = {} if render_mode is None else {"render_mode": render_mode}
-    environment = construct(task.environment, task.arguments | shown)
+    """Make the task's environment. Raises `LareError` if it cannot be made, or does not match the task."""
+    kwargs = {} if render_mode is None else {"render_mode": render_mode}
+    environment = make_parallel_env(task.environment, task.arguments | kwargs)
     try:
         return ParallelHost(environment, task)
     except BaseException:
@@ -32,323 +35,249 @@ def make(task: TaskSpec, render_mode: str | None = None) -> "ParallelHost":
         raise
 
 
-class StateFault(LareError):
-    """An environment cannot return its state now."""
-
-
 class ParallelHost:
-    """A ParallelEnv whose agents have fixed places, no matter which of them act.
+    """A ParallelEnv as a `HostEnv`. Each agent has a fixed index, no matter which agents act.
 
     If an agent leaves while others stay, it observes zeros from then on. At an episode's last step no agent leaves: those that
-    acted still observe the result, because `phi` may judge the step by it.
+    acted still observe the result, because `phi` may read it.
     """
 
     spec: EnvSpec
 
     def __init__(self, environment: Any, task: TaskSpec):
-        self.environment, self.task, self.name = environment, task, task.environment
-        names = self.names()
-        spaces = {name: self.spaces(name) for name in names}
-        ordered, teams = rows_of.by_team(names, task)
-        try:
-            self.agents = [rows_of.agent(name, *spaces[name]) for name in ordered]
-            rows_of.check_alike(self.agents)
-        except LareError as error:
-            raise LareError(f"environment {self.name!r}: {error}") from None
-        self.declared = spaces
-        self.max_steps = task.max_episode_steps or limit_of(environment, task.arguments)
-        if self.max_steps is None:
+        """Prepare the environment, and reset it once.
+
+        Raises:
+            LareError: the agents, spaces or first observations cannot be used, or there is no time limit.
+        """
+        self.environment, self._task, self._name = environment, task, task.environment
+        names = list(environment.possible_agents or ())
+        if not names or len(set(names)) != len(names):
             raise LareError(
-                f"task {task.name!r}: {self.name} has no time limit, so an episode may never pay; "
-                "set max_episode_steps in the task file, to the length of its longest episode or more"
+                f"environment {self._name!r} has the possible agents {short_repr(names)}. Each needs a name."
             )
-        self.places = {one.name: place for place, one in enumerate(self.agents)}
-        self.width, self.numbered = rows_of.width(self.agents), rows_of.unlike(self.agents)
-        self.full = rows_of.choices(self.agents)
-        self.masks = any(one.masked for one in self.agents) or not self.full.all()
-        self.judged_from_state = any(role.judged_from == "state" for role in (task, *task.teams))
-        self.last_state: np.ndarray | None = None
-        self.told = False
-        self.looking, self.seed, self.steps = True, 0, 0
-        self.clear()
-        first = self.reset(0)  # needed to find out whether there is a state, and whether `info` has masks
-        self.looking = False
-        low, high = rows_of.bounds(self.agents)
+        names, teams = group_by_team(names, task)
+        try:
+            with one_line_errors("its spaces cannot be read"):
+                spaces = [(environment.observation_space(name), environment.action_space(name)) for name in names]
+            agents = [make_agent(name, *pair) for name, pair in zip(names, spaces, strict=True)]
+            self.layout = AgentArrays(agents)
+        except LareError as error:
+            raise LareError(f"environment {self._name!r}: {error}") from None
+        max_steps = task.max_episode_steps or find_time_limit(environment, task.arguments)
+        if max_steps is None:
+            raise LareError(
+                f"task {task.name!r}: {self._name} has no time limit, so an episode may never end. "
+                "Set max_episode_steps in the task file, to the length of its longest episode or more."
+            )
+        self._available = self.layout.available
+        self._masks_actions = any(agent.observes_mask for agent in agents) or not self._available.all()
+        self._credit_from_state = any(role.judged_from == "state" for role in (task, *task.teams))
+        self._state: np.ndarray | None = None
+        self._state_failed = False
+        self._alive = np.zeros(len(agents), bool)
+        self._initialising = True  # the first reset shows whether there is a state, and whether `info` has masks
+        first = self.reset(0)
+        self._initialising = False
+        low, high = self.layout.bounds
         self.spec = EnvSpec(
             teams=teams,
-            observation_size=self.width,
-            action_size=self.full.shape[1],
-            discrete=self.agents[0].discrete,
-            max_steps=self.max_steps,
+            observation_size=self.layout.observation_size,
+            action_size=self.layout.action_size,
+            discrete=self.layout.discrete,
+            max_steps=max_steps,
             state_size=first.state.shape[-1],
             low=low,
             high=high,
             agents_leave=True,  # no environment states that they do not
-            masks_actions=self.masks,
+            masks_actions=self._masks_actions,
             measures=task.measures,
         )
 
-    def clear(self) -> None:
-        self.alive = np.zeros(len(self.agents), bool)
-        self.present: set[Any] = set()
-        self.gone: set[Any] = set()
-        """The agents that have left. They must not come back."""
-
     def reset(self, seed: int) -> Timestep:
-        """The first step of an episode: the same for the same seed."""
-        self.seed, self.steps = int(seed), 0
-        self.clear()
-        if not self.looking:
-            self.check_unchanged()
-        observations, infos = self.parts(self.call("reset", seed=self.seed), ("observations", "infos"))
-        self.present = self.present_now()
-        if not self.present:
-            raise LareError(f"environment {self.name!r} has no agents {self.where}")
-        self.alive = np.array([one.name in self.present for one in self.agents])
-        return self.shown(observations, infos, self.alive, self.alive, np.zeros(len(self.agents), np.float32))
+        """Start an episode. The same seed gives the same episode."""
+        self._alive[:] = False
+        observations, infos = self._call("reset", 2, seed=int(seed))
+        self._steps = 0
+        self._present = self._read_present()
+        self._left = np.zeros_like(self._alive)
+        if not self._present.any():
+            raise EnvOutputError(f"environment {self._name!r} has no agents after reset")
+        self._alive = self._present.copy()
+        return self._make_timestep(observations, infos, np.zeros(len(self._alive)), self._alive, self._alive)
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        """One step. Continuous actions are in the environment's units; choices are rows with a single 1."""
-        if not self.alive.any():
-            raise LareError(f"environment {self.name!r} has no episode under way: reset it before step")
-        acted = [one for one, lives in zip(self.agents, self.alive, strict=True) if lives]
-        actions = {one.name: one.taken(action[self.places[one.name]]) for one in acted}
-        self.steps += 1
-        observations, rewards, terminations, truncations, infos = self.parts(
-            self.call("step", actions), ("observations", "rewards", "terminations", "truncations", "infos")
-        )
-        before, self.present = self.present, self.present_now()
-        self.gone |= before - self.present
-        for name in (self.present - before) & self.gone:
-            raise LareError(f"environment {self.name!r} brought back {name}, which had left, {self.where}")
-        reward = np.zeros(len(self.agents), np.float32)
-        for one in acted:
-            if one.name in self.present:  # an agent that has left may be missing everywhere
-                for what, values in (
-                    ("rewards", rewards),
-                    ("terminations", terminations),
-                    ("truncations", truncations),
-                ):
-                    self.need(one.name, what, values)
-            reward[self.places[one.name]] = self.paid(one.name, rewards.get(one.name, 0))
-        over = {name: self.flag(value, "termination", name) for name, value in terminations.items()}
-        cut = {name: self.flag(value, "truncation", name) for name, value in truncations.items()}
-        self.gone |= {name for name in self.present if over.get(name) or cut.get(name)}
-        stay = np.array([one.name in self.present and one.name not in self.gone for one in self.agents])
-        ended = not stay.any()
-        was_cut = ended and any(cut.get(one.name) and not over.get(one.name) for one in acted)
-        truncated = was_cut or (not ended and self.steps >= self.spec.max_steps)
-        shown = stay
+        """Make one step. Continuous actions are in the environment's units, discrete actions are one-hot."""
+        acted = self._alive
+        if not acted.any():
+            raise LareError(f"environment {self._name!r} has no running episode. Call reset before step.")
+        agents = self.layout.agents
+        actions = {agents[index].name: agents[index].decode_action(action[index]) for index in np.flatnonzero(acted)}
+        observations, rewards, terminations, truncations, infos = self._call("step", 5, actions)
+        self._steps += 1
+        was_present, self._present = self._present, self._read_present()
+        self._left |= was_present & ~self._present
+        for index in np.flatnonzero(self._present & ~was_present & self._left):
+            raise EnvOutputError(
+                f"environment {self._name!r}: {agents[index].name} is among its agents again after it left"
+            )
+
+        reward = np.zeros(len(agents))
+        terminated, truncated = np.zeros((2, len(agents)), bool)
+        for index, agent in enumerate(agents):
+            required = bool(acted[index] and self._present[index])  # values of an agent that has left may be missing
+            if acted[index]:
+                reward[index] = self._read("reward", rewards, agent, _to_reward, required)
+            terminated[index] = self._read("termination", terminations, agent, to_float, required)
+            truncated[index] = self._read("truncation", truncations, agent, to_float, required)
+        self._left |= self._present & (terminated | truncated)  # some environments still list such agents
+
+        alive = self._present & ~self._left
+        ended = not alive.any()
+        was_truncated = ended and bool((acted & truncated & ~terminated).any())
+        observes = alive
         if ended:
-            names = [one.name for one in acted if one.name in observations and not (was_cut and over.get(one.name))]
-            shown = np.array([one.name in names for one in self.agents])
-        terminated = ended and not was_cut
-        self.alive = stay & (not truncated)
-        return self.shown(observations, infos, shown, stay, reward, terminated, truncated)
+            observes = acted & [agent.name in observations for agent in agents] & ~(was_truncated & terminated)
+        reached_limit = not ended and self._steps >= self.spec.max_steps
+        self._alive = alive & (not reached_limit)
+        return self._make_timestep(
+            observations, infos, reward, observes, alive, ended and not was_truncated, was_truncated or reached_limit
+        )
 
     def render(self) -> Float[np.ndarray, "height width 3"] | Any:
-        """The environment as pixels (height, width, 3)."""
-        pixels = self.call("render")
+        """Return a picture of the environment (height, width, 3)."""
+        with one_line_errors(f"environment {self._name!r} failed in render"):
+            pixels = self.environment.render()
         if not isinstance(pixels, np.ndarray) or pixels.ndim != 3 or pixels.shape[2] != 3:
             raise LareError(
-                f"environment {self.name!r} renders {shortened(pixels)}, not pixels (height, width, 3): "
-                "does it support the render mode 'rgb_array'?"
+                f"environment {self._name!r} renders {short_repr(pixels)}, not pixels (height, width, 3). "
+                "It must support the render mode 'rgb_array'."
             )
         return pixels
 
     def close(self) -> None:
         """Release the resources of the environment."""
-        self.call("close")
+        with one_line_errors(f"environment {self._name!r} failed in close"):
+            self.environment.close()
 
-    @property
-    def where(self) -> str:
-        return f"{f'at step {self.steps}' if self.steps else 'at the start'} of the episode of seed {self.seed}"
-
-    def call(self, what: str, *arguments: Any, **options: Any) -> Any:
-        """Call a method of the environment. Whatever it raises becomes a `LareError` of one line."""
-        try:
-            return getattr(self.environment, what)(*arguments, **options)
-        except (Exception, SystemExit) as error:
-            raise fault(f"environment {self.name!r} failed in {what}", error) from error
-
-    def names(self) -> list[Any]:
-        names = list(getattr(self.environment, "possible_agents", None) or ())
-        if not names or len(set(names)) != len(names):
-            raise LareError(f"environment {self.name!r} has the possible agents {shortened(names)}: each needs a name")
-        return names
-
-    def spaces(self, name: Any) -> tuple[Any, Any]:
-        return self.call("observation_space", name), self.call("action_space", name)
-
-    def check_unchanged(self) -> None:
-        """Raise `LareError` if agents or spaces differ from those that training was set up for."""
-        if set(names := self.names()) != set(self.declared):
-            raise LareError(
-                f"environment {self.name!r} has changed its possible agents from "
-                f"{shortened(list(self.declared))} to {shortened(names)}"
+    def _call(self, method: str, n: int, *args: Any, **kwargs: Any) -> tuple[Mapping[Any, Any], ...]:
+        """Return the n dictionaries by agent that `reset` or `step` of the environment returns."""
+        with one_line_errors(f"environment {self._name!r} failed in {method}"):
+            values = getattr(self.environment, method)(*args, **kwargs)
+        if not (isinstance(values, tuple) and len(values) == n and all(isinstance(value, Mapping) for value in values)):
+            raise EnvOutputError(
+                f"environment {self._name!r} returned {short_repr(values)} from {method}, not {n} dictionaries by agent"
             )
-        for name, declared in self.declared.items():
-            for key, was, now in zip(("observation", "action"), declared, self.spaces(name), strict=True):
-                if was is not now and was != now:
-                    raise LareError(
-                        f"environment {self.name!r} has changed the {key} space of {name} "
-                        f"from {shortened(was)} to {shortened(now)}"
-                    )
+        return values
 
-    def parts(self, answer: Any, wanted: tuple[str, ...]) -> list[Mapping[Any, Any]]:
-        """Check what `reset` or `step` returned: one dictionary, by the agents' names, for each of `wanted`."""
-        if not isinstance(answer, tuple) or len(answer) != len(wanted):
-            raise LareError(
-                f"environment {self.name!r} returned {shortened(answer)} {self.where}, not {', '.join(wanted)}"
-            )
-        for what, values in zip(wanted, answer, strict=True):
-            if not isinstance(values, Mapping):
-                raise LareError(
-                    f"environment {self.name!r} returned {shortened(values)} for its {what} {self.where}, "
-                    "not a dictionary by agent"
-                )
-            self.known(values, f"its {what}")
-        return list(answer)
-
-    def present_now(self) -> set[Any]:
-        return set(self.known(getattr(self.environment, "agents", ()), "its agents"))
-
-    def known(self, names: Collection[Any], what: str) -> Collection[Any]:
+    def _read_present(self) -> Bool[np.ndarray, " agents"]:
+        """Return which agents the environment lists."""
+        names, index = self.environment.agents, self.layout.index
         for name in names:
-            if name not in self.places and not (what == "its infos" and name == "__common__"):
-                raise LareError(
-                    f"environment {self.name!r} has {name!r} among {what} {self.where}, "
-                    f"but its possible agents are {', '.join(map(str, self.places))}"
+            if name not in index:
+                raise EnvOutputError(
+                    f"environment {self._name!r} has the agent {name!r}, but its possible agents are {', '.join(map(str, index))}"
                 )
-        return names
+        return np.array([name in names for name in index])
 
-    def need(self, name: Any, what: str, values: Mapping[Any, Any]) -> Any:
-        # Not `name in values`: PettingZoo's own wrapper gives rewards as a defaultdict.
+    def _read(
+        self, name: str, values: Mapping[Any, Any], agent: Agent, convert: Callable[[Any], Any], required: bool
+    ) -> Any:
+        """Return an agent's value, converted; 0 if it is missing and not required."""
         try:
-            return values[name]
+            value = values[agent.name]  # not `in`: PettingZoo's own wrapper returns rewards as a defaultdict
         except KeyError:
-            raise LareError(
-                f"environment {self.name!r} gave no {what} for {name} {self.where}, although it is among its agents"
-            ) from None
+            if required:
+                raise EnvOutputError(f"environment {self._name!r} returned no {name} for {agent.name}") from None
+            return 0
+        return self._convert(name, agent, convert, value)
 
-    def paid(self, name: Any, value: Any) -> float:
-        reward = number(value, f"environment {self.name!r} gave {name} the reward")
-        if not np.isfinite(reward):
-            raise LareError(f"environment {self.name!r} gave {name} the reward {reward} {self.where}")
-        return reward
-
-    def flag(self, value: Any, what: str, name: Any) -> bool:
+    def _convert(self, name: str, agent: Agent, convert: Callable[..., Any], *values: Any) -> Any:
         try:
-            return bool(value)
-        except (TypeError, ValueError):
-            raise LareError(
-                f"environment {self.name!r} gave {shortened(value)} for the {what} of {name} {self.where}, which is not a truth "
-                "value"
-            ) from None
+            return convert(*values)
+        except ValueError as error:
+            raise EnvOutputError(f"environment {self._name!r}: the {name} of {agent.name} {error}") from None
 
-    def shown(
+    def _make_timestep(
         self,
         observations: Mapping[Any, Any],
         infos: Mapping[Any, Any],
-        alive: Bool[np.ndarray, " agents"],
-        acting: Bool[np.ndarray, " agents"],
         reward: Float[np.ndarray, " agents"],
+        observes: Bool[np.ndarray, " agents"],
+        acts: Bool[np.ndarray, " agents"],
         terminated: bool = False,
         truncated: bool = False,
     ) -> Timestep:
-        """A step. `acting` are the agents that can continue: at an episode's end, masks are ignored."""
-        seen: dict[int, np.ndarray] = {}
-        available = self.full.copy()
-        for place, one in enumerate(self.agents):
-            if alive[place]:
-                given = self.need(one.name, "observations", observations)
-                seen[place] = self.row(one, given)
-                if acting[place]:
-                    self.restrict(available[place], one, given, infos.get(one.name))
-            elif one.discrete:
-                available[place] = np.arange(len(available[place])) == 0
-        observation = rows_of.rows(self.agents, self.width, self.numbered, seen)
+        """Make a timestep. `observes`: agents that observe it. `acts`: agents that can continue, whose masks are read."""
+        vectors: dict[int, np.ndarray] = {}
+        available = self._available.copy()
+        for index, agent in enumerate(self.layout.agents):
+            if observes[index]:
+                vectors[index] = self._read("observation", observations, agent, agent.flatten_observation, True)
+                if acts[index]:
+                    observation, info = observations[agent.name], infos.get(agent.name)
+                    mask = self._convert("action mask", agent, agent.read_mask, observation, info)
+                    if mask is not None:
+                        available[index, : agent.action_size] = mask
+                        self._check_masks_are_known(agent)
+            elif self.layout.discrete:
+                available[index] = np.arange(self.layout.action_size) == 0
+        observation = self.layout.pad_observations(vectors)
+        last, reports = terminated or truncated, [info for info in infos.values() if isinstance(info, Mapping)]
         return Timestep(
             observation=observation,
-            state=self.state(observation),
+            state=self._read_state(observation),
             available=available,
-            alive=alive.copy(),
-            reward=reward,
+            alive=observes.copy(),
+            reward=reward.astype(np.float32),
             terminated=np.array(terminated),
             truncated=np.array(truncated),
-            measures=self.measures(infos, terminated or truncated),
+            measures={
+                name: np.array(read_measure(reports, name) if last else 0, np.float32) for name in self._task.measures
+            },
         )
 
-    def row(self, one: Agent, given: Any) -> Float[np.ndarray, " _"]:
-        try:
-            if one.masked and not (isinstance(given, Mapping) and {"observation", MASK} <= set(given)):
-                raise ValueError(f"must have the parts observation and {MASK}, but is {shortened(given)}")
-            return rows_of.flat(one.observation, given["observation"] if one.masked else given)
-        except ValueError as error:
-            raise LareError(f"environment {self.name!r}: the observation of {one.name} {self.where} {error}") from None
-
-    def restrict(self, available: Bool[np.ndarray, " action"], one: Agent, given: Any, info: Any) -> None:
-        """Apply the agent's mask, from the observation or from `info`, to `available`."""
-        told = given[MASK] if one.masked else info.get(MASK) if isinstance(info, Mapping) else None
-        if told is None:
-            return
-        try:
-            if not one.discrete:
-                raise ValueError(f"applies to {shortened(one.action)}, which is not discrete")
-            available[: one.action_size] = rows_of.mask(told, one.action_size)
-        except ValueError as error:
-            raise LareError(f"environment {self.name!r}: the action mask of {one.name} {self.where} {error}") from None
-        if self.looking:
-            self.masks = True
-        elif not self.masks:
-            raise LareError(
-                f"environment {self.name!r} gave {one.name} an action mask {self.where}, and had none at its first reset"
+    def _check_masks_are_known(self, agent: Agent) -> None:
+        if self._initialising:
+            self._masks_actions = True
+        elif not self._masks_actions:
+            raise EnvOutputError(
+                f"environment {self._name!r} returned an action mask for {agent.name}, but none at its first reset. "
+                "Return masks at every step."
             )
 
-    def state(self, observation: Float[np.ndarray, "agents observation"]) -> Float[np.ndarray, " state"]:
-        """The environment's own state. Without one, all observations if steps are judged by the state, else an empty array."""
-        if self.looking:
-            self.last_state = self.own_state()
-        elif self.last_state is not None:
-            try:
-                self.last_state = self.own_state(self.last_state.shape)
-            except StateFault as error:
-                self.stand_in(error)
-        if self.last_state is not None:
-            return self.last_state.ravel()
-        return observation.ravel() if self.judged_from_state else np.zeros(0, np.float32)
+    def _read_state(self, observation: Float[np.ndarray, "agents observation"]) -> Float[np.ndarray, " state"]:
+        """Return the environment's state.
 
-    def own_state(self, shape: tuple[int, ...] | None = None) -> Float[np.ndarray, "..."] | None:
+        Without one, return all observations if credit is assigned from the state, else an empty array.
+        """
+        if self._initialising or self._state is not None:
+            self._update_state()
+        if self._state is not None:
+            return self._state.ravel()
+        return observation.ravel() if self._credit_from_state else np.zeros(0, np.float32)
+
+    def _update_state(self) -> None:
         if not callable(getattr(self.environment, "state", None)):
-            return None
+            return
         try:
             value = self.environment.state()
         except (Exception, SystemExit) as error:
-            if self.looking and isinstance(error, NotImplementedError):
-                return None  # from PettingZoo's base class: the environment has no state
-            raise StateFault(str(fault(f"environment {self.name!r} failed in state {self.where}", error))) from error
+            if self._initialising and isinstance(error, NotImplementedError):
+                return  # from PettingZoo's base class: the environment has no state
+            error = as_lare_error(f"environment {self._name!r} failed in state", error)
+            if self._initialising or self._credit_from_state:
+                raise error from None
+            # Only a critic reads the state: keep the previous one. Multiwalker has no state once an agent has fallen.
+            if not self._state_failed:
+                logging.getLogger(__name__).warning("%s; the previous state is used instead", error)
+            self._state_failed = True
+            return
         try:
-            return rows_of.finite(value, shape)
+            self._state = finite_array(value, None if self._state is None else self._state.shape)
         except ValueError as error:
-            raise LareError(f"environment {self.name!r}: the state {self.where} {error}") from None
+            raise EnvOutputError(f"environment {self._name!r}: the state {error}") from None
 
-    def stand_in(self, error: "StateFault") -> None:
-        """Keep the previous state if only a critic needs it. Multiwalker, for example, has no state once an agent has fallen."""
-        if self.judged_from_state:
-            raise error
-        if not self.told:
-            logging.getLogger(__name__).warning("%s; the previous state is used instead", error)
-        self.told = True
 
-    def measures(self, infos: Mapping[Any, Any], last: bool) -> dict[str, Float[Numbers, ""]]:
-        """The measures of the last step: means over the agents whose `info` has them."""
-        return {name: np.array(self.measured(infos, name) if last else 0, np.float32) for name in self.task.measures}
-
-    def measured(self, infos: Mapping[Any, Any], name: str) -> float:
-        told = [info for info in infos.values() if isinstance(info, Mapping)]
-        values = [info[name] for info in told if name in info]
-        if not values:
-            keys = ", ".join(sorted({str(key) for info in told for key in info}))
-            raise LareError(f"the task measures {name!r}, but the last step's info has only {keys or 'nothing'}")
-        what = f"the task measures {name!r}, and the last step's info has"
-        return float(np.mean([number(value, what) for value in values]))
+def _to_reward(value: Any) -> float:
+    return float(finite_array(to_float(value)))

@@ -9,83 +9,97 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lare_rl.envs.families import make_host_env
-from lare_rl.envs.interface import EnvSpec, HostEnv, Team, Timestep, env_action, team_mean
-from lare_rl.tasks.spec import JudgedFrom, TaskSpec
+from lare_rl.envs.interface import EnvSpec, HostEnv, Team, Timestep, team_mean, to_env_action
+from lare_rl.tasks.spec import CreditScope, TaskSpec
+
+__all__ = [
+    "Episode",
+    "Policy",
+    "find_team",
+    "phi_inputs",
+    "play_episode",
+    "play_episodes",
+    "play_steps",
+    "sample_action",
+]
 
 Policy = Callable[[np.ndarray], np.ndarray]
-"""A function from one observation of a single agent to one action of the environment."""
+"""A function from the observation of a single agent to its action, in the environment's units."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One whole episode. A step has one row for each agent of the role's team, or one row in total if the state is judged."""
+    """A complete episode. A step has one row for each agent of the team, or one row if credit is assigned from the state."""
 
-    before: Float[np.ndarray, "steps rows observation"]
-    action: Float[np.ndarray, "steps rows action"]
-    """In the environment's units."""
-    after: Float[np.ndarray, "steps rows observation"]
+    observation: Float[np.ndarray, "steps rows observation"]
+    env_action: Float[np.ndarray, "steps rows action"]
+    next_observation: Float[np.ndarray, "steps rows observation"]
     alive: Bool[np.ndarray, "steps rows"]
-    """Whether a row's agent acted."""
+    """Whether the row's agent acted."""
     reward: Float[np.ndarray, "steps rows"]
-    """The true reward: each agent's, or the team's if the state is judged."""
+    """The true reward: each agent's, or the team's if credit is assigned from the state."""
     team_reward: Float[np.ndarray, " steps"]
     measures: Mapping[str, float] = field(default_factory=dict)
-    """The task's own measures, from the last step."""
+    """The task's measures, from the last step."""
 
     @property
-    def total(self) -> float:
-        """The return R."""
+    def return_(self) -> float:
+        """The return R of the team."""
         return float(sum(self.team_reward))
 
 
-def team_of(role: TaskSpec, spec: EnvSpec) -> Team:
-    """The team that a spec names; the first team if it names none."""
+def find_team(role: TaskSpec, spec: EnvSpec) -> Team:
+    """Return the team that a role names, or the first team."""
     return next((team for team in spec.teams if team.name == role.team), spec.teams[0])
 
 
-def rows_of(judged_from: JudgedFrom, team: Team, shown: Timestep, action: Any) -> tuple[Any, Any]:
-    """The inputs of a team's phi at some steps: observations and actions, [*batch rows ...]. Arrays of NumPy or JAX."""
-    of_team = action[..., team.agents, :]
-    if judged_from == "observation":
-        return shown.observation[..., team.agents, :], of_team
-    return shown.state[..., None, :], of_team.reshape(*of_team.shape[:-2], 1, -1)
+def phi_inputs(credit_scope: CreditScope, team: Team, timestep: Timestep, env_action: Any) -> tuple[Any, Any]:
+    """Return the inputs of a team's phi: observations and actions [*batch rows ...], as arrays of NumPy or JAX.
+
+    The scope "state" has one row: the global state, and the actions of all agents of the team, concatenated.
+    """
+    team_action = env_action[..., team.agents, :]
+    if credit_scope == "observation":
+        return timestep.observation[..., team.agents, :], team_action
+    return timestep.state[..., None, :], team_action.reshape(*team_action.shape[:-2], 1, -1)
 
 
-def episodes_of(role: TaskSpec, count: int, policy: Policy | None = None, seed: int = 0) -> list[Episode]:
-    """Episodes under a policy of a single agent, or under uniformly random actions."""
+def play_episodes(role: TaskSpec, n_episodes: int, policy: Policy | None = None, seed: int = 0) -> list[Episode]:
+    """Play episodes under a policy of a single agent, or under uniformly random actions."""
     with contextlib.closing(make_host_env(role)) as env:
-        random = np.random.default_rng(seed)
-        return [episode_of(env, role, policy, random, seed + number) for number in range(count)]
+        rng = np.random.default_rng(seed)
+        return [play_episode(env, role, policy, rng, seed + number) for number in range(n_episodes)]
 
 
-def episode_of(env: HostEnv, role: TaskSpec, policy: Policy | None, random: np.random.Generator, seed: int) -> Episode:
-    """One episode."""
-    team, columns, measures = team_of(role, env.spec), [], {}
-    for before, action, after in steps_of(env, policy, random, seed):
-        shown, taken = rows_of(role.judged_from, team, before, action)
-        paid = np.asarray(team_mean(after.reward, before.alive, team))
-        alive, reward = before.alive[team.agents], after.reward[team.agents]
-        if role.judged_from == "state":
-            alive, reward = np.ones(1, bool), paid[None]
-        columns.append((shown, taken, rows_of(role.judged_from, team, after, action)[0], alive, reward, paid))
-        measures = {name: float(value) for name, value in after.measures.items()}
-    return Episode(*(np.stack(part) for part in zip(*columns, strict=True)), measures=measures)
+def play_episode(env: HostEnv, role: TaskSpec, policy: Policy | None, rng: np.random.Generator, seed: int) -> Episode:
+    """Play one episode. See `play_episodes`."""
+    team, scope, columns, measures = find_team(role, env.spec), role.judged_from, [], {}
+    for timestep, action, next_timestep in play_steps(env, policy, rng, seed):
+        observation, env_action = phi_inputs(scope, team, timestep, action)
+        next_observation, _ = phi_inputs(scope, team, next_timestep, action)
+        team_reward = np.asarray(team_mean(next_timestep.reward, timestep.alive, team))
+        alive, reward = timestep.alive[team.agents], next_timestep.reward[team.agents]
+        if scope == "state":
+            alive, reward = np.ones(1, bool), team_reward[None]
+        columns.append((observation, env_action, next_observation, alive, reward, team_reward))
+        measures = {name: float(value) for name, value in next_timestep.measures.items()}
+    return Episode(*(np.stack(column) for column in zip(*columns, strict=True)), measures=measures)
 
 
-def steps_of(
-    env: HostEnv, policy: Policy | None, random: np.random.Generator, seed: int
+def play_steps(
+    env: HostEnv, policy: Policy | None, rng: np.random.Generator, seed: int
 ) -> Iterator[tuple[Timestep, np.ndarray, Timestep]]:
-    """The steps of one episode: for each, the timestep before it, the action, and the timestep after it."""
-    timestep, ended = env.reset(seed), False
-    while not ended:
-        before = timestep
-        action = random_action(env.spec, before, random) if policy is None else policy(before.observation[0])[None]
-        timestep = env.step(action)
-        yield before, action, timestep
-        ended = bool(timestep.terminated or timestep.truncated)
+    """Play one episode. Yield the timestep before each step, the action, and the timestep after it."""
+    next_timestep, done = env.reset(seed), False
+    while not done:
+        timestep = next_timestep
+        action = sample_action(env.spec, timestep, rng) if policy is None else policy(timestep.observation[0])[None]
+        next_timestep = env.step(action)
+        yield timestep, action, next_timestep
+        done = bool(next_timestep.terminated or next_timestep.truncated)
 
 
-def random_action(spec: EnvSpec, shown: Timestep, random: np.random.Generator) -> Float[np.ndarray, "agents action"]:
-    """A random action: uniform within the bounds, or over the available choices of each agent."""
-    drawn = random.uniform(-1, 1, (spec.agents, spec.action_size)).astype(np.float32)
-    return env_action(np.where(shown.available, drawn, -np.inf) if spec.discrete else drawn, spec)
+def sample_action(spec: EnvSpec, timestep: Timestep, rng: np.random.Generator) -> Float[np.ndarray, "agents action"]:
+    """Sample actions in the environment's units: uniform within the bounds, or over the available actions of each agent."""
+    action = rng.uniform(-1, 1, (spec.n_agents, spec.action_size)).astype(np.float32)
+    return to_env_action(np.where(timestep.available, action, -np.inf) if spec.discrete else action, spec)

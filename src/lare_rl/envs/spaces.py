@@ -1,17 +1,22 @@
-"""Represents all spaces as rows of numbers: observations are flattened, discrete actions are encoded one-hot."""
+"""Observations and actions of any Gymnasium space as vectors of finite numbers."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import FlattenObservation
 from jaxtyping import Float
 
+from lare_rl.errors import LareError, short_repr
+
+__all__ = ["OneHot", "OneHotAction", "check_spaces", "finite_array", "flatten_spaces", "flatten_value"]
+
 
 class OneHot(Box):
-    """One of n actions, encoded one-hot. Any other row stands for the action at its largest number."""
+    """One of n discrete actions, encoded one-hot. Any other vector stands for the action of its largest entry."""
 
     def __init__(self, n: int, start: int = 0, seed: int | np.random.Generator | None = None):
         super().__init__(0, 1, (n,), np.float32, seed)
@@ -19,36 +24,102 @@ class OneHot(Box):
         """The number of the first action."""
 
     def sample(self, *args: Any, **kwargs: Any) -> Float[np.ndarray, " n"]:
-        return self.chosen(super().sample(*args, **kwargs))
+        return self.project(super().sample(*args, **kwargs))
 
-    def chosen(self, row: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """The one-hot row of the action that a row stands for."""
-        return np.eye(len(row), dtype=np.float32)[int(np.argmax(row))]
+    def project(self, vector: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the one-hot vector of the action that a vector stands for."""
+        return np.eye(len(vector), dtype=np.float32)[int(np.argmax(vector))]
 
-    def number(self, row: Float[np.ndarray, " n"]) -> int:
-        """The number that the environment gives to the action of a row."""
-        return self.start + int(np.argmax(row))
+    def to_discrete(self, vector: Float[np.ndarray, " n"]) -> int:
+        """Return the environment's number of the action that a vector stands for."""
+        return self.start + int(np.argmax(vector))
 
 
 class OneHotAction(gymnasium.ActionWrapper, RecordConstructorArgs):
-    """Makes an environment with discrete actions accept one-hot rows."""
+    """Makes an environment with discrete actions accept one-hot vectors."""
 
     def __init__(self, env: gymnasium.Env):
         RecordConstructorArgs.__init__(self)  # required by Gymnasium to make the same environment again
         super().__init__(env)
         assert isinstance(env.action_space, Discrete)
-        self.choice = OneHot(int(env.action_space.n), int(env.action_space.start))
-        self.action_space = self.choice
+        self.one_hot = OneHot(int(env.action_space.n), int(env.action_space.start))
+        self.action_space = self.one_hot
 
     def action(self, action: Float[np.ndarray, " n"]) -> int:
-        return self.choice.number(action)
+        return self.one_hot.to_discrete(action)
 
 
-def as_rows(environment: gymnasium.Env) -> gymnasium.Env:
-    """The environment with observations and actions as rows of numbers, as far as this is possible."""
-    if isinstance(environment.action_space, Discrete):
-        environment = OneHotAction(environment)
-    observations = environment.observation_space
-    if observations.is_np_flattenable and not (isinstance(observations, Box) and len(observations.shape) == 1):
-        environment = FlattenObservation(environment)
-    return environment
+def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Space) -> None:
+    """Check that observations can be flattened, and that actions are discrete or bounded.
+
+    Args:
+        owner: the name of the environment or agent, for the message.
+        observation: the observation space.
+        action: the action space.
+
+    Raises:
+        LareError: a space cannot be used.
+    """
+    if not observation.is_np_flattenable:
+        raise LareError(f"the observation space of {owner} is {short_repr(observation)}, which cannot be flattened")
+    if not isinstance(action, Discrete | Box):
+        raise LareError(
+            f"the action space of {owner} is {short_repr(action)}, neither a Discrete nor a Box. Turn several discrete actions "
+            "into one Discrete of all their combinations, or into a Box whose numbers the environment rounds."
+        )
+    if isinstance(action, Box) and not action.is_bounded():
+        raise LareError(f"the actions of {owner} have no bounds: {short_repr(action)}")
+
+
+def flatten_spaces(env: gymnasium.Env) -> gymnasium.Env:
+    """Return the environment with flat observations and one-hot actions."""
+    if isinstance(env.action_space, Discrete):
+        env = OneHotAction(env)
+    if not (isinstance(env.observation_space, Box) and len(env.observation_space.shape) == 1):
+        env = FlattenObservation(env)
+    return env
+
+
+def flatten_value(space: gymnasium.Space, value: Any) -> Float[np.ndarray, " size"]:
+    """Return a value of a space as a new vector, in the order of `gymnasium.spaces.flatten`.
+
+    Unlike Gymnasium's function, this one checks the value.
+
+    Raises:
+        ValueError: the value is not in the space. The message is the predicate of a sentence, such as "contains nan".
+    """
+    if isinstance(space, Box):
+        return finite_array(value, space.shape).ravel()
+    if isinstance(space, Dict):
+        if not isinstance(value, Mapping) or set(value) != set(space.spaces):
+            raise ValueError(f"must have the keys {', '.join(map(str, space.spaces))}, but is {short_repr(value)}")
+        return _concatenate([flatten_value(subspace, value[key]) for key, subspace in space.spaces.items()])
+    if isinstance(space, Tuple):
+        if not isinstance(value, Sequence) or len(value) != len(space.spaces):
+            raise ValueError(f"must have {len(space.spaces)} elements, but is {short_repr(value)}")
+        return _concatenate([flatten_value(*pair) for pair in zip(space.spaces, value, strict=True)])
+    if not space.contains(value):
+        raise ValueError(f"is {short_repr(value)}, which is not in {short_repr(space)}")
+    return np.array(gymnasium.spaces.flatten(space, value), np.float32)
+
+
+def _concatenate(vectors: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, " _"]:
+    return np.concatenate(vectors) if vectors else np.zeros(0, np.float32)
+
+
+def finite_array(value: Any, shape: tuple[int, ...] | None = None) -> Float[np.ndarray, "..."]:
+    """Return a value as a new float32 array.
+
+    Raises:
+        ValueError: the value is not an array of finite numbers, or has another shape. The message is a predicate.
+    """
+    try:
+        with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, which is refused below
+            array = np.array(value, np.float32)  # a copy: the environment may write the next value into the same memory
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"is {short_repr(value)}, which is not an array of numbers") from None
+    if shape is not None and array.shape != shape:
+        raise ValueError(f"has the shape {array.shape}, not {shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"contains {array[~np.isfinite(array)][0]}")
+    return array

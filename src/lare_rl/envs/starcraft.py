@@ -13,50 +13,56 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.errors import LareError
+from lare_rl.tasks.spec import TaskSpec
 
-NAMESPACE = "smac/"
-"""The prefix of such environments in a spec. The rest is the map's name."""
+__all__ = ["StarCraft", "make"]
+
 PACKAGES = {"smacv2.env": "smacv2.env", "smac.env.starcraft2": "smac.env"}
 """For each package, a module that no other package has, and the module that contains the game."""
 DIFFICULTY = "7"
 """The difficulty of the game's built-in opponent: "very hard", for which results are usually reported."""
-CRASHES = 3
-"""After this many crashes in a row, without a complete episode between them, the run fails."""
-NOTHING = 0
-"""The only choice of dead units. Living units do not have it."""
+MAX_CRASHES = 3
+"""A run fails after this number of crashes in a row, without a complete episode between them."""
+NO_OP = 0
+"""SMAC's only action for dead units. Living units do not have it."""
+
+
+def make(task: TaskSpec, **_: Any) -> "StarCraft":
+    """Make the environment of a task with the name `smac/MAP`."""
+    return StarCraft(task.environment_name)
 
 
 class StarCraft:
-    """A map of SMAC as a `HostEnv`. Its choices are SMAC's: nothing, stop, north, south, east, west, and to attack each enemy.
-
-    Args:
-        name: the name of the map.
-        relaunch: start the game again at each `reset`, with the given seed. SMAC accepts a seed only at the start of a game, and
-            a start takes many seconds. Without it, only the first episode follows its seed, and later ones continue from there.
-        game: a function that makes the game, in place of the installed package.
-    """
+    """A map of SMAC as a `HostEnv`. The actions are SMAC's: no-op, stop, north, south, east, west, and to attack each enemy."""
 
     spec: EnvSpec
 
-    def __init__(self, name: str, relaunch: bool = False, game: Callable[..., Any] | None = None):
-        self.name, self.relaunch = name, relaunch
-        self.make = game or find_game()
-        self.game: Any = None
-        self.steps = 0
-        self.alive = np.zeros(0, bool)
-        self.goes_on = False
-        self.crashes = 0
-        info = self.launch(0).get_env_info()
-        agents, choices = info["n_agents"], info["n_actions"]
-        self.available = np.zeros((agents, choices), bool)
+    def __init__(self, name: str, relaunch: bool = False, make_game: Callable[..., Any] | None = None):
+        """Make the game.
+
+        Args:
+            name: the name of the map.
+            relaunch: start the game again at each `reset`, with its seed. SMAC accepts a seed only at the start of a game, and a
+                start takes many seconds. Without it, only the first episode follows its seed, and later ones continue from there.
+            make_game: a function that makes the game. Default: SMAC's class.
+
+        Raises:
+            LareError: the package, StarCraft II or the map is missing.
+        """
+        self._name, self._relaunch, self._make_game = name, relaunch, make_game or _find_game()
+        self._game: Any = None
+        self._can_continue = False
+        self._n_crashes = 0
+        info = self._launch(0).get_env_info()
         self.spec = EnvSpec(
-            teams=(Team("ally", 0, agents),),
+            teams=(Team("ally", 0, info["n_agents"]),),
             observation_size=info["obs_shape"],
-            action_size=choices,
+            action_size=info["n_actions"],
             discrete=True,
             max_steps=info["episode_limit"],
             state_size=info["state_shape"],
@@ -65,98 +71,84 @@ class StarCraft:
             measures=("won",),
         )
 
-    def launch(self, seed: int) -> Any:
+    def _launch(self, seed: int) -> Any:
         """Make a game with this seed. StarCraft II itself only starts with the first episode."""
         self.close()
-        try:
-            self.game = self.make(map_name=self.name, difficulty=DIFFICULTY, seed=seed)
-        except Exception as error:  # the package may raise anything about a map or the game
-            raise LareError(f"SMAC cannot make {self.name!r}: {one_line(error)}") from error
-        return self.game
+        with one_line_errors(f"SMAC cannot make {self._name!r}"):
+            self._game = self._make_game(map_name=self._name, difficulty=DIFFICULTY, seed=seed)
+        return self._game
 
     def reset(self, seed: int) -> Timestep:
-        """The first step of an episode."""
+        """Start an episode."""
         # Before an episode has ended, SMAC's reset would start another game in addition to the running one.
-        if self.relaunch or not self.goes_on:
-            self.launch(seed)
-        try:
-            self.game.reset()
-        except Exception as error:
-            raise LareError(f"StarCraft II does not start {self.name!r}: {one_line(error)}") from error
-        self.steps = 0
-        return self.show(np.zeros(self.spec.agents, np.float32), over=False, won=False)
+        if self._relaunch or not self._can_continue:
+            self._launch(seed)
+        with one_line_errors(f"StarCraft II does not start {self._name!r}"):
+            self._game.reset()
+        self._steps = 0
+        return self._make_timestep(np.zeros(self.spec.n_agents, np.float32), done=False, won=False)
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        """One step. If the game crashes, the episode is truncated, and the next `reset` starts the game again.
+        """Make one step. If the game crashes, the episode is truncated, and the next `reset` starts the game again.
 
         Raises:
-            LareError: an agent chose an action that is not available, or the game has crashed too often.
+            LareError: an action is not available, or the game has crashed too often.
         """
-        choice = np.argmax(action, axis=1)
-        for agent, one in enumerate(choice):
-            if not self.available[agent, one]:
-                raise LareError(f"agent {agent} of {self.name} chose action {one}, which is not available to it now")
-        lived = self.alive
-        reward, over, info = self.game.step([int(one) for one in choice])
-        if over and not info:  # SMAC reports a crash only in this way
-            return self.crashed()
-        self.steps += 1
-        if over:
-            self.goes_on, self.crashes = True, 0
-        paid = np.where(lived, np.float32(reward), np.float32(0))
-        return self.show(paid, over=bool(over), won=bool(info.get("battle_won", False)))
+        choices = np.argmax(action, axis=1).tolist()
+        for agent, choice in enumerate(choices):
+            if not self._timestep.available[agent, choice]:
+                raise LareError(f"agent {agent} of {self._name} chose the action {choice}, which is not available")
+        reward, done, info = self._game.step(choices)
+        if done and not info:  # SMAC reports a crash only in this way
+            return self._handle_crash()
+        self._steps += 1
+        if done:
+            self._can_continue, self._n_crashes = True, 0
+        rewards = np.where(self._timestep.alive, np.float32(reward), np.float32(0))
+        return self._make_timestep(rewards, done=bool(done), won=bool(info.get("battle_won", False)))
 
-    def crashed(self) -> Timestep:
-        """The step in which the game crashed: its reward is 0, and it repeats the previous observations and ends the episode."""
-        said = f"StarCraft II crashed in step {self.steps + 1} of an episode of {self.name}"
-        self.goes_on, self.crashes = False, self.crashes + 1
-        if self.crashes == CRASHES:
-            raise LareError(f"{said}; that makes {CRASHES} crashes in a row")
-        warnings.warn(f"{said}: the episode ends there, and the game starts again", RuntimeWarning, stacklevel=3)
-        return self.shown._replace(reward=np.zeros_like(self.shown.reward), truncated=np.array(True))
+    def _handle_crash(self) -> Timestep:
+        """Return the previous timestep with reward 0, truncated."""
+        message = f"StarCraft II crashed in step {self._steps + 1} of an episode of {self._name}"
+        self._can_continue, self._n_crashes = False, self._n_crashes + 1
+        if self._n_crashes == MAX_CRASHES:
+            raise LareError(f"{message}, for the {MAX_CRASHES}rd time in a row")
+        warnings.warn(f"{message}: the episode ends there, and the game starts again", RuntimeWarning, stacklevel=3)
+        return self._timestep._replace(reward=np.zeros_like(self._timestep.reward), truncated=np.array(True))
 
-    def show(self, paid: Float[np.ndarray, " agents"], over: bool, won: bool) -> Timestep:
-        """The timestep after a step with this reward. SMAC itself does not distinguish truncation from termination."""
-        self.available = np.array(self.game.get_avail_actions(), bool)
-        self.alive = living(self.available)
-        late = self.steps >= self.spec.max_steps
-        self.shown = Timestep(
-            observation=np.stack([np.asarray(one, np.float32) for one in self.game.get_obs()]),
-            state=np.asarray(self.game.get_state(), np.float32),
-            available=self.available,
-            alive=self.alive,
-            reward=paid,
-            terminated=np.array(over and (not late or won or not self.alive.any())),
-            truncated=np.array(late),
+    def _make_timestep(self, reward: Float[np.ndarray, " agents"], done: bool, won: bool) -> Timestep:
+        available = np.array(self._game.get_avail_actions(), bool)
+        alive = ~available[:, NO_OP]
+        at_limit = self._steps >= self.spec.max_steps
+        self._timestep = Timestep(
+            observation=np.stack(self._game.get_obs()).astype(np.float32),
+            state=np.asarray(self._game.get_state(), np.float32),
+            available=available,
+            alive=alive,
+            reward=reward,
+            terminated=np.array(
+                done and (not at_limit or won or not alive.any())
+            ),  # SMAC does not tell truncation apart
+            truncated=np.array(at_limit),
             measures={"won": np.array(won, np.float32)},
         )
-        return self.shown
+        return self._timestep
 
     def render(self) -> Any:
-        """The battle as pixels (height, width, 3)."""
-        return self.game.render(mode="rgb_array")
+        """Return the battle as pixels (height, width, 3)."""
+        return self._game.render(mode="rgb_array")
 
     def close(self) -> None:
         """End the game."""
-        if self.game is not None:
-            self.game.close()
-            self.game = None
-        self.goes_on = False
+        if self._game is not None:
+            self._game.close()
+            self._game = None
+        self._can_continue = False
 
 
-def living(available: Bool[np.ndarray, "agents choices"]) -> Bool[np.ndarray, " agents"]:
-    """Which units are alive: only dead units have the choice `NOTHING`."""
-    return ~available[:, NOTHING]
-
-
-def find_game() -> Callable[..., Any]:
-    """The function that makes a game.
-
-    Raises:
-        LareError: the package or StarCraft II is missing.
-    """
-    found = [home for module, home in PACKAGES.items() if is_there(module)]
-    if not found:
+def _find_game() -> Callable[..., Any]:
+    modules = [game_module for marker, game_module in PACKAGES.items() if _is_installed(marker)]
+    if not modules:
         raise LareError(
             "SMAC is not installed: pip install git+https://github.com/oxwhirl/smacv2.git"
             " (the package that PyPI calls smac is another project)"
@@ -164,20 +156,16 @@ def find_game() -> Callable[..., Any]:
     folder = Path(os.environ.get("SC2PATH", "~/StarCraftII")).expanduser()
     if not folder.is_dir():
         raise LareError(
-            f"StarCraft II is not at {folder}: set SC2PATH to its folder, with SMAC's maps in Maps/SMAC_Maps"
+            f"StarCraft II is not at {folder}. Set SC2PATH to its folder, with SMAC's maps in Maps/SMAC_Maps."
         )
-    try:
-        return importlib.import_module(found[0]).StarCraft2Env
-    except (ImportError, AttributeError, TypeError) as error:  # TypeError: old protocol buffers with a new protobuf
-        raise LareError(f"{found[0]} cannot be imported: {one_line(error)}") from error
+    with one_line_errors(
+        f"{modules[0]} cannot be imported"
+    ):  # old protocol buffers fail with a new protobuf, for example
+        return importlib.import_module(modules[0]).StarCraft2Env
 
 
-def is_there(module: str) -> bool:
+def _is_installed(module: str) -> bool:
     try:
         return find_spec(module) is not None
     except ImportError:  # a parent is missing
         return False
-
-
-def one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -1,4 +1,4 @@
-"""Many copies of a `HostEnv`, stepped in lockstep: in this process (`LocalEnvs`), or in several (`WorkerEnvs`).
+"""Many copies of a `HostEnv`, stepped in lockstep: in this process (`LocalVecEnv`), or in several (`SubprocVecEnv`).
 
 Workers are new processes, never forks, because JAX runs threads in this process. They are not started by `multiprocessing`, which
 would run the user's script again in each of them. The functions that make environments are pickled, so they must be importable.
@@ -25,57 +25,63 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
-from lare_rl.envs.guarded_gymnasium import EnvironmentFault, fault
+from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
 from lare_rl.errors import LareError
 
+__all__ = ["LocalVecEnv", "SubprocVecEnv", "VecEnv"]
+
 Maker = Callable[[], HostEnv]
 
-PROGRAM = "import sys; from lare_rl.envs.workers import serve; serve(int(sys.argv[1]))"
+PROGRAM = "import sys; from lare_rl.envs.workers import _serve; _serve(int(sys.argv[1]))"
 
-ARRAYS = tuple(name for name in Timestep._fields if name != "measures")
-
-GRACE = 2.0
-"""Seconds within which workers must close their environments."""
+CLOSE_TIMEOUT_S = 2.0
+"""Workers must close their environments within this time."""
 
 
-class Envs(ABC):
-    """A batch of environments. `where` selects some of them; the rows of the others do not change.
+class VecEnv(ABC):
+    """A batch of environments with the same sizes.
 
-    The next call overwrites the returned arrays.
+    `where` selects environments: the rows of the others do not change. The next call overwrites the returned arrays.
     """
 
     spec: EnvSpec
+    batch: Timestep
+    """The last timestep of each environment."""
 
     def __init__(self, specs: Sequence[EnvSpec]):
         self.spec = specs[0]
-        for place, spec in enumerate(specs):
-            if sizes(spec) != sizes(self.spec):
-                raise LareError(f"environment {place} is not like environment 0: {sizes(spec)}, not {sizes(self.spec)}")
-        self.batch = stacked([blank(self.spec) for _ in specs])
+        for env_index, spec in enumerate(specs):
+            if _sizes(spec) != _sizes(self.spec):
+                raise LareError(
+                    f"environment {env_index} differs from environment 0: {_sizes(spec)}, not {_sizes(self.spec)}"
+                )
+        self.batch = _empty_batch(self.spec, len(specs))
 
     def reset(self, where: Bool[np.ndarray, " n"], seeds: Integer[np.ndarray, " n"]) -> Timestep:
         """Start episodes. The same seeds give the same episodes."""
-        return self.all("reset", {place: int(seeds[place]) for place in np.flatnonzero(where).tolist()})
+        return self._update_batch("reset", {index: int(seeds[index]) for index in np.flatnonzero(where).tolist()})
 
     def step(
         self, action: Float[np.ndarray, "n agents action"], where: Bool[np.ndarray, " n"] | None = None
     ) -> Timestep:
-        """One step of each selected environment."""
-        places = range(len(self.batch.alive)) if where is None else np.flatnonzero(where).tolist()
-        return self.all("step", {place: action[place] for place in places})
+        """Make one step of each selected environment."""
+        indices = range(len(self.batch.alive)) if where is None else np.flatnonzero(where).tolist()
+        return self._update_batch("step", {index: action[index] for index in indices})
 
-    def all(self, command: str, arguments: Mapping[int, Any]) -> Timestep:
-        for place, row in self.ask(command, arguments).items():
-            for name in ARRAYS:
-                getattr(self.batch, name)[place] = getattr(row, name)
-            for name, value in row.measures.items():
-                self.batch.measures[name][place] = value
+    def _update_batch(self, command: str, arguments: Mapping[int, Any]) -> Timestep:
+        for index, timestep in self._request(command, arguments).items():
+            *columns, measures = self.batch
+            *values, new_measures = timestep
+            for column, value in zip(columns, values, strict=True):
+                column[index] = value
+            for name, value in new_measures.items():
+                measures[name][index] = value
         return self.batch
 
     @abstractmethod
-    def ask(self, command: str, arguments: Mapping[int, Any]) -> Mapping[int, Timestep]:
-        """The answers of the environments at these places to a command."""
+    def _request(self, command: str, arguments: Mapping[int, Any]) -> Mapping[int, Timestep]:
+        """Return the replies of the environments of these indices to "reset" or "step"."""
 
     @abstractmethod
     def close(self) -> None:
@@ -88,163 +94,171 @@ class Envs(ABC):
         self.close()
 
 
-class LocalEnvs(Envs):
-    """Environments in this process, one after the other."""
+class LocalVecEnv(VecEnv):
+    """Environments in this process, stepped one after the other."""
 
     def __init__(self, makers: Sequence[Maker]):
-        self.environments = [made(place, maker) for place, maker in enumerate(makers)]
-        super().__init__([environment.spec for environment in self.environments])
+        self._envs = [_make(index, maker) for index, maker in enumerate(makers)]
+        super().__init__([env.spec for env in self._envs])
 
-    def ask(self, command: str, arguments: Mapping[int, Any]) -> Mapping[int, Timestep]:
-        return {place: told(place, self.environments[place], command, one) for place, one in arguments.items()}
+    def _request(self, command: str, arguments: Mapping[int, Any]) -> Mapping[int, Timestep]:
+        return {index: _call(index, self._envs[index], command, argument) for index, argument in arguments.items()}
 
     def close(self) -> None:
-        for environment in self.environments:
-            environment.close()
+        for env in self._envs:
+            env.close()
 
 
-class WorkerEnvs(Envs):
-    """Environments in separate processes; several in each process if there are more environments than cores.
-
-    Raises:
-        LareError: an environment cannot be made, raised an error, died or did not answer in time. All workers have then ended.
-    """
+class SubprocVecEnv(VecEnv):
+    """Environments in separate processes, several in each process if there are more environments than cores."""
 
     def __init__(self, makers: Sequence[Maker], processes: int | None = None, timeout: float = 60.0):
+        """Start the processes and make the environments.
+
+        Args:
+            makers: one function for each environment. It must be possible to pickle them.
+            processes: the number of processes. Default: the number of cores, but at most one for each environment.
+            timeout: the time (s) within which an environment must reply.
+
+        Raises:
+            LareError: an environment cannot be made. Later calls raise it if an environment raises an error, dies or does not
+                reply in time. All workers have then ended.
+        """
         self.timeout = timeout
-        self.workers: list[Worker] = []
-        number = min(len(makers), processes or cores())
+        self._workers: list[_Worker] = []
+        n_workers = min(len(makers), processes or _n_cores())
         try:
-            for first in range(number):
-                self.workers.append(Worker(range(first, len(makers), number)))
-            self.worker_of = {place: worker for worker in self.workers for place in worker.places}
-            specs = self.ask("make", {place: packed(place, maker) for place, maker in enumerate(makers)})
-            super().__init__([specs[place] for place in range(len(makers))])
+            for first in range(n_workers):
+                self._workers.append(_Worker(range(first, len(makers), n_workers)))
+            specs = self._request("make", {index: _pickle(index, maker) for index, maker in enumerate(makers)})
+            super().__init__([specs[index] for index in range(len(makers))])
         except BaseException:
-            self.end()
+            self._kill()
             raise
-
-    def ask(self, command: str, arguments: Mapping[int, Any]) -> dict[int, Any]:
-        if not self.workers:
-            raise LareError("the worker processes have ended: make the environments again")
-        try:
-            for worker in self.workers:
-                own = {place: arguments[place] for place in worker.places if place in arguments}
-                if own:
-                    worker.send(command, own)
-            return self.answers(command)
-        except BaseException:  # Ctrl-C too: a pending answer would be taken for the next one
-            self.end()
-            raise
-
-    def answers(self, command: str) -> dict[int, Any]:
-        """All answers, in the order of their arrival."""
-        found: dict[int, Any] = {}
-        while waiting := [worker for worker in self.workers if worker.expected]:
-            until = min(worker.heard for worker in waiting) + self.timeout
-            ready = wait([worker.connection for worker in waiting], max(0.0, until - time.monotonic()))
-            for worker in waiting:
-                if worker.connection in ready:
-                    place, answer = worker.receive()
-                    if isinstance(answer, Failure):
-                        raise answer.error
-                    found[place] = answer
-                elif time.monotonic() > worker.heard + self.timeout:
-                    raise LareError(f"{worker.name} did not answer for {self.timeout:g} s in {command}")
-        return found
-
-    def close(self) -> None:
-        """Close the environments, and end workers that take too long."""
-        for worker in self.workers:
-            worker.connection.close()  # tells the worker to end
-        until = time.monotonic() + GRACE
-        for worker in self.workers:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                worker.process.wait(max(0.0, until - time.monotonic()))
-        self.end()
-
-    def end(self) -> None:
-        """End the processes."""
-        for worker in self.workers:
-            worker.end()
-        self.workers = []
-
-    def __del__(self):
-        self.end()
-
-
-class Failure:
-    """An error that a worker sends instead of an answer."""
-
-    def __init__(self, error: LareError):
-        self.text = str(error)
-        self.place = error.place if isinstance(error, EnvironmentFault) else None
 
     @property
-    def error(self) -> LareError:
-        """The error that the worker raised."""
-        if self.place is None:
-            return LareError(self.text)
-        error = EnvironmentFault(self.text)
-        error.place = self.place
+    def pids(self) -> list[int]:
+        """The ids of the worker processes."""
+        return [worker.process.pid for worker in self._workers]
+
+    def _request(self, command: str, arguments: Mapping[int, Any]) -> dict[int, Any]:
+        if not self._workers:
+            raise LareError("the worker processes have ended. Make the environments again.")
+        try:
+            for worker in self._workers:
+                worker_arguments = {index: arguments[index] for index in worker.env_indices if index in arguments}
+                if worker_arguments:
+                    worker.send(command, worker_arguments)
+            return self._receive(command)
+        except BaseException:  # Ctrl-C too: a pending reply would be taken for the next one
+            self._kill()
+            raise
+
+    def _receive(self, command: str) -> dict[int, Any]:
+        """Return all replies, in the order of their arrival."""
+        replies: dict[int, Any] = {}
+        while busy := [worker for worker in self._workers if worker.pending]:
+            deadline = min(worker.last_active for worker in busy) + self.timeout
+            ready = wait([worker.connection for worker in busy], max(0.0, deadline - time.monotonic()))
+            for worker in busy:
+                if worker.connection in ready:
+                    index, reply = worker.receive()
+                    if isinstance(reply, _Failure):
+                        raise reply.to_error()
+                    replies[index] = reply
+                elif time.monotonic() > worker.last_active + self.timeout:
+                    raise LareError(f"{worker.label} did not reply for {self.timeout:g} s in {command}")
+        return replies
+
+    def close(self) -> None:
+        """Close the environments, and kill workers that take too long."""
+        for worker in self._workers:
+            worker.connection.close()  # asks the worker to end
+        deadline = time.monotonic() + CLOSE_TIMEOUT_S
+        for worker in self._workers:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                worker.process.wait(max(0.0, deadline - time.monotonic()))
+        self._kill()
+
+    def _kill(self) -> None:
+        for worker in self._workers:
+            worker.kill()
+        self._workers = []
+
+    def __del__(self):
+        self._kill()
+
+
+class _Failure:
+    """An error that a worker sends instead of a reply. Exceptions with attributes cannot be pickled reliably."""
+
+    def __init__(self, error: LareError):
+        self.message = str(error)
+        self.env_index = error.env_index if isinstance(error, EnvOutputError) else None
+
+    def to_error(self) -> LareError:
+        if self.env_index is None:
+            return LareError(self.message)
+        error = EnvOutputError(self.message)
+        error.env_index = self.env_index
         return error
 
 
-class Worker:
+class _Worker:
     """A worker process and its environments, from the parent's side."""
 
-    def __init__(self, places: Sequence[int]):
-        self.places = places
-        self.expected: deque[int] = deque()
-        """Places of the environments that have not answered yet, in their order."""
-        self.heard = time.monotonic()
-        self.connection, theirs = Pipe()
+    def __init__(self, env_indices: Sequence[int]):
+        self.env_indices = env_indices
+        self.pending: deque[int] = deque()
+        """The indices of the environments that have not replied yet, in the order of their replies."""
+        self.last_active = time.monotonic()
+        self.connection, worker_end = Pipe()
         # The same import paths as in this process, and one thread, so that other workers can use the other cores.
         variables = (
             {"OMP_NUM_THREADS": "1"}
             | os.environ
             | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
         )
-        with theirs:
+        with worker_end:
             self.process = subprocess.Popen(
-                [sys.executable, "-P", "-c", PROGRAM, str(theirs.fileno())],
+                [sys.executable, "-P", "-c", PROGRAM, str(worker_end.fileno())],
                 stdin=subprocess.PIPE,
-                pass_fds=[theirs.fileno()],
+                pass_fds=[worker_end.fileno()],
                 env=variables,
                 start_new_session=True,  # Ctrl-C must reach only the parent
             )
 
     @property
-    def name(self) -> str:
-        """The environment and the process, for error messages."""
-        return f"environment {self.expected[0]} (in worker process {self.process.pid})"
+    def label(self) -> str:
+        """The environment that should reply and the process, for error messages."""
+        return f"environment {self.pending[0]} (in worker process {self.process.pid})"
 
     def send(self, command: str, arguments: dict[int, Any]) -> None:
-        self.expected.extend(arguments)
-        self.heard = time.monotonic()
+        self.pending.extend(arguments)
+        self.last_active = time.monotonic()
         try:
             self.connection.send((command, arguments))
         except OSError:
-            raise self.died() from None
+            raise self._make_death_error() from None
 
     def receive(self) -> tuple[int, Any]:
         try:
-            answer = self.connection.recv()
+            reply = self.connection.recv()
         except (EOFError, OSError):
-            raise self.died() from None
-        self.heard = time.monotonic()
-        return self.expected.popleft(), answer
+            raise self._make_death_error() from None
+        self.last_active = time.monotonic()
+        return self.pending.popleft(), reply
 
-    def died(self) -> LareError:
+    def _make_death_error(self) -> LareError:
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(GRACE)
+            self.process.wait(CLOSE_TIMEOUT_S)
         status = self.process.returncode
         if status is None:
-            return LareError(f"{self.name} closed its connection")
-        how = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
-        return LareError(f"{self.name} died: {how}")
+            return LareError(f"{self.label} closed its connection")
+        reason = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+        return LareError(f"{self.label} died: {reason}")
 
-    def end(self) -> None:
+    def kill(self) -> None:
         self.connection.close()
         self.process.kill()
         self.process.wait()
@@ -252,87 +266,72 @@ class Worker:
         self.process.stdin.close()
 
 
-def serve(descriptor: int) -> None:
-    """The worker's side: make, reset and step environments, with one answer for each, until the connection closes."""
-    threading.Thread(target=end_with_the_parent, daemon=True).start()
+def _serve(descriptor: int) -> None:
+    """Run a worker: make, reset and step environments, with one reply for each, until the connection closes."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     connection = Connection(descriptor)
-    environments: dict[int, HostEnv] = {}
+    envs: dict[int, HostEnv] = {}
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             command, arguments = connection.recv()
-            for place, argument in arguments.items():
+            for index, argument in arguments.items():
                 try:
                     if command == "make":
-                        environments[place] = made(place, lambda argument=argument: pickle.loads(argument)())
-                        answer = environments[place].spec
+                        envs[index] = _make(index, lambda pickled=argument: pickle.loads(pickled)())
+                        reply = envs[index].spec
                     else:
-                        answer = told(place, environments[place], command, argument)
+                        reply = _call(index, envs[index], command, argument)
                 except LareError as error:
-                    answer = Failure(error)
-                connection.send(answer)
-    for environment in environments.values():
+                    reply = _Failure(error)
+                connection.send(reply)
+    for env in envs.values():
         with contextlib.suppress(Exception):
-            environment.close()
+            env.close()
 
 
-def end_with_the_parent() -> None:
+def _end_with_parent() -> None:
     """Exit when standard input closes, which happens whenever the parent ends. A step that hangs would not notice this."""
     while os.read(0, 1):
         pass
     os._exit(0)
 
 
-def packed(place: int, maker: Maker) -> bytes:
-    try:
+def _pickle(env_index: int, maker: Maker) -> bytes:
+    with one_line_errors(f"environment {env_index} cannot be sent to a worker process"):
         return pickle.dumps(maker)
-    except Exception as error:
-        raise fault(f"environment {place} cannot be sent to a worker process", error) from error
 
 
-def made(place: int, maker: Maker) -> HostEnv:
-    try:
+def _make(env_index: int, maker: Maker) -> HostEnv:
+    with one_line_errors(f"environment {env_index} cannot be made"):
         return maker()
-    except (Exception, SystemExit) as error:
-        raise fault(f"environment {place} cannot be made", error) from error
 
 
-def told(place: int, environment: HostEnv, command: str, argument: Any) -> Timestep:
-    """A reset or a step. Whatever it raises becomes a `LareError` of one line."""
+def _call(env_index: int, env: HostEnv, command: str, argument: Any) -> Timestep:
     try:
-        return environment.reset(argument) if command == "reset" else environment.step(argument)
-    except EnvironmentFault as error:
-        error.place = place
+        with one_line_errors(f"environment {env_index} failed in {command}"):
+            return env.reset(argument) if command == "reset" else env.step(argument)
+    except EnvOutputError as error:
+        error.env_index = env_index
         raise
-    except (Exception, SystemExit) as error:
-        raise fault(f"environment {place} failed in {command}", error) from error
 
 
-def cores() -> int:
-    """How many processes can run at the same time."""
+def _n_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def sizes(spec: EnvSpec) -> tuple[Any, ...]:
+def _sizes(spec: EnvSpec) -> tuple[Any, ...]:
     return spec.teams, spec.observation_size, spec.action_size, spec.discrete, spec.state_size, spec.measures
 
 
-def blank(spec: EnvSpec) -> Timestep:
-    """The timestep of an environment whose first episode has not started."""
+def _empty_batch(spec: EnvSpec, n: int) -> Timestep:
+    """Return the timesteps of n environments whose first episode has not started."""
     return Timestep(
-        observation=np.zeros((spec.agents, spec.observation_size), np.float32),
-        state=np.zeros(spec.state_size, np.float32),
-        available=np.ones((spec.agents, spec.action_size), bool),
-        alive=np.zeros(spec.agents, bool),
-        reward=np.zeros(spec.agents, np.float32),
-        terminated=np.array(False),
-        truncated=np.array(False),
-        measures={name: np.zeros((), np.float32) for name in spec.measures},
+        observation=np.zeros((n, spec.n_agents, spec.observation_size), np.float32),
+        state=np.zeros((n, spec.state_size), np.float32),
+        available=np.ones((n, spec.n_agents, spec.action_size), bool),
+        alive=np.zeros((n, spec.n_agents), bool),
+        reward=np.zeros((n, spec.n_agents), np.float32),
+        terminated=np.zeros(n, bool),
+        truncated=np.zeros(n, bool),
+        measures={name: np.zeros(n, np.float32) for name in spec.measures},
     )
-
-
-def stacked(rows: Sequence[Timestep]) -> Timestep:
-    """Timesteps of several environments, stacked along a new first axis."""
-    *parts, measures = (list(column) for column in zip(*rows, strict=True))
-    by_name = {name: np.stack([one[name] for one in measures]) for name in measures[0]}
-    observation, state, available, alive, reward, terminated, truncated = map(np.stack, parts)
-    return Timestep(observation, state, available, alive, reward, terminated, truncated, by_name)

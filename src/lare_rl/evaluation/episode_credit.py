@@ -1,106 +1,131 @@
-"""The proxy rewards that a run's decoders give to the steps of an episode, beside the true rewards."""
+"""The credit that a run's decoders give to the steps of its last training episode."""
 
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lare_rl.credit.decoder_settings import RECENT
+from lare_rl.credit.decoder_settings import RECENT_STEPS
 from lare_rl.credit.decomposition import Decomposition
 from lare_rl.credit.methods import Fit
-from lare_rl.credit.returns import deviation
+from lare_rl.credit.returns import reward_std
 from lare_rl.data import replay
 from lare_rl.data.replay import Index, StoredSteps
-from lare_rl.evaluation.watch import newest_episode
 from lare_rl.runs.directory import Run
-from lare_rl.training.learner import Learner, Paid, features, rewards
-from lare_rl.training.seed_axis import of_seed
-from lare_rl.training.session import load_learner
+from lare_rl.training.decoder_inputs import decoder_inputs
+from lare_rl.training.learner import Learner
+from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import float64
+from lare_rl.util.statistics import column_correlations
+
+__all__ = ["EpisodeCredit", "FactorLabel", "label_factors", "load_episode_credit"]
 
 
-@dataclass(frozen=True)
-class Credit:
+@dataclass(frozen=True, kw_only=True)
+class EpisodeCredit:
     """The last finished episode of a run's first seed, and the factors' correlations."""
 
     reward: Float[np.ndarray, "steps agents"]
     """True rewards."""
-    proxy: Float[np.ndarray, "steps agents"]
-    """Proxy rewards, by the decoders of the last checkpoint."""
+    proxy_reward: Float[np.ndarray, "steps agents"]
+    """By the decoders of the last checkpoint."""
     uncertainty: Float[np.ndarray, " steps"] | None
     """Two posterior standard deviations of the proxy reward, for a single agent and a closed-form decoder."""
     factors: Float[np.ndarray, "steps rows factors"]
-    known: bool
-    """Whether the true rewards of single steps are known. They are not if only the last step of an episode is paid."""
+    has_step_rewards: bool
+    """Whether the true rewards of single steps are known. They are unknown if only the last step has a reward."""
     correlations: Float[np.ndarray, " factors"]
-    """Pearson's correlation of each factor with the true reward, over the last steps of all seeds. NaN if one of the two never
-    varies."""
+    """Pearson's correlation of each factor with the true reward, over the newest steps of all seeds. NaN if one never varies."""
 
 
-def factor_labels(run: Run, place: int = 0) -> list[tuple[str, str, str]]:
-    """Name, meaning and entries of each column of z, for the function of one of the task's roles."""
+class FactorLabel(NamedTuple):
+    """A column of z, described by the source of phi."""
+
+    name: str
+    meaning: str
+    reads: str
+    """The entries that it reads."""
+
+
+def label_factors(run: Run, team_index: int = 0) -> list[FactorLabel]:
+    """Return a label of each column of z, for the function of one of the task's roles."""
     if not run.functions:
         return []
-    function = run.functions[place]
-    columns = function.columns_by(run.judges)
-    times = len(columns) // function.size
-    return list(zip(columns, function.meanings * times, function.reads * times, strict=True))
+    function = run.functions[team_index]
+    names = function.factor_columns(run.factor_inputs)
+    n_observations = len(names) // function.size
+    labels = zip(names, function.meanings * n_observations, function.reads * n_observations, strict=True)
+    return [FactorLabel(name=name, meaning=meaning, reads=reads) for name, meaning, reads in labels]
 
 
-def credit_of(run: Run) -> Credit | None:
-    """The credit of a run; None for a method without proxy rewards, and while no episode has finished."""
-    config, learner, _, _ = load_learner(run)
-    one = of_seed(learner)
-    index = newest_episode(one)
-    if not config.method.has_proxy or index is None:
+def load_episode_credit(run: Run) -> EpisodeCredit | None:
+    """Return the credit of a run. None for a method without proxy rewards, and while no episode has finished."""
+    state = load_learner(run)
+    config, learner = state.config, select_seed(state.learner)
+    index = _find_newest_episode(learner)
+    if not config.method.has_proxy_rewards or index is None:
         return None
-    steps, proxy = jax.jit(partial(paid, config=config))(one, index)
+    steps, proxy_reward = jax.jit(partial(_read_rewards, config=config))(learner, index)
     uncertainty = None
-    if one.credit and config.method.fit is Fit.EVIDENCE and config.judged_rows == 1:
+    if learner.credit and config.method.fit is Fit.EVIDENCE and config.credit_rows == 1:
         with float64():
-            known = np.asarray(jax.jit(partial(uncertain, config=config))(one.credit[0], steps))
-        uncertainty = 2 * known / np.where(one.credit[0].average, steps.length, 1)
-    factors = np.asarray(steps.before["factors"]) if "factors" in steps.before else np.zeros((len(proxy), 1, 0))
-    correlations = factor_correlations(learner, config)
-    reward = np.asarray(steps.before["reward"])
-    return Credit(reward, np.asarray(proxy), uncertainty, factors, bool(reward[:-1].any()), correlations)
+            std = np.asarray(jax.jit(partial(_posterior_std, config=config))(learner.credit[0], steps))
+        uncertainty = 2 * std / np.where(learner.credit[0].is_mean, steps.length, 1)
+    reward = np.asarray(steps.columns["reward"])
+    return EpisodeCredit(
+        reward=reward,
+        proxy_reward=np.asarray(proxy_reward),
+        uncertainty=uncertainty,
+        factors=np.asarray(steps.columns.get("factors", np.zeros((len(reward), 1, 0)))),
+        has_step_rewards=bool(reward[:-1].any()),
+        correlations=_factor_correlations(state.learner, config),
+    )
 
 
-def paid(learner: Learner, index: Index, config: TrainConfig) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
-    """Steps of one seed's replay, and their proxy rewards."""
-    steps = replay.read(learner.replay, index)
-    return steps, rewards(steps, Paid(learner.credit, learner.scale), config)
-
-
-def uncertain(credit: Decomposition, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:
-    """The posterior deviation of a single agent's proxy rewards, in float64."""
-    return deviation(credit, features(steps, config, 0)[:, 0], config.forms)
-
-
-def correlations(
-    columns: Float[np.ndarray, "rows columns"], reward: Float[np.ndarray, " rows"]
-) -> Float[np.ndarray, " columns"]:
-    """Pearson's correlation of each column with the reward; NaN if one of the two never varies."""
-    with np.errstate(invalid="ignore"):
-        return np.array([np.corrcoef(column, reward)[0, 1] for column in columns.T])
-
-
-def factor_correlations(learner: Learner, config: TrainConfig) -> Float[np.ndarray, " factors"]:
-    """Correlations of a single agent's factors with its true reward, over the newest steps.
-
-    NaN if only returns are known; empty for many agents.
-    """
-    if not config.method.latent or config.judged_rows > 1 or config.env.agents > 1:
-        return np.zeros(0)
+def _find_newest_episode(learner: Learner) -> Index | None:
+    """Return the steps of the last finished episode of a seed's first environment. None if none has finished."""
     buffer = learner.replay
-    known = int(np.min(buffer.transitions - jax.jit(jax.vmap(replay.oldest_transition))(buffer)))
-    count = min(RECENT, known)
-    steps = jax.jit(jax.vmap(lambda one: replay.read(one, replay.newest(one, count))))(buffer)
-    reward, last = np.asarray(steps.before["reward"]).ravel(), np.asarray(steps.last).ravel()
-    factors = np.asarray(steps.before["factors"]).reshape(len(reward), -1)
-    if not reward[~last].any():  # paid at the end only, so the true reward of each step is unknown
+    if not int(replay.n_finished(buffer)[0]):
+        return None
+    env_index, episode = np.int32(0), np.asarray(buffer.episodes)[0] - 1
+    start = int(np.asarray(buffer.first)[0, episode % buffer.first.shape[-1]])
+    number = jnp.arange(start, int(jax.jit(replay.end_of_episode)(buffer, env_index, episode)))
+    return Index(jnp.zeros(len(number), int), number)
+
+
+def _read_rewards(
+    learner: Learner, index: Index, config: TrainConfig
+) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
+    """Read steps of one seed's replay, and compute their proxy rewards."""
+    steps = replay.read(learner.replay, index)
+    return steps, rewards(steps, RewardState(learner.credit, learner.scale), config)
+
+
+def _posterior_std(decoder: Decomposition, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:
+    """Compute the posterior standard deviation of a single agent's proxy rewards, in float64."""
+    return reward_std(decoder, decoder_inputs(steps, config, 0)[:, 0], config.score_types)
+
+
+def _factor_correlations(learners: Learner, config: TrainConfig) -> Float[np.ndarray, " factors"]:
+    """Compute the correlations of a single agent's factors with its true reward, over the newest steps of all seeds.
+
+    They are NaN if only returns are known. The array is empty for many agents.
+    """
+    if not config.method.needs_phi or config.credit_rows > 1 or config.env.n_agents > 1:
+        return np.zeros(0)
+    buffers = learners.replay
+    n_stored = int(np.min(jax.jit(jax.vmap(replay.n_transitions))(buffers)))
+    n_steps = min(RECENT_STEPS, n_stored)
+    steps = jax.jit(jax.vmap(lambda buffer: replay.read(buffer, replay.newest_steps(buffer, n_steps))))(buffers)
+    reward, last = np.asarray(steps.columns["reward"]).ravel(), np.asarray(steps.last).ravel()
+    factors = np.asarray(steps.columns["factors"]).reshape(len(reward), -1)
+    if not reward[~last].any():  # only the last steps have rewards, so the true reward of each step is unknown
         return np.full(factors.shape[1], np.nan)
-    return correlations(factors, reward)
+    return column_correlations(factors, reward)

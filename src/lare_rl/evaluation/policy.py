@@ -1,4 +1,4 @@
-"""The policy of a finished (or stopped) run, to use in your own program."""
+"""The policy of a run, to use in other programs."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -9,80 +9,105 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.families import env_spec
+from lare_rl.envs.families import load_env_spec
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
-from lare_rl.envs.interface import env_action
+from lare_rl.envs.interface import to_env_action
 from lare_rl.envs.spaces import OneHot
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
-from lare_rl.training.collect_host import evaluation_action
-from lare_rl.training.compiled import compiled, new_memory
-from lare_rl.training.session import load_actor
-from lare_rl.training.streams import Stream, generator
+from lare_rl.training.compiled import compile_functions, init_memory
+from lare_rl.training.saved_state import load_actor
+from lare_rl.training.streams import Stream, numpy_generator
+from lare_rl.training.unroll_host import select_action
+
+__all__ = ["Policy", "discrete_action_space", "load_policy"]
+
+
+def load_policy(
+    run: Run | str | Path, seed: int | None = None, best: bool = False, deterministic: bool = False
+) -> "Policy":
+    """Load the policy of a seed: a function from an observation to an action of the environment, or from a batch to a batch.
+
+    It acts as in evaluations: PPO's choices are sampled, and all other actions are deterministic. Observations that are not one row
+    of numbers must be flattened first (`gymnasium.spaces.flatten`).
+
+    Args:
+        run: the run, or its directory.
+        seed: one of the run's seeds; the default is the first.
+        best: load the policy of the seed's best evaluation, instead of the last policy.
+        deterministic: always take the most likely choice, which PPO's policy samples otherwise.
+
+    Raises:
+        LareError: the run has several agents, or has no such seed, or no checkpoint.
+    """
+    run = as_run(run)
+    return Policy(run, run.seed_index(seed), best, deterministic)
 
 
 class Policy:
-    """A policy: from one observation to one action of the environment, or from a batch of them to a batch.
+    """The policy of one seed, which acts as in evaluations (`load_policy`).
 
-    It acts as in evaluations: PPO's choices are sampled (unless `deterministic` is true), and all other actions are deterministic.
     A policy with a memory (`qmix`, `vdn`) takes observations one at a time, in order, and `reset` begins a new episode.
     """
 
-    def __init__(self, run: Run, place: int, best: bool, deterministic: bool = False):
-        self.env = env_spec(run.config.task)
-        if self.env.agents > 1:
+    def __init__(self, run: Run, seed_index: int, best: bool, deterministic: bool = False):
+        self._env = load_env_spec(run.config.task)
+        if self._env.n_agents > 1:
             raise LareError(f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy")
         config, actors, _ = load_actor(run, best)
-        self.config = replace(config, deterministic=deterministic)
-        self.actor = jax.tree.map(lambda leaf: leaf[place : place + 1], actors)
-        self.functions = compiled(self.config)
-        self.random = generator(run.seeds[place], Stream.EVALUATION_NOISE, 0)
-        self.choices = choices(run) if self.env.discrete else None
+        self._config = replace(config, deterministic=deterministic)
+        self._actor = jax.tree.map(lambda leaf: leaf[seed_index : seed_index + 1], actors)
+        self._functions = compile_functions(self._config)
+        self._rng = numpy_generator(run.seeds[seed_index], Stream.EVALUATION_NOISE, 0)
+        self._choices = discrete_action_space(run) if self._env.discrete else None
         self.reset()
 
     def reset(self) -> None:
         """Begin a new episode."""
-        self.memory = new_memory(self.config, 1, 1)
+        self._memory = init_memory(self._config, 1, 1)
 
     def __call__(self, observation: Any) -> Any:
-        """The action for an observation (n,), or the actions for a batch (batch, n).
+        """Return the action for an observation (n,), or the actions for a batch (batch, n).
 
         Raises:
-            LareError: observations are of another size, or a policy that remembers its episode is given a batch.
+            LareError: observations have another size, or a policy with a memory is given a batch.
         """
-        rows, single = self.rows(observation)
-        found = self.actions(rows)
-        if self.choices is not None:
-            numbers = [self.choices.number(row) for row in found]
-            return numbers[0] if single else np.array(numbers)
-        return found[0] if single else found
+        rows, is_single = self._check_observation(observation)
+        actions = self._select_actions(rows)
+        if self._choices is not None:
+            actions = np.array([self._choices.to_discrete(action) for action in actions])
+        return actions[0] if is_single else actions
 
-    def row(self, observation: Any) -> Float[np.ndarray, " action"]:
-        """The action for one observation in the environment's units; for a choice, a one-hot row."""
-        return self.actions(self.rows(observation)[0])[0]
+    def select_env_action(self, observation: Any) -> Float[np.ndarray, " action"]:
+        """Return the action for one observation in the environment's units. A choice is a one-hot row."""
+        return self._select_actions(self._check_observation(observation)[0])[0]
 
-    def actions(self, rows: Float[np.ndarray, "batch observation"]) -> Float[np.ndarray, "batch action"]:
-        """The actions in the environment's units; for a choice, a one-hot row."""
-        count, remembers = len(rows), bool(jax.tree.leaves(self.memory))
-        if remembers and count > 1:
+    def _select_actions(self, rows: Float[np.ndarray, "batch observation"]) -> Float[np.ndarray, "batch action"]:
+        n_rows, has_memory = len(rows), bool(jax.tree.leaves(self._memory))
+        if has_memory and n_rows > 1:
             raise LareError(
-                f"the policy of {self.config.algorithm.name} remembers its episode: give it one observation at a time"
+                f"the policy of {self._config.algorithm.name} remembers its episode: give it one observation at a time"
             )
-        memory = self.memory if remembers else new_memory(self.config, 1, count)
-        available, new = np.ones((1, count, 1, self.env.action_size), bool), np.zeros((1, count), bool)
-        given = memory, rows[None, :, None], available, new
-        action, self.memory = evaluation_action(self.functions, self.config, self.actor, *given, [self.random])
-        return env_action(action[0, :, 0], self.env)
+        action, self._memory = select_action(
+            self._functions,
+            self._config,
+            self._actor,
+            self._memory if has_memory else init_memory(self._config, 1, n_rows),
+            observation=rows[None, :, None],
+            available=np.ones((1, n_rows, 1, self._env.action_size), bool),
+            episode_start=np.zeros((1, n_rows), bool),
+            rngs=[self._rng],
+        )
+        return to_env_action(action[0, :, 0], self._env)
 
-    def rows(self, given: Any) -> tuple[Float[np.ndarray, "batch observation"], bool]:
-        """Observations as rows, and whether a single one was given."""
-        size = self.env.observation_size
+    def _check_observation(self, observation: Any) -> tuple[Float[np.ndarray, "batch observation"], bool]:
+        """Return observations as rows, and whether there is a single one."""
+        size = self._env.observation_size
         try:
-            rows = np.asarray(given, np.float32)
+            rows = np.asarray(observation, np.float32)
         except (TypeError, ValueError):
-            raise LareError(
-                f"an observation is {size} numbers: no array can be made of {type(given).__name__}"
-            ) from None
+            kind = type(observation).__name__
+            raise LareError(f"an observation is {size} numbers: no array can be made of {kind}") from None
         if rows.ndim not in (1, 2) or rows.shape[-1] != size or not rows.size:
             raise LareError(
                 f"an observation is {size} numbers, and a batch has rows of them: the shape is {rows.shape}"
@@ -92,29 +117,8 @@ class Policy:
         return np.atleast_2d(rows), rows.ndim == 1
 
 
-def policy_of(
-    run: Run | str | Path, seed: int | None = None, best: bool = False, deterministic: bool = False
-) -> Policy:
-    """The policy of a seed, from one observation to one action of the environment, or from a batch to a batch.
-
-    It acts as in evaluations: PPO's choices are sampled, and all other actions are deterministic. Observations that are not one row
-    of numbers must be flattened first (`gymnasium.spaces.flatten`).
-
-    Args:
-        run: the run, or its directory.
-        seed: one of the run's seeds; the default is the first.
-        best: return the policy of the seed's best evaluation, instead of the last policy.
-        deterministic: always take the most likely choice, which PPO's policy samples otherwise.
-
-    Raises:
-        LareError: it is a run of many agents, or has no such seed, or no checkpoint.
-    """
-    run = as_run(run)
-    return Policy(run, run.place_of(seed), best, deterministic)
-
-
-def choices(run: Run) -> OneHot:
-    """The action space of a run's environment, whose actions are choices."""
+def discrete_action_space(run: Run) -> OneHot:
+    """Return the action space of a run's environment, whose actions must be choices."""
     with closing(GymnasiumEnv(run.config.task)) as env:
         assert isinstance(env.environment.action_space, OneHot)
         return env.environment.action_space

@@ -1,30 +1,37 @@
-"""An episode of a run's policy as a film, for one agent and for many."""
+"""Films of an episode of a run's policy, for one agent and for many."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from io import BytesIO
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 
-from lare_rl.envs.families import env_spec, make_host_env
+from lare_rl.envs.families import load_env_spec, make_env, make_host_env
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
-from lare_rl.envs.interface import HostEnv
+from lare_rl.envs.interface import HostEnv, JaxEnv
+from lare_rl.envs.play import play_steps
 from lare_rl.errors import LareError
-from lare_rl.evaluation import team_matches as agents
 from lare_rl.evaluation.policy import Policy
-from lare_rl.evaluation.watch import watch
+from lare_rl.evaluation.rollout import Rollout, roll_out
 from lare_rl.runs.directory import Run
 from lare_rl.training.streams import Stream, episode_seed
 
+__all__ = ["check_video_path", "encode_gif", "record_video", "render_rollout", "write_video"]
+
 FRAMES_PER_SECOND = 8
 """The frame rate of a film of many agents."""
-
-FRAME = {"width": 320, "height": 320}
+MAX_GIF_FRAMES_PER_SECOND = 25
+"""Browsers play a GIF at 50 frames a second at most, and a frame may take long without a graphics card."""
+FRAME_SIZE = {"width": 320, "height": 320}
 """Pixels of a MuJoCo film. The default, 480 by 480, takes twice the time and space."""
+
+Frame = UInt8[np.ndarray, "height width 3"]
 
 
 def record_video(run: Run, path: str | Path, best: bool = False, deterministic: bool = False) -> None:
@@ -36,66 +43,45 @@ def record_video(run: Run, path: str | Path, best: bool = False, deterministic: 
         LareError: the environment cannot be drawn on this machine, or the file cannot be written.
     """
     path = Path(path)
-    check_video(path)
-    if env_spec(run.config.task).agents > 1:
+    check_video_path(path)
+    if load_env_spec(run.config.task).n_agents > 1:
         if best or deterministic:
             raise LareError(
                 "many agents are filmed as they act in training, with their credit: leave best and deterministic out"
             )
-        pictures = agents.frames(run, watch(run))
-        if pictures is None:
+        frames = render_rollout(run, roll_out(run))
+        if frames is None:
             raise LareError(f"{run.config.task.name} steps on the host, where only single agents are filmed")
-        write_video(path, pictures, 1 / FRAMES_PER_SECOND)
+        write_video(path, frames, 1 / FRAMES_PER_SECOND)
         return
-    camera = {"camera_name": "track", **FRAME} if has_tracking_camera(run) else {}
-    with closing(make_host_env(run.config.task, render_mode="rgb_array", **camera)) as environment:
-        assert isinstance(environment, GymnasiumEnv)
-        fps = environment.environment.metadata.get("render_fps", 30)
-        # Browsers play a GIF at 50 frames a second at most, and a frame may take long where there is no graphics card.
-        every = max(1, round(fps / 25)) if path.suffix == ".gif" else 1
-        policy = Policy(run, 0, best, deterministic)
-        write_video(path, list(drawn(run, environment, every, policy)), every / fps)
+    camera = {"camera_name": "track", **FRAME_SIZE} if _has_tracking_camera(run) else {}
+    with closing(make_host_env(run.config.task, render_mode="rgb_array", **camera)) as env:
+        assert isinstance(env, GymnasiumEnv)
+        fps = env.environment.metadata.get("render_fps", 30)
+        interval = max(1, round(fps / MAX_GIF_FRAMES_PER_SECOND)) if path.suffix == ".gif" else 1
+        frames = _play_and_render(run, env, Policy(run, 0, best, deterministic), interval)
+        write_video(path, frames, interval / fps)
 
 
-def drawn(run: Run, environment: HostEnv, every: int, policy: Policy) -> Iterator[np.ndarray]:
-    """Pictures of an episode, one in `every` steps. Raises `LareError` if this machine cannot draw them."""
-    shown = environment.reset(episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0))
-    ended, step = False, 0
-    while not ended:
-        if step % every == 0:
-            yield picture(environment, run)
-        shown = environment.step(policy.row(shown.observation[0])[None])
-        ended, step = bool(shown.terminated or shown.truncated), step + 1
+def render_rollout(run: Run, rollout: Rollout) -> list[Frame] | None:
+    """Render the first episode with each agent's credit. Return None for an environment that cannot be drawn."""
+    env = make_env(run.config.task)
+    if not isinstance(env, JaxEnv):
+        env.close()
+        return None
+    return env.frames(rollout.select_episode(rollout.state), rollout.select_episode(rollout.credit))
 
 
-def gif(file: BytesIO, frames: Sequence[np.ndarray]) -> None:
-    """Write pictures of many agents as an animated GIF."""
-    first, *others = (Image.fromarray(frame) for frame in frames)
-    first.save(file, format="GIF", save_all=True, append_images=others, duration=1000 // FRAMES_PER_SECOND, loop=0)
+def encode_gif(frames: Iterable[Frame]) -> bytes:
+    """Return frames of many agents as an animated GIF."""
+    buffer = BytesIO()
+    first, *rest = map(Image.fromarray, frames)
+    duration_ms = 1000 // FRAMES_PER_SECOND
+    first.save(buffer, format="GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
+    return buffer.getvalue()
 
 
-def picture(environment: HostEnv, run: Run) -> np.ndarray:
-    """The environment as it is now."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of graphics libraries that find no screen; another one may not need it
-            return np.asarray(environment.render())
-    except Exception as error:  # every graphics library has its own error for a missing display
-        raise LareError(
-            f"{run.config.task.environment} cannot be drawn here: "
-            f"{error}; without a screen, MUJOCO_GL=egl in the environment may help"
-        ) from error
-
-
-def has_tracking_camera(run: Run) -> bool:
-    """Whether the environment is a MuJoCo model with a camera that follows it, which Gymnasium does not use by itself."""
-    with closing(make_host_env(run.config.task)) as environment:
-        assert isinstance(environment, GymnasiumEnv)
-        model: Any = getattr(environment.environment.unwrapped, "model", None)
-        return hasattr(model, "ncam") and "track" in (model.camera(number).name for number in range(model.ncam))
-
-
-def check_video(path: Path) -> None:
+def check_video_path(path: Path) -> None:
     """Raise `LareError` if a video could not be written, before the work is done."""
     if path.suffix not in (".gif", ".mp4"):
         raise LareError(f"{path} is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]")
@@ -103,14 +89,51 @@ def check_video(path: Path) -> None:
         raise LareError(f"the video {path} cannot be written: there is no directory {path.parent}")
 
 
-def write_video(path: Path, frames: Sequence[np.ndarray], seconds: float) -> None:
-    """Write pictures that are shown for so many seconds each. Raises `LareError` if that fails."""
+def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> None:
+    """Write frames that are shown for `frame_seconds` each. Raise `LareError` if that fails."""
     import imageio.v3 as imageio
 
-    timing: dict[str, Any] = {"duration": 1000 * seconds, "loop": 0} if path.suffix == ".gif" else {"fps": 1 / seconds}
+    is_gif = path.suffix == ".gif"
+    timing: dict[str, Any] = {"duration": 1000 * frame_seconds, "loop": 0} if is_gif else {"fps": 1 / frame_seconds}
     try:
         imageio.imwrite(path, list(frames), **timing)
     except (OSError, ValueError, ImportError, TypeError) as error:
         raise LareError(
             f"the video {path} cannot be written: {error}; .gif always works, .mp4 needs lare-rl[video]"
         ) from error
+
+
+def _play_and_render(run: Run, env: HostEnv, policy: Policy, interval: int) -> list[Frame]:
+    """Play an episode, and render every `interval`-th timestep at which the policy acts."""
+    frames, steps = [], count()
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        if next(steps) % interval == 0:
+            frames.append(_render(env, run))
+        return policy.select_env_action(observation)
+
+    seed = episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0)
+    for _ in play_steps(env, act, np.random.default_rng(0), seed):
+        pass
+    return frames
+
+
+def _render(env: HostEnv, run: Run) -> Frame:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore"
+            )  # graphics libraries warn if they find no screen, although another may not need it
+            return np.asarray(env.render())
+    except Exception as error:  # every graphics library has a different error for a missing display
+        raise LareError(
+            f"{run.config.task.environment} cannot be drawn here: {error}; without a screen, set MUJOCO_GL=egl"
+        ) from error
+
+
+def _has_tracking_camera(run: Run) -> bool:
+    """Return whether the environment is a MuJoCo model with a camera that follows it. Gymnasium does not use it by default."""
+    with closing(make_host_env(run.config.task)) as env:
+        assert isinstance(env, GymnasiumEnv)
+        model: Any = getattr(env.environment.unwrapped, "model", None)
+        return hasattr(model, "ncam") and "track" in (model.camera(index).name for index in range(model.ncam))

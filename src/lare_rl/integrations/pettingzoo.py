@@ -4,18 +4,21 @@ from copy import deepcopy
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.assigner.layout import layout_of
+from lare_rl.assigner.layout import Layout, make_layout
 from lare_rl.envs.episodic import TRUE_REWARD
-from lare_rl.errors import LareError, needs_extra
-from lare_rl.integrations.gymnasium import CREDIT_STEP, Pay, batch_of_one, check_pay
+from lare_rl.errors import LareError, missing_extra_error
+from lare_rl.integrations.gymnasium import batch_of_one
+from lare_rl.integrations.recorder import CREDIT_STEP, Pay, StepRecorder, check_pay
 
 try:
     from pettingzoo.utils.wrappers import BaseParallelWrapper
 except ModuleNotFoundError as error:
-    raise needs_extra("lare_rl.integrations.pettingzoo", "pettingzoo") from error
+    raise missing_extra_error("lare_rl.integrations.pettingzoo", "pettingzoo") from error
+
+__all__ = ["CreditParallel"]
 
 
 class CreditParallel(BaseParallelWrapper):
@@ -26,7 +29,7 @@ class CreditParallel(BaseParallelWrapper):
     the sum over the steps of the mean reward of the agents that act. An agent that leaves counts until its last step. The episode
     ends when all agents have left.
 
-    `reset` in the middle of an episode gives the episode up: it is never learned from.
+    `reset` in the middle of an episode gives the episode up: nothing is learned from it.
     """
 
     def __init__(self, env: Any, credit: CreditAssigner, pay: Pay = "proxy"):
@@ -38,88 +41,79 @@ class CreditParallel(BaseParallelWrapper):
             pay: the rewards that `step` returns: r_hat, or the environment's.
 
         Raises:
-            LareError: the number of agents or the spaces are not those that the assigner was made for.
+            LareError: the assigner was made for another number of agents, or for other spaces.
         """
         super().__init__(env)
         check_pay(pay)
         self.credit, self.pay = credit, pay
         self.team = list(env.possible_agents)
-        self.shown, self.taken = (self.layout(name) for name in ("observation", "action"))
-        if len(self.team) != credit.config.agents:
-            raise LareError(
-                f"the environment has {len(self.team)} agents, and the assigner has agents = {credit.config.agents}"
-            )
-        self.lane = object()
-        """A key that no other environment of the assigner has."""
-        self.before = np.zeros((len(self.team), self.shown.size), np.float32)
+        for name in ("observation", "action"):
+            layouts = [make_layout(getattr(env, f"{name}_space")(agent), f"{name}_space") for agent in self.team]
+            for agent, layout in zip(self.team, layouts, strict=True):
+                if layout != layouts[0]:
+                    raise LareError(
+                        f"the agents of a team need the same {name} space: {agent!r} has another one than {self.team[0]!r}"
+                    )
+        first = self.team[0]
+        self._recorder = StepRecorder(
+            credit, env.observation_space(first), env.action_space(first), env_ids=[object()], agents=len(self.team)
+        )
+        self._observation = self._empty_rows(self._recorder.observation_layout)
         """The last observation of each agent; zeros for an agent that has not appeared yet."""
 
-    def layout(self, name: str) -> Any:
-        """The layout of every agent's observations or actions."""
-        found = [layout_of(getattr(self.env, f"{name}_space")(agent), f"{name}_space") for agent in self.team]
-        for agent, one in zip(self.team, found, strict=True):
-            if one != found[0]:
-                raise LareError(
-                    f"the agents of a team must have the same {name} space, and {agent!r} has another one than {self.team[0]!r}"
-                )
-        size = getattr(self.credit.config, name).size
-        if found[0].size != size:
-            raise LareError(
-                f"{name}s of the environment are rows of {found[0].size} numbers, and the assigner was made for {size}"
-            )
-        return found[0]
-
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
-        self.credit.drop(self.lane)
+        self._recorder.drop(0)
         observations, infos = self.env.reset(seed=seed, options=options)
-        self.before = np.zeros_like(self.before)
-        self.before = self.seen(observations)
+        self._observation = self._empty_rows(self._recorder.observation_layout)
+        self._observation = self._update_observation(observations)
         return observations, infos
 
-    def seen(self, observations: dict) -> Float[np.ndarray, "agents observation"]:
-        """The observation of each agent; for an agent that has left, its last one."""
-        rows = self.before.copy()
-        for place, agent in enumerate(self.team):
-            if agent in observations:
-                batch = batch_of_one(self.env.observation_space(agent), observations[agent])
-                rows[place] = self.shown.rows(batch, "observation")[0]
-        return rows
-
     def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:
-        alive, action = self.acting(actions)
+        acting = {agent: index for index, agent in enumerate(self.team) if agent in actions}
+        action = self._action_rows(actions)
         observations, rewards, terminated, truncated, infos = self.env.step(deepcopy(actions))
-        after = self.seen(observations)
-        paid = np.array([[float(rewards.get(agent, 0)) for agent in self.team]])
-        many = len(self.team) > 1
-        lead = (1, len(self.team)) if many else (1,)
+        next_observation = self._update_observation(observations)
+        reward = np.array([float(rewards.get(agent, 0)) for agent in self.team])
+        alive = np.array([agent in acting for agent in self.team])
+        several = len(self.team) > 1  # a team of one is a single agent, whose arrays have no axis of agents
         steps = self.credit.add(
-            self.before.reshape(*lead, -1),
-            action.reshape(*lead, -1),
-            after.reshape(*lead, -1),
-            paid if many else paid[0],
+            self._observation[None] if several else self._observation,
+            action[None] if several else action,
+            next_observation[None] if several else next_observation,
+            reward[None] if several else reward,
             [not self.env.agents],
             [False],
-            lanes=[self.lane],
-            alive=alive[None] if many else None,
+            env_ids=self._recorder.env_ids,
+            alive=alive[None] if several else None,
         )
-        self.before = after
-        acted = {agent: place for place, agent in enumerate(self.team) if alive[place]}
-        number = {CREDIT_STEP: int(steps[0])}
+        self._observation = next_observation
         infos = {agent: dict(info) for agent, info in infos.items()}
-        for agent in acted:
-            own = {TRUE_REWARD: float(rewards.get(agent, 0)), **infos.get(agent, {}), **number}
-            infos[agent] = own
+        for agent, index in acting.items():
+            infos[agent] = {TRUE_REWARD: float(reward[index]), **infos.get(agent, {}), CREDIT_STEP: int(steps[0])}
         if self.pay == "proxy":
-            self.credit.fit_owed()
+            self.credit.fit_pending()
             r_hat = self.credit.rewards_at(steps).reshape(-1)
-            rewards = {agent: float(r_hat[acted[agent]]) if agent in acted else 0.0 for agent in rewards}
+            rewards = {agent: float(r_hat[acting[agent]]) if agent in acting else 0.0 for agent in rewards}
         return observations, rewards, terminated, truncated, infos
 
-    def acting(self, actions: dict) -> tuple[Bool[np.ndarray, " agents"], Float[np.ndarray, "agents action"]]:
-        """Which agents act, and their actions; zeros for the others."""
-        alive = np.array([agent in actions for agent in self.team])
-        rows = np.zeros((len(self.team), self.taken.size), np.float32)
-        for place in np.flatnonzero(alive):
-            agent = self.team[place]
-            rows[place] = self.taken.rows(batch_of_one(self.env.action_space(agent), actions[agent]), "action")[0]
-        return alive, rows
+    def _update_observation(self, observations: dict) -> Float[np.ndarray, "agents observation"]:
+        """Return the observation of each agent, or its last one if it has left."""
+        rows, layout = self._observation.copy(), self._recorder.observation_layout
+        for index, agent in enumerate(self.team):
+            if agent in observations:
+                rows[index] = layout.rows(
+                    batch_of_one(self.env.observation_space(agent), observations[agent]), "observation"
+                )[0]
+        return rows
+
+    def _action_rows(self, actions: dict) -> Float[np.ndarray, "agents action"]:
+        """Return the action of each agent, and zeros for an agent that does not act."""
+        layout = self._recorder.action_layout
+        rows = self._empty_rows(layout)
+        for index, agent in enumerate(self.team):
+            if agent in actions:
+                rows[index] = layout.rows(batch_of_one(self.env.action_space(agent), actions[agent]), "action")[0]
+        return rows
+
+    def _empty_rows(self, layout: Layout) -> Float[np.ndarray, "agents size"]:
+        return np.zeros((len(self.team), layout.size), np.float32)

@@ -13,18 +13,18 @@ import numpy as np
 
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.layout import Layout
-from lare_rl.errors import LareError, needs_extra
-from lare_rl.integrations.space_checks import check_assigner
+from lare_rl.errors import LareError, missing_extra_error
+from lare_rl.integrations.recorder import CREDIT_STEP, check_assigner
 
 try:
     import torch
     from tensordict import TensorDictBase
     from torchrl.envs.transforms import Transform
 except ModuleNotFoundError as error:
-    raise needs_extra("lare_rl.integrations.torchrl", "torchrl") from error
+    raise missing_extra_error("lare_rl.integrations.torchrl", "torchrl") from error
 
-CREDIT_STEP = "credit_step"
-"""The buffer's key for the numbers of steps."""
+__all__ = ["CREDIT_STEP", "REWARD", "CreditTransform"]
+
 REWARD = ("next", "reward")
 TRAJECTORY = ("collector", "traj_ids")
 """The key under which TorchRL's collectors store the trajectory of a step."""
@@ -37,11 +37,11 @@ class CreditTransform(Transform):
     where ("next", "done"), "terminated" or "truncated" is true. A collector names the trajectory of each step. Without a collector,
     the last dimension of the batch is time, and the next batch continues the episodes of this one.
 
-    It may be called from several threads. Before every sample, the decoder's updates that are due are made.
+    It may be called from several threads. Before every sample, the pending updates of the decoder are made.
     """
 
     def __init__(self, credit: CreditAssigner, observation: Any = None, action: Any = "action"):
-        """A transform for one replay buffer.
+        """Create a transform for one replay buffer.
 
         Args:
             credit: the assigner. It must keep at least as many steps as the buffer (`capacity`).
@@ -53,75 +53,71 @@ class CreditTransform(Transform):
         """
         super().__init__()
         check_assigner(credit)
-        if credit.config.agents > 1:
-            raise LareError(
-                f"CreditTransform pays a single agent, and the assigner has agents = {credit.config.agents}"
-            )
         self.credit = credit
-        parts = credit.config.observation.names
-        self.observation = observation if observation is not None else ({name: name for name in parts} or "observation")
+        names = credit.config.observation.names
+        self.observation = observation if observation is not None else ({name: name for name in names} or "observation")
         self.action = action
-        self.lanes = object()
-        """A key that no other transform of the assigner has."""
+        self._id = object()
+        """Distinguishes the trajectories from those of other transforms of the assigner."""
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Show new steps to the assigner, and store their numbers instead of their rewards."""
         if REWARD not in tensordict.keys(include_nested=True):
             raise LareError(
-                'CreditTransform belongs to a replay buffer of whole steps, with ("next", "reward"): '
-                f"there are {', '.join(map(str, tensordict.keys()))}"
+                'CreditTransform is for replay buffers of steps, with ("next", "reward"), and the keys are '
+                f"{', '.join(map(str, tensordict.keys()))}"
             )
-        after, known = tensordict.get("next"), self.credit.config
+        next_, config = tensordict.get("next"), self.credit.config
         steps = self.credit.add(
-            batch_of(tensordict, self.observation, known.observation),
-            batch_of(tensordict, self.action, known.action),
-            batch_of(after, self.observation, known.observation),
-            flat(after, "reward").reshape(-1),
-            flags(after, "terminated") | flags(after, "done"),
-            flags(after, "truncated"),
-            lanes=self.lanes_of(tensordict),
+            _read_elements(tensordict, self.observation, config.observation),
+            _read_elements(tensordict, self.action, config.action),
+            _read_elements(next_, self.observation, config.observation),
+            _flatten(next_, "reward").reshape(-1),
+            _read_flags(next_, "terminated") | _read_flags(next_, "done"),
+            _read_flags(next_, "truncated"),
+            env_ids=self._trajectories(tensordict),
         )
         reward = tensordict.get(REWARD)
         numbers = torch.as_tensor(steps, device=reward.device).reshape(tensordict.batch_size)
         return tensordict.set(CREDIT_STEP, numbers).set(REWARD, torch.zeros_like(reward))
 
-    def lanes_of(self, tensordict: TensorDictBase) -> list[tuple[object, int]]:
-        """A key for each step's trajectory."""
-        names = tensordict.get(TRAJECTORY, None)
-        if names is not None:
-            return [(self.lanes, name) for name in names.reshape(-1).tolist()]
-        time = tensordict.batch_size[-1] if tensordict.batch_dims else 1
-        return [(self.lanes, -1 - place // time) for place in range(tensordict.numel())]
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Set the rewards of sampled steps to r_hat."""
         steps, reward = tensordict.get(CREDIT_STEP, None), tensordict.get(REWARD)
         if steps is None:
-            raise LareError(f"the sample has no {CREDIT_STEP!r}: it went into the buffer without this transform")
-        self.credit.fit_owed()
-        r_hat = self.credit.rewards_at(steps.cpu().numpy())
-        paid = torch.as_tensor(r_hat, dtype=reward.dtype, device=reward.device)
-        return tensordict.set(REWARD, paid.reshape(reward.shape))
+            raise LareError(f"the sample has no {CREDIT_STEP!r}: add the steps to the buffer with this transform")
+        self.credit.fit_pending()
+        r_hat = torch.as_tensor(self.credit.rewards_at(steps.cpu().numpy()), dtype=reward.dtype, device=reward.device)
+        return tensordict.set(REWARD, r_hat.reshape(reward.shape))
+
+    def _trajectories(self, tensordict: TensorDictBase) -> list[tuple[object, int]]:
+        """Return a key for the trajectory of each step."""
+        trajectories = tensordict.get(TRAJECTORY, None)
+        if trajectories is not None:
+            return [(self._id, number) for number in trajectories.reshape(-1).tolist()]
+        n_times = tensordict.batch_size[-1] if tensordict.batch_dims else 1
+        # Negative, because collectors count trajectories from 0.
+        return [(self._id, -1 - step // n_times) for step in range(tensordict.numel())]
 
 
-def flat(tensordict: TensorDictBase, key: Any) -> np.ndarray:
-    """The values under a key, with the axes of the batch merged into one axis of steps."""
+def _flatten(tensordict: TensorDictBase, key: Any) -> np.ndarray:
+    """Return the values under a key, with one axis of steps instead of the axes of the batch."""
     values = tensordict.get(key).detach().cpu().numpy()
     return values.reshape(-1, *values.shape[tensordict.batch_dims :])
 
 
-def flags(tensordict: TensorDictBase, key: str) -> np.ndarray:
-    """The flags under a key, one for each step; false if there is no such key."""
+def _read_flags(tensordict: TensorDictBase, key: str) -> np.ndarray:
+    """Return the flag of each step under a key, or false if there is no such key."""
     if key not in tensordict.keys():  # noqa: SIM118
         return np.zeros(tensordict.numel(), bool)
-    return flat(tensordict, key).reshape(-1)
+    return _flatten(tensordict, key).reshape(-1)
 
 
-def batch_of(tensordict: TensorDictBase, key: Any, layout: Layout) -> Any:
-    """Observations or actions in the form that the assigner takes. In TorchRL, choices are one-hot rows of flags, or numbers."""
+def _read_elements(tensordict: TensorDictBase, key: Any, layout: Layout) -> Any:
+    """Return observations or actions in the form that the assigner takes. In TorchRL, choices are one-hot rows or numbers."""
     if isinstance(key, dict):
-        parts = zip(layout.names, layout.parts, strict=True)
-        return {name: batch_of(tensordict, key[name], part) for name, part in parts}
-    values = flat(tensordict, key)
-    marked = layout.kind == "choices" and values.ndim == 2 and values.shape[1] == layout.size > 1
-    return values.astype(np.float32) if marked else values
+        children = zip(layout.names, layout.parts, strict=True)
+        return {name: _read_elements(tensordict, key[name], child) for name, child in children}
+    values = _flatten(tensordict, key)
+    is_one_hot = layout.kind == "choices" and values.ndim == 2 and values.shape[1] == layout.size > 1
+    return values.astype(np.float32) if is_one_hot else values

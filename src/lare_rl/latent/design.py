@@ -4,26 +4,35 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from lare_rl.envs.load import as_task
-from lare_rl.errors import LareError, shortened
-from lare_rl.latent.candidates import CANDIDATES, MOST_CANDIDATES
-from lare_rl.latent.function import LatentFunction, normal, of_verdict
+from lare_rl.envs.load import resolve_task
+from lare_rl.errors import LareError, short_repr
+from lare_rl.latent.function import LatentFunction, function_from_verdict, normalise_source
 from lare_rl.latent.verify import Check, Steps, Verdict, sample_steps, verify
 from lare_rl.llm import prompts
 from lare_rl.llm.model import Model, recorded_model
-from lare_rl.llm.prompts import Kind, Message, Stage
+from lare_rl.llm.prompts import MAX_CANDIDATES, N_CANDIDATES, Kind, Message, Stage
 from lare_rl.llm.recording import Recorder
-from lare_rl.llm.reply import MalformedReply, parse
-from lare_rl.tasks.spec import TaskSpec, the_role
+from lare_rl.llm.reply import MalformedReplyError, parse_reply
+from lare_rl.tasks.spec import TaskSpec, require_role
 
-ATTEMPTS = 5
-"""How often a function is verified, the first time included, before the loop gives up."""
+__all__ = [
+    "Conversation",
+    "DesignError",
+    "DesignInterruptedError",
+    "DesignModelError",
+    "check_recorded",
+    "design",
+    "examine_reply",
+]
 
-LONGEST_QUOTE = 20_000
-"""Characters of a failed reply that are shown to the model again."""
+_MAX_ATTEMPTS = 5
+"""Attempts at a function that passes verification, the first included."""
+
+_MAX_QUOTE = 20_000
+"""Characters of a failed reply that the model sees again."""
 
 
-class DesignFailed(LareError):
+class DesignError(LareError):
     """No attempt passed. `recorder` holds all exchanges with the model."""
 
     status = 1
@@ -33,13 +42,13 @@ class DesignFailed(LareError):
         self.recorder, self.model = recorder, model
 
 
-class DesignBroken(DesignFailed):
+class DesignModelError(DesignError):
     """The model became unavailable before an attempt passed."""
 
     status = 2
 
 
-class DesignStopped(DesignFailed):
+class DesignInterruptedError(DesignError):
     """The user stopped the design before an attempt passed."""
 
     status = 130
@@ -51,26 +60,26 @@ class Attempt:
 
     reply: str
     source: str
-    """Empty if the reply could not be read."""
+    """It is empty if the reply could not be read."""
     verdict: Verdict
     errors: str
-    """All errors of the reply, for the model; empty if it passed."""
+    """All errors of the reply, for the model. It is empty if the reply passed."""
+
+    @property
+    def first_error(self) -> str:
+        """The first error, in one line, or "passes"."""
+        lines = self.errors.splitlines() or ["passes"]
+        return lines[0] + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else "")
 
 
-def examine(reply: str, task: TaskSpec, kind: Kind, steps: Steps | None = None) -> Attempt:
+def examine_reply(reply: str, task: TaskSpec, kind: Kind, steps: Steps | None = None) -> Attempt:
     """Read and verify a reply."""
     try:
-        source = normal(parse(reply).functions)
-    except MalformedReply as error:
-        return Attempt(reply, "", Verdict(()), str(error))
+        source = normalise_source(parse_reply(reply).functions)
+    except MalformedReplyError as error:
+        return Attempt(reply=reply, source="", verdict=Verdict(()), errors=str(error))
     verdict = verify(source, task, kind, steps)
-    return Attempt(reply, source, verdict, verdict.errors)
-
-
-def first_line(attempt: Attempt) -> str:
-    """The first error of an attempt, in one line."""
-    lines = attempt.errors.splitlines() or ["passes"]
-    return lines[0] + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else "")
+    return Attempt(reply=reply, source=source, verdict=verdict, errors=verdict.errors)
 
 
 @dataclass(frozen=True)
@@ -81,18 +90,18 @@ class Conversation:
     kind: Kind
     model: Model
     recorder: Recorder
-    said: Callable[[str], None]
+    on_message: Callable[[str], None]
     steps: Steps | None = None
-    """The steps that functions are tried on. None means random steps of the environment."""
+    """The steps that functions are tried on. The default is random steps of the environment."""
 
     def ask(self, stage: Stage, messages: Sequence[Message]) -> str:
-        """A reply to a request. Each call asks for a new reply."""
-        reply = self.model.reply(messages, self.recorder.asked(stage, messages))
-        self.recorder.take(stage, messages, reply, self.model.name)
+        """Return a new reply to a request."""
+        reply = self.model.reply(messages, self.recorder.n_replies(stage, messages))
+        self.recorder.add(stage, messages, reply, self.model.name)
         return reply
 
-    def begin(self, candidates: int, pre_verification: bool) -> tuple[list[Message], str]:
-        """Ask for candidates and their combination. Returns the last request and the reply to it.
+    def start(self, candidates: int, pre_verification: bool) -> tuple[list[Message], str]:
+        """Ask for candidates and their combination. Return the last request and the reply to it.
 
         Only candidates that pass verification are combined. If none passes, or without pre-verification, all are combined.
         """
@@ -100,64 +109,73 @@ class Conversation:
         replies = [self.ask("candidate", request) for _ in range(candidates)]
         if candidates == 1:
             return request, replies[0]
-        sound = self.sound(replies) if pre_verification else []
-        request = prompts.combine(self.task, sound or [quoted(reply) for reply in replies], self.kind)
+        passing = []
+        if pre_verification:
+            attempts = [self._examine(reply) for reply in replies]
+            for number, attempt in enumerate(attempts, start=1):
+                self.on_message(f"candidate {number}: {attempt.first_error}")
+            passing = [attempt.reply for attempt in attempts if not attempt.errors]
+        request = prompts.combine(self.task, passing or list(map(_quote, replies)), self.kind)
         return request, self.ask("combine", request)
 
-    def sound(self, replies: Sequence[str]) -> list[str]:
-        """The replies that can be read and pass verification."""
-        tried = [examine(reply, self.task, self.kind, self.steps) for reply in replies]
-        for number, attempt in enumerate(tried, start=1):
-            self.said(f"candidate {number}: {first_line(attempt)}")
-        return [attempt.reply for attempt in tried if not attempt.errors]
-
     def correct(self, request: list[Message], reply: str) -> Attempt:
-        """Verify a reply, and ask for corrections until one passes. Raises `DesignFailed` after the last attempt."""
-        attempt = examine(reply, self.task, self.kind, self.steps)
-        for number in range(2, ATTEMPTS + 1):
-            self.said(f"attempt {number - 1}: {first_line(attempt)}")
+        """Verify a reply, and ask for corrections until one passes.
+
+        Raises:
+            DesignError: no attempt has passed.
+        """
+        attempt = self._examine(reply)
+        for number in range(1, _MAX_ATTEMPTS + 1):
+            self.on_message(f"attempt {number}: {attempt.first_error}")
             if not attempt.errors:
                 return attempt
-            request = prompts.correct(request, quoted(attempt.reply), attempt.errors)
-            attempt = examine(self.ask("correct", request), self.task, self.kind, self.steps)
-        self.said(f"attempt {ATTEMPTS}: {first_line(attempt)}")
-        if not attempt.errors:
-            return attempt
-        raise self.failed(f"none of {ATTEMPTS} attempts passed; the last one failed: {first_line(attempt)}")
+            if number < _MAX_ATTEMPTS:
+                request = prompts.correct(request, _quote(attempt.reply), attempt.errors)
+                attempt = self._examine(self.ask("correct", request))
+        raise self._error(f"none of {_MAX_ATTEMPTS} attempts passed; the last one failed: {attempt.first_error}")
 
-    def once(self, reply: str) -> Attempt:
-        """Accept a reply if it can be read: the ablation without pre-verification. Raises `DesignFailed` if it cannot."""
-        attempt = examine(reply, self.task, self.kind, self.steps)
+    def accept(self, reply: str) -> Attempt:
+        """Accept a reply if it can be read: the ablation without pre-verification.
+
+        Raises:
+            DesignError: the reply cannot be read.
+        """
+        attempt = self._examine(reply)
         if attempt.verdict.graph is None:
-            raise self.failed(f"the reply cannot be read: {first_line(attempt)}")
+            raise self._error(f"the reply cannot be read: {attempt.first_error}")
         return replace(attempt, verdict=Verdict((Check("read", True),), attempt.verdict.graph), errors="")
 
-    def made(self, attempt: Attempt) -> LatentFunction:
-        """The latent function of an attempt."""
-        verdict = attempt.verdict
-        return self.with_exchanges(
-            replace(of_verdict(attempt.source, self.task, self.kind, verdict), model=self.model.name)
-        )
+    def to_function(self, attempt: Attempt) -> LatentFunction:
+        """Return the latent function of an attempt."""
+        function = function_from_verdict(attempt.source, self.task, self.kind, attempt.verdict)
+        return self.add_exchanges(replace(function, model=self.model.name))
 
-    def with_exchanges(self, function: LatentFunction) -> LatentFunction:
-        """The function with all exchanges so far."""
+    def add_exchanges(self, function: LatentFunction) -> LatentFunction:
+        """Return the function with all exchanges so far."""
         return replace(function, exchanges=tuple(exchange.model_dump() for exchange in self.recorder.exchanges))
 
-    def failed(self, why: str) -> DesignFailed:
-        return DesignFailed(f"task {self.task.name!r}: {why}", self.recorder, self.model.name)
+    def _examine(self, reply: str) -> Attempt:
+        return examine_reply(reply, self.task, self.kind, self.steps)
+
+    def _error(self, reason: str) -> DesignError:
+        return DesignError(f"task {self.task.name!r}: {reason}", self.recorder, self.model.name)
+
+
+def _quote(reply: str) -> str:
+    """Shorten a reply that the model sees again. It must not be empty, because some servers refuse empty messages."""
+    return reply[:_MAX_QUOTE] if reply.strip() else "(an empty reply)"
 
 
 def check_recorded(task: TaskSpec, kind: Kind, draw: int, candidates: int) -> None:
-    """Raise `LareError` if the shipped recordings lack a reply that a design needs when every candidate passes."""
+    """Check that the shipped recordings have the replies that a design needs when every candidate passes.
+
+    Raises:
+        LareError: a reply is missing.
+    """
     model, request = recorded_model(task.name, kind, draw), prompts.candidate(task, kind)
     replies = [model.reply(request, sample) for sample in range(candidates)]
     if candidates > 1:
         model.reply(prompts.combine(task, replies, kind), 0)
-
-
-def quoted(reply: str) -> str:
-    """A reply as it is shown to the model again: shortened, and never empty, because some servers refuse empty messages."""
-    return reply[:LONGEST_QUOTE] if reply.strip() else "(an empty reply)"
 
 
 def design(
@@ -165,10 +183,10 @@ def design(
     kind: Kind = "factors",
     model: Model | None = None,
     draw: int = 0,
-    candidates: int = CANDIDATES,
+    candidates: int = N_CANDIDATES,
     pre_verification: bool = True,
     record: Path | None = None,
-    said: Callable[[str], None] = lambda _: None,
+    on_message: Callable[[str], None] = lambda _: None,
     steps: Steps | None = None,
 ) -> LatentFunction:
     """Ask a model for `phi` until one passes every check.
@@ -183,39 +201,39 @@ def design(
         kind: several factors, or one reward.
         model: the language model to ask. Without one, the shipped recordings answer.
         draw: the number of the shipped recording that answers (0 to 4). It is independent of the training seed.
-        candidates: n; with 1 (the paper's ablation without self-prompting), the single candidate is the function and
+        candidates: n. With 1 (the paper's ablation without self-prompting), the single candidate is the function and
             nothing is combined.
-        pre_verification: without it (the paper's ablation), the first function is kept if it can be read.
+        pre_verification: without it (the paper's ablation), the first function that can be read is accepted.
         record: the file to which every exchange is written, from the first reply on.
-        said: a function that receives messages about the progress.
+        on_message: called with messages about the progress.
         steps: observations (n, observation size) and actions (n, action size) that functions are tried on if there is no
             environment, as `lare_rl.logged_steps` reads them from a data set.
 
     Raises:
-        DesignFailed: no attempt passed. `DesignBroken` if the model became unavailable, `DesignStopped` after Ctrl-C.
+        DesignError: no attempt passed. It is a `DesignModelError` if the model became unavailable, and a `DesignInterruptedError`
+            after Ctrl-C.
         LareError: the model cannot answer, the environment does not run, or each team of the task needs its own function.
     """
-    task = the_role(as_task(task))
+    task = require_role(resolve_task(task))
     if model is not None and not isinstance(model, Model):
-        raise LareError(f"a model must have a name and a method reply(messages, sample): {shortened(model)} does not")
-    if not 1 <= candidates <= MOST_CANDIDATES:
-        raise LareError(f"candidates = {candidates}: from 1 to {MOST_CANDIDATES}")
+        raise LareError(f"a model must have a name and a method reply(messages, sample): {short_repr(model)} does not")
+    if not 1 <= candidates <= MAX_CANDIDATES:
+        raise LareError(f"candidates = {candidates}: from 1 to {MAX_CANDIDATES}")
     model = model or recorded_model(task.name, kind, draw)
-    # Detects an environment that does not run before a model is paid.
-    sample_steps(task, steps)
+    sample_steps(task, steps)  # an environment that does not run is found before a model is paid
     recorder = Recorder(task.name, kind, getattr(model, "temperature", None), record)
-    conversation = Conversation(task, kind, model, recorder, said, steps)
+    conversation = Conversation(task, kind, model, recorder, on_message, steps)
     try:
-        request, reply = conversation.begin(candidates, pre_verification)
-        attempt = conversation.correct(request, reply) if pre_verification else conversation.once(reply)
-    except DesignFailed:
+        request, reply = conversation.start(candidates, pre_verification)
+        attempt = conversation.correct(request, reply) if pre_verification else conversation.accept(reply)
+    except DesignError:
         raise
     except LareError as error:
         if not recorder.exchanges:
             raise
-        raise DesignBroken(str(error), recorder, model.name) from error
+        raise DesignModelError(str(error), recorder, model.name) from error
     except KeyboardInterrupt:
         if not recorder.exchanges:
             raise
-        raise DesignStopped("stopped", recorder, model.name) from None
-    return conversation.made(attempt)
+        raise DesignInterruptedError("stopped", recorder, model.name) from None
+    return conversation.to_function(attempt)

@@ -9,7 +9,9 @@ from lare_rl.errors import LareError
 from lare_rl.phi.evaluate import compute, evaluate
 from lare_rl.phi.graph import Graph
 
-CHUNK = 1 << 22
+__all__ = ["LatentRewardError", "check_finite", "compute_factors", "find_infinity"]
+
+_CHUNK_NUMBERS = 1 << 22
 """About how many numbers are computed at a time."""
 
 
@@ -27,7 +29,7 @@ def compute_factors(
     action: Float[np.ndarray, "batch action"],
 ) -> Float[np.ndarray, "batch factors"]:
     """Compute the factors of a batch. They are not checked: they may be infinite or NaN."""
-    rows = max(1, CHUNK // max(graph.size, 1))
+    rows = max(1, _CHUNK_NUMBERS // max(graph.size, 1))
     chunks = [
         evaluate(graph, {"observation": observation[i : i + rows], "action": action[i : i + rows]})["factors"]
         for i in range(0, max(len(observation), 1), rows)
@@ -41,27 +43,30 @@ def check_finite(
     observation: Float[np.ndarray, "batch observation"],
     action: Float[np.ndarray, "batch action"],
 ) -> None:
-    """Raise `LatentRewardError` if a factor is not finite."""
+    """Check that all factors are finite.
+
+    Raises:
+        LatentRewardError: a factor is infinite or NaN.
+    """
     if not np.isfinite(factors).all():
         row, column = np.argwhere(~np.isfinite(factors))[0]
-        shown = np.array2string(observation[row], precision=3, threshold=6)
-        message = f"the latent function failed: factor {names[column]!r} is {factors[row, column]} for the observation {shown}"
+        text = np.array2string(observation[row], precision=3, threshold=6)
+        message = (
+            f"the latent function failed: factor {names[column]!r} is {factors[row, column]} for the observation {text}"
+        )
         raise LatentRewardError(message, observation, action)
 
 
-def origin_of_infinity(
+def find_infinity(
     graph: Graph,
     factor: int,
     observation: Float[np.ndarray, "batch observation"],
     action: Float[np.ndarray, "batch action"],
 ) -> tuple[str, int] | None:
-    """The first operation that makes a factor of these rows infinite or not a number, and the line of the source that it is in.
-
-    None if there is no such operation.
-    """
+    """Return the first operation that makes a factor infinite or NaN on these rows, and its line in the source, or None."""
     values: list[np.ndarray] = []
-    inputs = {"observation": observation, "action": action}
     finite: list[bool] = []
+    inputs = {"observation": observation, "action": action}
     for node in graph.nodes:
         if node.op == "input":
             values.append(inputs[node.option])

@@ -12,30 +12,43 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.errors import LareError, shortened
+from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.factors import check_finite, compute_factors
 from lare_rl.latent.verify import Check, Steps, Verdict, verify
-from lare_rl.llm.key import without_key
+from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import Kind
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.names import factor_meanings, factor_names
 from lare_rl.phi.read import read
-from lare_rl.tasks.spec import Judges, TaskSpec, the_role
+from lare_rl.tasks.spec import FactorInputs, TaskSpec, require_role, select_states
 
-CHANGED = "; changed by hand since"
-"""Appended to the model's name if a source is not the one that was saved."""
+__all__ = [
+    "CHANGED_SUFFIX",
+    "HEADER_PREFIX",
+    "LatentFunction",
+    "check_task",
+    "features_text",
+    "function_from_verdict",
+    "normalise_source",
+    "pair_with_roles",
+    "source_hash",
+    "verify_function",
+]
 
-VARIATION = "\ufe0f"
+CHANGED_SUFFIX = "; changed by hand since"
+"""It is appended to the model's name if a source is not the saved one."""
 
-HEADER = "# lare: "
-"""Marks the lines that `save` puts on top of the source."""
+HEADER_PREFIX = "# lare: "
+"""It begins the lines that `save` puts on top of the source."""
+
+_VARIATION_SELECTOR = "\ufe0f"
 
 
 @dataclass(frozen=True)
 class LatentFunction:
     """`phi` of one task: (batch, observation), (batch, action) -> (batch, d).
 
-    A function from `design`, `verified` or `load` has passed every check.
+    A function from `design`, `verify_function` or `load_function` has passed every check.
     """
 
     task: str
@@ -53,19 +66,19 @@ class LatentFunction:
     @property
     def digest(self) -> str:
         """SHA-256 of the source."""
-        return sha256(self.source)
+        return source_hash(self.source)
 
     @property
     def changed(self) -> bool:
         """Whether the source was changed after it was saved."""
-        return self.model.endswith(CHANGED)
+        return self.model.endswith(CHANGED_SUFFIX)
 
     @functools.cached_property
     def graph(self) -> Graph:
-        """The function as a graph of array operations of one row: what is computed, compiled and exported.
+        """The function as a graph of array operations on one row: what is computed, compiled and exported.
 
         Raises:
-            Refused: the source cannot be read, which a verified function's can.
+            RefusedError: the source cannot be read. This does not happen to a verified function.
         """
         return read(self.source, *self.sizes)
 
@@ -76,21 +89,21 @@ class LatentFunction:
 
     @property
     def meanings(self) -> list[str]:
-        """The source's comment on each factor; empty for a factor without a comment."""
+        """The source's comment on each factor. It is empty for a factor without a comment."""
         return factor_meanings(self.source, self.names)
 
     @property
-    def entries_read(self) -> list[dict[str, list[int]]]:
-        """For each factor, the entries of the observation and of the action that it depends on, by "observation" and "action"."""
+    def features_read(self) -> list[dict[str, list[int]]]:
+        """For each factor, the indices of "observation" and "action" that it depends on."""
         return self.graph.entries_read("factors")
 
     @property
     def reads(self) -> list[str]:
-        """The same as texts: "observation[8:10, 13], action[0:6]"."""
-        return [entries_text(entries) for entries in self.entries_read]
+        """`features_read` as texts: "observation[8:10, 13], action[0:6]"."""
+        return [features_text(indices) for indices in self.features_read]
 
     def __call__(self, observation: Any, action: Any) -> Float[np.ndarray, "*batch factors"]:
-        """The factors of a batch of steps, or of a single step.
+        """Compute the factors of a batch of steps, or of a single step.
 
         Args:
             observation: (batch, observation size), or a single row (observation size,).
@@ -100,64 +113,45 @@ class LatentFunction:
             LareError: the arrays do not have the task's sizes, or the numbers of observations and actions differ.
             LatentRewardError: a factor is not finite.
         """
-        rows, single = self.rows(observation, action)
-        factors = compute_factors(self.graph, *rows)
-        check_finite(factors, self.names, *rows)
-        return factors[0] if single else factors
-
-    def rows(self, observation: Any, action: Any) -> tuple[tuple[np.ndarray, np.ndarray], bool]:
-        """Both arrays as rows of numbers, and whether both were single rows."""
-        arrays = []
-        for name, values, size in zip(("observation", "action"), (observation, action), self.sizes, strict=True):
-            try:
-                array = np.asarray(values, np.float32)
-            except (TypeError, ValueError):
-                raise LareError(
-                    f"{name}s must be arrays of numbers: {shortened(values)} cannot be converted to one"
-                ) from None
-            if array.ndim not in (1, 2) or size != array.shape[-1]:
-                raise LareError(
-                    f"{name}s must have the shape (batch, {size}), or ({size},) for a single step: the shape is {array.shape}"
-                )
-            arrays.append(array)
-        single = {array.ndim for array in arrays} == {1}
-        observations, actions = (np.atleast_2d(array) for array in arrays)
+        observations = _as_array("observation", observation, self.sizes[0])
+        actions = _as_array("action", action, self.sizes[1])
+        single = observations.ndim == actions.ndim == 1
+        observations, actions = np.atleast_2d(observations), np.atleast_2d(actions)
         if len(observations) != len(actions):
             raise LareError(
-                f"there are {len(observations)} observations and {len(actions)} actions: each step needs one observation and one "
-                "action"
+                f"there are {len(observations)} observations and {len(actions)} actions: each step needs one of both"
             )
-        return (observations, actions), single
+        factors = compute_factors(self.graph, observations, actions)
+        check_finite(factors, self.names, observations, actions)
+        return factors[0] if single else factors
 
-    def of_steps(
-        self,
-        before: Any,
-        action: Any,
-        after: Any,
-        judges: Judges,
+    def step_factors(
+        self, observation: Any, action: Any, next_observation: Any, factor_inputs: FactorInputs
     ) -> Float[np.ndarray, "*batch factors"]:
-        """The factors of steps, by the observations that `judges` names. For "both", the factors are concatenated.
+        """Compute the factors of steps from the observations that `factor_inputs` names.
+
+        For "both", the factors of both observations are concatenated.
 
         Raises:
-            LareError: as for `__call__`, or `judges` is not before, after or both.
+            LareError: as for `__call__`, or `factor_inputs` is not before, after or both.
         """
-        if judges not in ("before", "after", "both"):
-            raise LareError(f"judges = {shortened(judges)}: it is before, after or both")
-        judged = {"before": [before], "after": [after], "both": [before, after]}[judges]
-        return np.concatenate([self(observation, action) for observation in judged], axis=-1)
+        if factor_inputs not in ("before", "after", "both"):
+            raise LareError(f"judges = {short_repr(factor_inputs)}: it is before, after or both")
+        observations = select_states(factor_inputs, observation, next_observation)
+        return np.concatenate([self(array, action) for array in observations], axis=-1)
 
-    def size_by(self, judges: Judges) -> int:
-        """How many factors `of_steps` gives."""
-        return 2 * self.size if judges == "both" else self.size
+    def n_factors(self, factor_inputs: FactorInputs) -> int:
+        """Return the number of factors of `step_factors`."""
+        return 2 * self.size if factor_inputs == "both" else self.size
 
-    def columns_by(self, judges: Judges) -> list[str]:
-        """Names of the columns that `of_steps` gives."""
-        if judges != "both":
+    def factor_columns(self, factor_inputs: FactorInputs) -> list[str]:
+        """Return the names of the factors of `step_factors`."""
+        if factor_inputs != "both":
             return list(self.names)
-        return [f"{name} ({which})" for which in ("before", "after") for name in self.names]
+        return [f"{name} ({side})" for side in ("before", "after") for name in self.names]
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state for another process: everything except the graph, which is read again there."""
+        """Return the state for another process, without the graph, which is read again there."""
         return {name: value for name, value in self.__dict__.items() if name != "graph"}
 
     def save(self, path: str | Path) -> None:
@@ -170,91 +164,126 @@ class LatentFunction:
         if not path.name:
             raise LareError(f"{path} is not the name of a file")
         path = path.with_suffix(".py")
-        top = (
+        header = (
             f"task: {self.task}",
             f"kind: {self.kind}",
             f"model: {self.model}",
             f"sha256: {self.digest}",
             f"passed: {', '.join(check.name for check in self.checks)}",
         )
-        top = (" ".join(line.split()) for line in top)  # names are untrusted, and must not become lines of code
+        # Names are untrusted. Without line breaks, they cannot become lines of code.
+        lines = [HEADER_PREFIX + " ".join(line.split()) for line in header]
+        texts = {".py": "\n".join([*lines, self.source]), ".json": json.dumps(asdict(self), indent=1)}
         try:
-            path.write_text(
-                without_key("".join(f"{HEADER}{line}\n" for line in top) + self.source + "\n"), encoding="utf-8"
-            )
-            path.with_suffix(".json").write_text(
-                without_key(json.dumps(asdict(self), indent=1)) + "\n", encoding="utf-8"
-            )
+            for suffix, text in texts.items():
+                path.with_suffix(suffix).write_text(redact_key(text) + "\n", encoding="utf-8")
         except OSError as error:
             raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
 
-def entries_text(entries: dict[str, list[int]]) -> str:
-    """Entries as Python's indices, runs of them as slices: "observation[8:10, 13]"; "nothing" if there are none."""
-    texts = []
-    for name, numbers in entries.items():
-        runs = [list(run) for _, run in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
-        ends = [(run[0][1], run[-1][1]) for run in runs]
-        if numbers:
-            texts.append(f"{name}[{', '.join(str(a) if a == b else f'{a}:{b + 1}' for a, b in ends)}]")
-    return ", ".join(texts) or "nothing"
+def _as_array(name: str, values: Any, size: int) -> np.ndarray:
+    """Return observations or actions as an array of rows, or of a single row."""
+    try:
+        array = np.asarray(values, np.float32)
+    except (TypeError, ValueError):
+        raise LareError(f"{name}s must be arrays of numbers, not {short_repr(values)}") from None
+    if array.ndim not in (1, 2) or array.shape[-1] != size:
+        raise LareError(
+            f"{name}s must have the shape (batch, {size}), or ({size},) for a single step: the shape is {array.shape}"
+        )
+    return array
 
 
-def sha256(source: str) -> str:
-    """SHA-256 of a source, in hexadecimal digits."""
-    return hashlib.sha256(source.encode()).hexdigest()
-
-
-def normal(source: str) -> str:
-    r"""The source in its stored form: lines end with \n, no surrounding blank lines, and no header of `save`.
-
-    Variation selectors, which turn a sign into an emoji, are removed: models write warning signs into comments, and a variation
-    selector is invisible. A line ends where Python's parser ends it, and nowhere else.
-    """
-    lines = source.replace(VARIATION, "").replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    return "\n".join(itertools.dropwhile(lambda line: not line or line.startswith(HEADER), lines)).rstrip("\n")
-
-
-def verified(
+def verify_function(
     source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | None = None, path: Path | None = None
 ) -> LatentFunction:
-    """Verify a source on `steps`, as `verify` does, and return the function.
+    """Verify a source, and return its function.
 
-    Raises `LareError` with all errors if it fails, and with the path of its file if one is given.
+    Args:
+        source: Python code.
+        task: the task of the function.
+        kind: whether the function returns factors or one reward.
+        steps: the steps that it is tried on, as in `verify`.
+        path: the file of the source, for the error message.
+
+    Raises:
+        LareError: the source does not pass. The message contains all errors.
     """
-    source = normal(source)
+    source = normalise_source(source)
     verdict = verify(source, task, kind, steps)
     if not verdict.passed:
-        where = "" if path is None else f"{path}: "
-        raise LareError(f"{where}the function does not fit task {task.name!r}: {verdict.errors}")
-    return of_verdict(source, task, kind, verdict)
+        prefix = "" if path is None else f"{path}: "
+        raise LareError(f"{prefix}the function does not fit task {task.name!r}: {verdict.errors}")
+    return function_from_verdict(source, task, kind, verdict)
 
 
-def of_verdict(source: str, task: TaskSpec, kind: Kind, verdict: Verdict) -> LatentFunction:
-    """The function of a source that could be read, and of its verdict, which the caller has accepted."""
-    role = the_role(task)
+def function_from_verdict(source: str, task: TaskSpec, kind: Kind, verdict: Verdict) -> LatentFunction:
+    """Return the function of a source that could be read, whether or not it has passed every check."""
+    role = require_role(task)
     assert verdict.graph is not None
-    sizes = role.observation_size, role.action_size
-    function = LatentFunction(role.name, kind, source, verdict.graph.factor_count, verdict.checks, sizes)
+    function = LatentFunction(
+        task=role.name,
+        kind=kind,
+        source=source,
+        size=verdict.graph.n_factors,
+        checks=verdict.checks,
+        sizes=(role.observation_size, role.action_size),
+    )
     function.__dict__["graph"] = verdict.graph  # it need not be read again
     return function
 
 
-Given = TypeVar("Given")
+def normalise_source(source: str) -> str:
+    r"""Return a source as it is saved: lines end with \n, no surrounding blank lines, and no header.
+
+    A line ends where Python's parser ends it, and nowhere else. Variation selectors, which make an emoji of a sign, are removed:
+    models write warning signs into comments, and a variation selector is invisible.
+    """
+    lines = source.replace(_VARIATION_SELECTOR, "").replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    body = itertools.dropwhile(lambda line: not line or line.startswith(HEADER_PREFIX), lines)
+    return "\n".join(body).rstrip("\n")
 
 
-def per_role(given: Sequence[Given], task: TaskSpec) -> list[tuple[Given, TaskSpec]]:
-    """Pair each given item with its role of the task. Raises `LareError` if their numbers differ."""
-    if len(given) != len(task.roles):
+def source_hash(source: str) -> str:
+    """Return the SHA-256 of a source, in hexadecimal digits."""
+    return hashlib.sha256(source.encode()).hexdigest()
+
+
+Item = TypeVar("Item")
+
+
+def pair_with_roles(items: Sequence[Item], task: TaskSpec) -> list[tuple[Item, TaskSpec]]:
+    """Pair functions, or their files, with the roles of a task.
+
+    Raises:
+        LareError: the numbers of items and roles differ.
+    """
+    if len(items) != len(task.roles):
         names = ", ".join(role.name for role in task.roles)
-        raise LareError(f"{task.name} needs one latent function for each of {names}; {len(given)} were given")
-    return list(zip(given, task.roles, strict=True))
+        raise LareError(f"{task.name} needs one latent function for each of {names}; {len(items)} were given")
+    return list(zip(items, task.roles, strict=True))
 
 
 def check_task(function: LatentFunction, task: TaskSpec) -> None:
-    """Raise `LareError` if a function was written for another task."""
+    """Check that a function was written for a task.
+
+    Raises:
+        LareError: it was written for another task.
+    """
     if function.task != task.name:
         raise LareError(
-            f"the latent function was written for the task {function.task!r}, and this is {task.name!r}: choose another one or, if "
-            f"this one is right for both, say so by dataclasses.replace(function, task={task.name!r})"
+            f"the latent function was written for the task {function.task!r}, not for {task.name!r}. If it is right for both, use "
+            f"dataclasses.replace(function, task={task.name!r})"
         )
+
+
+def features_text(indices: dict[str, list[int]]) -> str:
+    """Write indices as in Python, runs of them as slices: "observation[8:10, 13]". Without indices, write "nothing"."""
+    texts = []
+    for name, numbers in indices.items():
+        runs = [list(run) for _, run in itertools.groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
+        bounds = [(run[0][1], run[-1][1] + 1) for run in runs]
+        if numbers:
+            slices = (str(start) if stop == start + 1 else f"{start}:{stop}" for start, stop in bounds)
+            texts.append(f"{name}[{', '.join(slices)}]")
+    return ", ".join(texts) or "nothing"

@@ -1,6 +1,6 @@
 """Reflection, an extension of the paper: the model sees how well its factors explain returns, and may improve its function.
 
-The caller passes the judge (`lare_rl.training.reflect`), because no module of this folder has access to returns.
+The caller passes the function that assesses (`lare_rl.training.reflect`), because no module of this folder has access to returns.
 """
 
 from collections.abc import Callable
@@ -9,86 +9,84 @@ from pathlib import Path
 
 from lare_rl.errors import LareError
 from lare_rl.latent.design import Conversation
-from lare_rl.latent.function import LatentFunction, normal
+from lare_rl.latent.function import LatentFunction, normalise_source
 from lare_rl.llm import prompts
 from lare_rl.llm.model import Model
 from lare_rl.llm.recording import Exchange, Recorder
-from lare_rl.llm.reply import MalformedReply, parse
+from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec
+
+__all__ = ["Assessment", "improve"]
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Assessment:
     """How well a function explains the returns of some episodes."""
 
     r2: float
-    """R^2 of the returns, each predicted from the factors before it was seen; NaN if it cannot be computed."""
+    """R^2 of the returns, each predicted from the factors before it was used to fit; NaN if it cannot be computed."""
     text: str
     """The description for the model: what the factors explain together, what each one explains, and what may be missing."""
-
-
-Judge = Callable[[LatentFunction], Evidence]
-"""It must judge every function on the same episodes. It may raise `LareError` if a function fails on them."""
 
 
 def improve(
     function: LatentFunction,
     task: TaskSpec,
     model: Model,
-    judge: Judge,
+    assess: Callable[[LatentFunction], Assessment],
     rounds: int = 1,
     record: Path | None = None,
-    said: Callable[[str], None] = lambda _: None,
+    on_message: Callable[[str], None] = lambda _: None,
 ) -> LatentFunction:
-    """Show the model how well a function explains returns, ask for a better one, and keep the one that predicts returns best.
+    """Show the model how well a function explains returns, ask for a better one, and return the one that predicts returns best.
 
     After an error or an interruption, the best function so far is returned.
 
     Args:
-        function: a verified function. New exchanges are appended to its own.
+        function: a verified function. New exchanges are appended to its exchanges.
         task: the task that the function is designed for.
         model: the language model to ask.
-        judge: judges a function by the returns of some episodes.
+        assess: assesses a function by the returns of some episodes, the same ones in each call. It may raise `LareError`.
         rounds: how often the model is asked for a better function.
-        record: the file to which every exchange is written; the file of the design, if the design had one.
-        said: a function that receives messages about the progress.
+        record: the file to which every exchange is written. If the design had a file, it is this file.
+        on_message: called with messages about the progress.
     """
-    exchanges = [Exchange(**one) for one in function.exchanges]
+    exchanges = [Exchange(**exchange) for exchange in function.exchanges]
     recorder = Recorder(task.name, function.kind, getattr(model, "temperature", None), record, exchanges)
-    recorder.begun = record is not None and bool(exchanges)
-    conversation = Conversation(task, function.kind, model, recorder, said)
+    recorder.file_created = record is not None and bool(exchanges)
+    conversation = Conversation(task, function.kind, model, recorder, on_message)
     try:
-        best, known = function, judge(function)
+        best, assessment = function, assess(function)
     except (LareError, KeyboardInterrupt) as error:
-        said(f"no reflection: {str(error) or 'stopped'}")
+        on_message(f"no reflection: {str(error) or 'stopped'}")
         return function
-    said(f"reflection: the factors of the first function predict unseen returns with R² = {known.r2:.3f}")
+    on_message(f"reflection: the factors of the first function predict unseen returns with R² = {assessment.r2:.3f}")
     for number in range(1, rounds + 1):
         try:
-            request = prompts.reflect(task, said_of(best), known.text, function.kind)
+            request = prompts.reflect(task, _find_reply(best), assessment.text, function.kind)
             attempt = conversation.correct(request, conversation.ask("reflect", request))
-            new = conversation.made(attempt)
-            found = judge(new)
+            candidate = conversation.to_function(attempt)
+            candidate_assessment = assess(candidate)
         except LareError as error:
-            said(f"reflection {number}: {error}")
+            on_message(f"reflection {number}: {error}")
             continue
         except KeyboardInterrupt:
-            said(f"reflection {number}: stopped")
+            on_message(f"reflection {number}: stopped")
             break
-        better = found.r2 > known.r2
-        said(f"reflection {number}: R² = {found.r2:.3f}, {'kept' if better else 'not better'}")
+        better = candidate_assessment.r2 > assessment.r2
+        on_message(f"reflection {number}: R² = {candidate_assessment.r2:.3f}, {'kept' if better else 'not better'}")
         if better:
-            best, known = new, found
-    return conversation.with_exchanges(best)
+            best, assessment = candidate, candidate_assessment
+    return conversation.add_exchanges(best)
 
 
-def said_of(function: LatentFunction) -> str:
-    """The reply that a function was read from; the function's source if there is no such reply."""
+def _find_reply(function: LatentFunction) -> str:
+    """Return the reply that a function was read from, or its source if no reply fits."""
     replies = [reply for exchange in function.exchanges for reply in exchange["replies"]]
     for reply in reversed(replies):
         try:
-            if normal(parse(reply).functions) == function.source:
+            if normalise_source(parse_reply(reply).functions) == function.source:
                 return reply
-        except MalformedReply:
+        except MalformedReplyError:
             continue
     return function.source

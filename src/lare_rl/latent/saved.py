@@ -7,58 +7,28 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from lare_rl.envs.load import as_task
-from lare_rl.errors import LareError, shortened
-from lare_rl.latent.function import CHANGED, HEADER, LatentFunction, normal, sha256, verified
+from lare_rl.envs.load import resolve_task
+from lare_rl.errors import LareError, short_repr
+from lare_rl.latent.function import (
+    CHANGED_SUFFIX,
+    HEADER_PREFIX,
+    LatentFunction,
+    normalise_source,
+    source_hash,
+    verify_function,
+)
 from lare_rl.latent.verify import Steps
 from lare_rl.llm.prompts import Kind
 from lare_rl.llm.recording import Exchange
-from lare_rl.llm.reply import MalformedReply, parse
+from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.safe_io import read_json, read_text
 
-LARGEST_FILE = 1 << 20
-"""The largest size of a function file, in bytes."""
+__all__ = ["SavedSource", "load_function", "read_source"]
 
-UNNAMED = "a model that is not named"
+_MAX_FILE_BYTES = 1 << 20
+_UNNAMED_MODEL = "a model that is not named"
 """The model of a function that was read from a reply."""
-
-
-def source_file(path: str | Path) -> Path:
-    """The Python file of a saved function, or the file of a model's reply. Raises `LareError` if there is none."""
-    if not isinstance(path, (str, Path)):
-        raise LareError(f"a latent function is read from the path of a file, not from {shortened(path)}")
-    path = Path(path)
-    source_path = path.with_suffix(".py") if path.suffix == ".json" else path
-    if not source_path.is_file() and path.is_file():
-        source_path = path
-    if not source_path.is_file():
-        what = "is not a file" if source_path.exists() else "does not exist"
-        raise LareError(f"the function file {source_path} {what}")
-    if source_path.stat().st_size > LARGEST_FILE:
-        raise LareError(
-            f"the function file {source_path} is larger than {LARGEST_FILE >> 20} MB, which is too large for a function"
-        )
-    return source_path
-
-
-def text_of(source_path: Path) -> str:
-    """The text of a Python file, or the function within a model's reply. Raises `LareError` if the file holds neither."""
-    text = read_text(source_path)
-    if source_path.suffix != ".json":
-        return text
-    try:
-        return parse(text).functions
-    except MalformedReply as error:
-        python = source_path.with_suffix(".py")
-        raise LareError(f"{source_path} is not a model's reply ({error}), and {python} does not exist") from error
-
-
-def split_header(text: str) -> tuple[list[str], str]:
-    """The header lines that `save` wrote, and the source."""
-    lines = text.split("\n")
-    header = list(itertools.takewhile(lambda line: line.startswith(HEADER), lines))
-    return header, "\n".join(lines[len(header) :])
 
 
 class SavedSource(NamedTuple):
@@ -73,16 +43,20 @@ class SavedSource(NamedTuple):
     @property
     def digest(self) -> str:
         """SHA-256 of the source."""
-        return sha256(self.source)
+        return source_hash(self.source)
 
 
 def read_source(path: str | Path) -> SavedSource:
-    """The source of a function file. Raises `LareError` if it cannot be read."""
-    header, source = split_header(text_of(source_file(path)))
-    return SavedSource(normal(source), was_changed(header, source), said_of("task", header))
+    """Read the source of a function file, or of a model's reply (.json).
+
+    Raises:
+        LareError: the file cannot be read.
+    """
+    header, source = _split_header(_read_source_text(_find_file(path)))
+    return SavedSource(source=source, changed=_was_changed(header, source), task=_header_value(header, "task"))
 
 
-def load(path: str | Path, task: TaskSpec | str | Path, steps: Steps | None = None) -> LatentFunction:
+def load_function(path: str | Path, task: TaskSpec | str | Path, steps: Steps | None = None) -> LatentFunction:
     """Read a function from a file, and verify it. Files that `save` wrote are verified again too.
 
     Args:
@@ -94,48 +68,80 @@ def load(path: str | Path, task: TaskSpec | str | Path, steps: Steps | None = No
     Raises:
         LareError: the file cannot be read, or the function does not pass for this task.
     """
-    source_path, task = source_file(path), as_task(task, playable=steps is None)
-    header, source = split_header(text_of(source_path))
-    written_for = said_of("task", header)
-    if written_for not in (None, task.name):
+    file, task = _find_file(path), resolve_task(task, playable=steps is None)
+    header, source = _split_header(_read_source_text(file))
+    saved_task = _header_value(header, "task")
+    if saved_task not in (None, task.name):
         raise LareError(
-            f"{source_path} was written for the task {written_for!r}, and this is {task.name!r}: choose another function or, if "
-            f'this one is right for both, remove its line "{HEADER}task: {written_for}"'
+            f"{file} was written for the task {saved_task!r}, not for {task.name!r}. If it is right for both, remove its line "
+            f'"{HEADER_PREFIX}task: {saved_task}"'
         )
-    kind: Kind = "reward" if said_of("kind", header) == "reward" else "factors"
-    function = verified(source, task, kind, steps, source_path)
-    if source_path.suffix == ".json":
-        return replace(function, model=UNNAMED)
-    function = replace(function, model=said_of("model", header) or function.model)
-    function = with_provenance(function, source_path.with_suffix(".json"))
-    if was_changed(header, source) and not function.changed:
-        function = replace(function, model=function.model + CHANGED)
+    kind: Kind = "reward" if _header_value(header, "kind") == "reward" else "factors"
+    function = verify_function(source, task, kind, steps, file)
+    if file.suffix == ".json":
+        return replace(function, model=_UNNAMED_MODEL)
+    function = replace(function, model=_header_value(header, "model") or function.model)
+    function = _add_provenance(function, file.with_suffix(".json"))
+    if _was_changed(header, source) and not function.changed:
+        function = replace(function, model=function.model + CHANGED_SUFFIX)
     return function
 
 
-def said_of(what: str, header: Sequence[str]) -> str | None:
-    """The value of the key `what` in the header that `save` wrote; None if there is none."""
-    start = f"{HEADER}{what}: "
+def _find_file(path: str | Path) -> Path:
+    """Return the Python file of a saved function, or the file of a model's reply."""
+    if not isinstance(path, (str, Path)):
+        raise LareError(f"a latent function is read from the path of a file, not from {short_repr(path)}")
+    path = Path(path)
+    file = path.with_suffix(".py") if path.suffix == ".json" else path
+    if not file.is_file() and path.is_file():
+        file = path
+    if not file.is_file():
+        raise LareError(f"the function file {file} {'is not a file' if file.exists() else 'does not exist'}")
+    if file.stat().st_size > _MAX_FILE_BYTES:
+        raise LareError(f"the function file {file} is larger than {_MAX_FILE_BYTES >> 20} MB")
+    return file
+
+
+def _read_source_text(file: Path) -> str:
+    """Return the text of a Python file, or the function within a model's reply."""
+    text = read_text(file)
+    if file.suffix != ".json":
+        return text
+    try:
+        return parse_reply(text).functions
+    except MalformedReplyError as error:
+        python = file.with_suffix(".py")
+        raise LareError(f"{file} is not a model's reply ({error}), and {python} does not exist") from error
+
+
+def _split_header(text: str) -> tuple[list[str], str]:
+    """Return the header lines that `save` wrote, and the source."""
+    header = list(itertools.takewhile(lambda line: line.startswith(HEADER_PREFIX), text.split("\n")))
+    return header, normalise_source(text)
+
+
+def _header_value(header: Sequence[str], key: str) -> str | None:
+    """Return the value of a key in the header."""
+    start = f"{HEADER_PREFIX}{key}: "
     return next((line.removeprefix(start).strip() for line in header if line.startswith(start)), None)
 
 
-def was_changed(header: Sequence[str], source: str) -> bool:
-    """Whether the header that `save` wrote has the hash of another source."""
-    said = said_of("sha256", header)
-    return said is not None and said != sha256(normal(source))
+def _was_changed(header: Sequence[str], source: str) -> bool:
+    """Return whether the header has the hash of another source."""
+    return _header_value(header, "sha256") not in (None, source_hash(source))
 
 
-def with_provenance(function: LatentFunction, record: Path) -> LatentFunction:
-    """Add the model and the replies from the .json beside the source. The model is marked `CHANGED` if the source differs."""
+def _add_provenance(function: LatentFunction, record: Path) -> LatentFunction:
+    """Add the model and the replies from the .json beside the source. Mark the model if the source differs."""
     if not record.is_file():
         return function
     try:
         saved = read_json(read_text(record))
         json.dumps(saved, ensure_ascii=False).encode()  # a lone surrogate can be read but not written
-        same = saved["source"] == function.source
-        model, exchanges = saved["model"], tuple(Exchange(**one).model_dump() for one in saved["exchanges"])
+        model = saved["model"] if saved["source"] == function.source else saved["model"] + CHANGED_SUFFIX
+        exchanges = tuple(Exchange(**exchange).model_dump() for exchange in saved["exchanges"])
         if not isinstance(model, str):
             raise TypeError("model")
     except (LareError, ValueError, KeyError, TypeError) as error:
-        raise LareError(f"{record} is not the record of a latent function: {shortened(error)}") from error
-    return replace(function, model=model if same else model + CHANGED, exchanges=exchanges)
+        raise LareError(f"{record} is not the record of a latent function: {short_repr(error)}") from error
+    return replace(function, model=model, exchanges=exchanges)

@@ -1,7 +1,7 @@
 """Verifies that a source is a latent function of a task: it is read, and its factors are finite on steps of the task.
 
-That rows are independent, that chance and earlier calls play no part, and that time and memory are bounded holds for every function
-that can be read (`lare_rl.phi`).
+Every function that can be read (`lare_rl.phi`) treats rows independently, does not depend on chance or on earlier calls, and needs
+bounded time and memory.
 """
 
 import contextlib
@@ -15,23 +15,26 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs.families import make_host_env
-from lare_rl.envs.play import rows_of, steps_of, team_of
+from lare_rl.envs.play import find_team, phi_inputs, play_steps
 from lare_rl.errors import LareError
-from lare_rl.latent.factors import compute_factors, origin_of_infinity
+from lare_rl.latent.factors import compute_factors, find_infinity
 from lare_rl.llm.prompts import Kind
-from lare_rl.phi.graph import Graph, Refused
+from lare_rl.phi.graph import Graph
+from lare_rl.phi.limits import MAX_FACTORS, RefusedError
 from lare_rl.phi.names import factor_names
-from lare_rl.phi.read import MOST_FACTORS, read
-from lare_rl.tasks.spec import TaskSpec, judged_states, the_role
+from lare_rl.phi.read import read
+from lare_rl.tasks.spec import TaskSpec, require_role, select_states
 
-STEPS = 256
+__all__ = ["N_SAMPLE_STEPS", "Check", "Steps", "Verdict", "random_steps", "sample_steps", "verify"]
+
+N_SAMPLE_STEPS = 256
 """The number of steps that a function is tried on."""
-LONGEST_PLAY = 20 * STEPS
-"""The most environment steps that are played to collect `STEPS` steps and end an episode. Agents that have left have no steps."""
 
+_MAX_PLAYED_STEPS = 20 * N_SAMPLE_STEPS
+"""The most environment steps that are played for `N_SAMPLE_STEPS` steps of agents. Agents that have left have no steps."""
 
 Steps = tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]]
-"""Observations (steps, observation size) as the function judges them, and their actions (steps, action size)."""
+"""Inputs of a function: observations (n, observation size), and the actions of these steps (n, action size)."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +58,12 @@ class Verdict:
 
     @property
     def passed(self) -> bool:
+        """Whether every check has passed."""
         return bool(self.checks) and all(check.passed for check in self.checks)
 
     @property
     def errors(self) -> str:
+        """The messages of all failed checks, one per line."""
         return "\n".join(check.message for check in self.checks if not check.passed)
 
 
@@ -68,7 +73,7 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | N
     Args:
         source: Python code.
         task: the task, which determines the sizes of observations and actions.
-        kind: whether it must return factors or one reward.
+        kind: whether the function must return factors or one reward.
         steps: observations (n, observation size) and actions (n, action size) that it is tried on if there is no environment;
             256 steps are enough. Without them, it is tried on random steps of the task's environment.
 
@@ -78,64 +83,64 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | N
     """
     observation, action = sample_steps(task, steps)
     try:
-        graph = read(source, observation.shape[1], action.shape[1], 1 if kind == "reward" else MOST_FACTORS)
-    except Refused as refusal:
-        return Verdict((Check("read", False, str(refusal)),))
-    names = factor_names(source, graph.factor_count)
-    error = _not_finite(graph, names, observation, action, source)
+        graph = read(source, observation.shape[1], action.shape[1], 1 if kind == "reward" else MAX_FACTORS)
+    except RefusedError as error:
+        return Verdict((Check("read", False, str(error)),))
+    names = factor_names(source, graph.n_factors)
+    error = _finite_error(graph, names, observation, action, source)
     checks = Check("read", True), Check("finite", error is None, error or "")
-    return Verdict(
-        checks, graph, () if error else tuple(_advice(graph, names, compute_factors(graph, observation, action)))
-    )
+    advice = () if error else tuple(_advice(graph, names, compute_factors(graph, observation, action)))
+    return Verdict(checks, graph, advice)
 
 
-def _not_finite(
+def _finite_error(
     graph: Graph, names: Sequence[str], observation: np.ndarray, action: np.ndarray, source: str
 ) -> str | None:
-    """A message about the first factor that is not finite on some batch of steps."""
+    """Return a message about the first factor that is not finite on a batch of steps."""
     # Random numbers that are reproducible for a source, but that its author cannot know.
-    random = np.random.default_rng(list(hashlib.sha256(source.encode(errors="replace")).digest()))
-    for name, observations, actions in _batches(observation, action, random):
+    rng = np.random.default_rng(list(hashlib.sha256(source.encode(errors="replace")).digest()))
+    for batch_name, observations, actions in _test_batches(observation, action, rng):
         factors = compute_factors(graph, observations, actions)
         bad = ~np.isfinite(factors)
         if bad.any():
             factor = int(bad.any(axis=0).argmax())
             rows = bad[:, factor]
-            origin = origin_of_infinity(graph, factor, observations[rows][:1], actions[rows][:1])
-            line = f" line {origin[1]}" if origin else ""
-            why = f" ({origin[0]})" if origin else ""
-            value = factors[rows, factor][0]
-            return f"E-FINITE{line}: factor {factor + 1}, {names[factor]!r}, is {value}{why} for {rows.sum()} of {len(rows)} {name}"
+            origin = find_infinity(graph, factor, observations[rows][:1], actions[rows][:1])
+            line, operation = (f" line {origin[1]}", f" ({origin[0]})") if origin else ("", "")
+            return (
+                f"E-FINITE{line}: factor {factor + 1}, {names[factor]!r}, is {factors[rows, factor][0]}{operation} for "
+                f"{rows.sum()} of {len(rows)} {batch_name}"
+            )
     return None
 
 
-def _batches(
-    observation: np.ndarray, action: np.ndarray, random: np.random.Generator
+def _test_batches(
+    observation: np.ndarray, action: np.ndarray, rng: np.random.Generator
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Steps of many kinds, which training may or may not contain. Factors must be finite on all of them."""
+    """Yield steps of many kinds, which training may or may not contain. Factors must be finite on all of them."""
     sizes = observation.shape[1], action.shape[1]
     yield "recorded steps", observation, action
-    noise = [random.standard_normal((STEPS, size)).astype(np.float32) for size in sizes]
+    noise = [rng.standard_normal((N_SAMPLE_STEPS, size)).astype(np.float32) for size in sizes]
     yield "random steps", noise[0], noise[1]
     yield "steps of nothing but zeros", np.zeros((1, sizes[0]), np.float32), np.zeros((1, sizes[1]), np.float32)
     yield "steps of nothing but ones", np.ones((1, sizes[0]), np.float32), np.ones((1, sizes[1]), np.float32)
-    single = np.eye(sum(sizes), dtype=np.float32)
-    yield "steps with a single one", single[:, : sizes[0]], single[:, sizes[0] :]
+    unit = np.eye(sum(sizes), dtype=np.float32)
+    yield "steps with a single one", unit[:, : sizes[0]], unit[:, sizes[0] :]
     yield "recorded steps times 1000", 1000 * observation, action
     yield "recorded steps times 1e-9", np.float32(1e-9) * observation, np.float32(1e-9) * action
 
 
 def _advice(graph: Graph, names: Sequence[str], factors: Float[np.ndarray, "steps factors"]) -> Iterator[str]:
-    """Remarks on factors that are constant or redundant. Not errors: early steps may show little of a task."""
-    entries = graph.entries_read("factors")
-    spread = factors.std(axis=0)
-    varies = spread > 1e-9 * (1 + np.abs(factors).max(axis=0))
+    """Yield remarks on factors that are constant or redundant. They are not errors: early steps may show little of a task."""
+    features_read = graph.entries_read("factors")
+    std = factors.std(axis=0)
+    varies = std > 1e-9 * (1 + np.abs(factors).max(axis=0))
     for i, name in enumerate(names):
-        if not any(entries[i].values()):
+        if not any(features_read[i].values()):
             yield f"factor {name!r} reads no entry of the observation or the action: it is the same for all steps"
         elif not varies[i]:
             yield f"factor {name!r} never varies on the recorded steps"
-    standardized = (factors[:, varies] - factors[:, varies].mean(axis=0)) / spread[varies]
+    standardized = (factors[:, varies] - factors[:, varies].mean(axis=0)) / std[varies]
     same = np.abs(standardized.T @ standardized) / max(1, len(factors)) > 0.9999
     varying = np.flatnonzero(varies).tolist()
     for i, j in np.argwhere(np.triu(same, 1)):
@@ -146,67 +151,72 @@ def _advice(graph: Graph, names: Sequence[str], factors: Float[np.ndarray, "step
 
 
 def sample_steps(task: TaskSpec, steps: Steps | None) -> Steps:
-    """The steps that a function of a task is tried on: at most `STEPS` of the given steps, evenly spaced; or random steps.
+    """Return the steps that a function of a task is tried on: at most `N_SAMPLE_STEPS` of `steps`, evenly spaced, or random steps.
 
     Raises:
-        LareError: as `verify`.
+        LareError: as for `verify`.
     """
-    role = the_role(task)
+    role = require_role(task)
     if steps is None:
         return random_steps(role)
     sampled = []
-    for values, name, size in zip(
-        steps, ("observations", "actions"), (role.observation_size, role.action_size), strict=True
-    ):
+    sizes = {"observation": role.observation_size, "action": role.action_size}
+    for values, (name, size) in zip(steps, sizes.items(), strict=True):
         rows = np.asarray(values)
         if rows.dtype.kind not in "biuf" or rows.shape != (len(steps[0]), size) or not len(rows):
             raise LareError(
-                f"{name} of steps must have the shape (n, {size}), with the {name[:-1]}_size of {role.name}, and n >= 1 as for the "
-                f"other array: the shape is {rows.shape}"
+                f"{name}s of steps must have the shape (n, {size}), with the {name}_size of {role.name} and the same n >= 1 for "
+                f"both arrays: the shape is {rows.shape}"
             )
         if not np.isfinite(rows).all():
-            raise LareError(f"{name} of steps hold a number that is not finite")
-        sampled.append(rows[np.linspace(0, len(rows) - 1, min(STEPS, len(rows))).astype(int)].astype(np.float32))
+            raise LareError(f"{name}s of steps hold a number that is not finite")
+        sampled.append(rows[_evenly_spaced(len(rows), N_SAMPLE_STEPS)].astype(np.float32))
     return sampled[0], sampled[1]
 
 
-def random_steps(task: TaskSpec, count: int = STEPS, seed: int = 0) -> Steps:
-    """Steps of whole episodes under uniformly random actions (the paper's pre-collected random state-action pairs).
+def random_steps(task: TaskSpec, n_steps: int = N_SAMPLE_STEPS, seed: int = 0) -> Steps:
+    """Play episodes by uniformly random actions, and return steps of them (the paper's pre-collected state-action pairs).
 
     The task's `judges` selects the observations before or after a step, or both: half of the rows are then observations before a
-    step. If more steps were played than requested, the result is evenly spaced among them, from the first to the last.
+    step. If more steps were played than requested, the result is evenly spaced among them, from the first to the last. The arrays
+    are cached, and therefore read-only.
     """
-    return _random_steps(task.model_dump_json(), count, seed)
+    return _random_steps(task.model_dump_json(), n_steps, seed)
 
 
 @functools.lru_cache(maxsize=8)
-def _random_steps(task: str, count: int, seed: int) -> Steps:
-    """As `random_steps`, with the task as JSON. The arrays are cached, and therefore read-only."""
-    role = TaskSpec.model_validate_json(task)
+def _random_steps(task_json: str, n_steps: int, seed: int) -> Steps:
+    role = TaskSpec.model_validate_json(task_json)
     with contextlib.closing(make_host_env(role)) as env:
-        team, random = team_of(role, env.spec), np.random.default_rng(seed)
-        rows_by_side: dict[str, list[list[np.ndarray]]] = {
-            side: [] for side in judged_states(role.judges, "before", "after")
-        }
-        rows, played = 0, 0
-        for number in itertools.count():
-            for before, action, after in steps_of(env, None, random, seed + number):
-                acted = slice(None) if role.judged_from == "state" else before.alive[team.agents]
-                for side, arrays in rows_by_side.items():
-                    timestep = before if side == "before" else after
-                    arrays.append([array[acted] for array in rows_of(role.judged_from, team, timestep, action)])
-                    rows += len(arrays[-1][0])
-                played += 1
-                if played == LONGEST_PLAY:
+        team, rng = find_team(role, env.spec), np.random.default_rng(seed)
+        sides = select_states(role.judges, "before", "after")
+        rows_by_side: dict[str, list[list[np.ndarray]]] = {side: [] for side in sides}
+        n_rows, n_played = 0, 0
+        for episode in itertools.count():
+            for timestep, env_action, next_timestep in play_steps(env, None, rng, seed + episode):
+                acting = slice(None) if role.judged_from == "state" else timestep.alive[team.agents]
+                for side, rows in rows_by_side.items():
+                    inputs = phi_inputs(
+                        role.judged_from, team, timestep if side == "before" else next_timestep, env_action
+                    )
+                    rows.append([array[acting] for array in inputs])
+                    n_rows += len(rows[-1][0])
+                n_played += 1
+                if n_played == _MAX_PLAYED_STEPS:
                     break
-            if rows >= count or played >= LONGEST_PLAY:  # at the end of an episode, to try functions on it too
+            # A function is tried on the end of an episode too.
+            if n_rows >= n_steps or n_played == _MAX_PLAYED_STEPS:
                 break
-    if not rows:
-        raise LareError(f"no agent of {role.name} acted in {played} steps of random actions")
+    if not n_rows:
+        raise LareError(f"no agent of {role.name} acted in {n_played} steps of random actions")
     columns = zip(*itertools.chain(*rows_by_side.values()), strict=True)
-    observations, actions = (np.concatenate(arrays).astype(np.float32) for arrays in columns)
-    chosen = np.linspace(0, rows - 1, min(count, rows)).astype(int)
-    observation, action = observations[chosen], actions[chosen]
-    for array in (observation, action):
-        array.setflags(write=False)
+    selected = _evenly_spaced(n_rows, n_steps)
+    observation, action = (np.concatenate(arrays).astype(np.float32)[selected] for arrays in columns)
+    observation.setflags(write=False)
+    action.setflags(write=False)
     return observation, action
+
+
+def _evenly_spaced(n_rows: int, n_selected: int) -> np.ndarray:
+    """Return the indices of at most `n_selected` rows, from the first to the last."""
+    return np.linspace(0, n_rows - 1, min(n_selected, n_rows)).astype(int)

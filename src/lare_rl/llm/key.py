@@ -1,32 +1,35 @@
-"""The key of a model: read from the environment, sent in the header of a request, and removed from every text that is kept."""
+"""The key of a model: read from the environment, sent in the header of a request, and removed from every text that is saved."""
 
 import functools
 import os
 import re
 
-VARIABLE = "OPENAI_API_KEY"
+__all__ = ["KEY_VARIABLE", "api_key", "redact_key"]
 
-SHORTEST = 8
-"""The fewest characters of a key that is removed from texts. A shorter one is not a secret, but a word like "none"."""
+KEY_VARIABLE = "OPENAI_API_KEY"
 
-
-def key() -> str:
-    return os.environ.get(VARIABLE, "").strip()
+_MIN_KEY_LENGTH = 8
+"""A shorter key is not removed from texts, because it is not a secret but a word such as "none"."""
 
 
-def without_key(text: str) -> str:
-    """A text without the key, whether it is written literally or by the escapes of JSON and Python."""
-    secret = key()
-    return spellings(secret).sub("[key]", text) if len(secret) >= SHORTEST else text
+def api_key() -> str:
+    """Return the key, or an empty text."""
+    return os.environ.get(KEY_VARIABLE, "").strip()
+
+
+def redact_key(text: str) -> str:
+    """Replace the key in a text, also where it is written by escapes of JSON or Python."""
+    key = api_key()
+    return _key_pattern(key).sub("[key]", text) if len(key) >= _MIN_KEY_LENGTH else text
 
 
 @functools.lru_cache(maxsize=8)
-def spellings(secret: str) -> re.Pattern[str]:
-    """A pattern of all texts that become the key when their escapes are read, once or twice."""
-    return re.compile("".join(spelled(letter) for letter in secret))
+def _key_pattern(key: str) -> re.Pattern[str]:
+    """Return a pattern of all texts that become the key when their escapes are read once or twice."""
+    return re.compile("".join(map(_letter_pattern, key)))
 
 
-def spelled(letter: str) -> str:
+def _letter_pattern(letter: str) -> str:
     code = ord(letter)
-    numbers = rf"[uU](?:0000)?00(?i:{code:02x})|[uU]\{{?0*(?i:{code:x})\}}|x(?i:{code:02x})|0?{code:o}"
-    return rf"\\{{0,4}}(?:{re.escape(letter)}|(?<=\\)(?:{numbers}))"
+    escapes = rf"[uU](?:0000)?00(?i:{code:02x})|[uU]\{{?0*(?i:{code:x})\}}|x(?i:{code:02x})|0?{code:o}"
+    return rf"\\{{0,4}}(?:{re.escape(letter)}|(?<=\\)(?:{escapes}))"

@@ -9,15 +9,21 @@ from lare_rl.llm.prompts import Kind, Message
 from lare_rl.llm.recording import RecordedModel, read_recording, shipped_recordings
 from lare_rl.util.safe_io import read_text
 
+__all__ = ["RECORDED", "Model", "recorded_model"]
+
 
 @runtime_checkable
 class Model(Protocol):
-    """Anything that answers a request."""
+    """A language model."""
 
     name: str
 
     def reply(self, messages: Sequence[Message], sample: int) -> str:
-        """The text of answer number `sample` (0, 1, ...) to the same request. Raises `LareError`."""
+        """Return the text of reply number `sample` (0, 1, ...) to the same request.
+
+        Raises:
+            LareError: there is no reply.
+        """
         ...
 
 
@@ -26,10 +32,10 @@ RECORDED = "recorded"
 
 
 def recorded_model(task: str, kind: Kind, draw: int = 0, path: Path | None = None) -> RecordedModel:
-    """A model that answers from a file, or from the shipped recordings of that kind and draw.
+    """Return a model that answers from a file, or from the shipped recordings of that kind and draw.
 
     Raises:
-        LareError: there is no such file or draw, or it is not a recording.
+        LareError: the file or draw does not exist, or the file is not a recording.
     """
     if path is None:
         return RecordedModel(shipped_recordings(kind, draw), task)

@@ -1,4 +1,4 @@
-"""Recordings: a model's replies to exact requests, kept in a file, and the model that answers from them."""
+"""Recordings: a model's replies to exact requests, saved in a file, and the model that answers from them."""
 
 import datetime
 import json
@@ -7,16 +7,18 @@ from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 
-from lare_rl.errors import Checked, LareError
-from lare_rl.llm.key import without_key
+from lare_rl.errors import CheckedModel, LareError
+from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import Kind, Message, Stage
-from lare_rl.util.files import replace
+from lare_rl.util.files import replace_file
 from lare_rl.util.safe_io import read_json
 
-SHIPPED = files("lare_rl.llm") / "recordings"
+__all__ = ["SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recorder", "read_recording", "shipped_recordings"]
+
+SHIPPED_RECORDINGS = files("lare_rl.llm") / "recordings"
 
 
-class Exchange(Checked):
+class Exchange(CheckedModel):
     """A request and the replies to it, unchanged."""
 
     stage: Stage
@@ -24,8 +26,8 @@ class Exchange(Checked):
     replies: list[str]
 
 
-class Recording(Checked):
-    """One complete sample of a model: its candidates and their combination (and corrections, if there were any)."""
+class Recording(CheckedModel):
+    """One complete sample of a model: its candidates, their combination, and corrections if they were needed."""
 
     task: str
     kind: Kind
@@ -37,36 +39,40 @@ class Recording(Checked):
 
 
 def shipped_recordings(kind: Kind, draw: int) -> list[Recording]:
-    """The recordings of that kind and draw that come with the package, by task.
+    """Return the recordings of that kind and draw that come with the package, in the order of their tasks' names.
 
     Raises:
         LareError: no recording has that draw.
     """
-    ending = f".draw{draw}.json"
-    entries = sorted((SHIPPED / kind).iterdir(), key=lambda entry: entry.name)
-    found = [entry for entry in entries if entry.name.endswith(ending)]
-    if not found:
+    entries = sorted((SHIPPED_RECORDINGS / kind).iterdir(), key=lambda entry: entry.name)
+    selected = [entry for entry in entries if entry.name.endswith(f".draw{draw}.json")]
+    if not selected:
         draws = sorted({int(entry.name.split(".draw")[1].removesuffix(".json")) for entry in entries})
         raise LareError(f"no recording of {kind} has draw {draw}; the draws are {', '.join(map(str, draws))}")
-    return [read_recording(entry.read_text(encoding="utf-8"), entry.name) for entry in found]
+    return [read_recording(entry.read_text(encoding="utf-8"), entry.name) for entry in selected]
 
 
 def read_recording(text: str, name: str) -> Recording:
-    """Parse a recording. Raises `LareError` if `text` is not one; the message contains `name`."""
+    """Parse a recording.
+
+    Args:
+        text: the content of a file.
+        name: the name of the file, for error messages.
+
+    Raises:
+        LareError: the text is not a recording.
+    """
     try:
         values = read_json(text)
         json.dumps(values, ensure_ascii=False).encode()
     except UnicodeEncodeError as error:
-        raise LareError(f"recording {name} holds half a character (a surrogate), which no file can keep") from error
+        raise LareError(f"recording {name} holds half a character (a surrogate), which no file can store") from error
     except ValueError as error:
         raise LareError(f"recording {name} is not JSON: {error}") from error
     if not isinstance(values, dict):
         raise LareError(f"recording {name} is JSON, but not an object")
     if "Functions" in values:
-        raise LareError(
-            f"{name} is a single reply, not a recording of requests and their replies: lare-rl verify {name} --task TASK reads the "
-            "function in it"
-        )
+        raise LareError(f"{name} is a single reply, not a recording: check it by lare-rl verify {name} --task TASK")
     try:
         return Recording(**values)
     except LareError as error:
@@ -74,36 +80,39 @@ def read_recording(text: str, name: str) -> Recording:
 
 
 class RecordedModel:
-    """Answers requests that match a recorded one word for word, and no others."""
+    """Answers requests that match a recorded one word for word, and no other requests."""
 
     def __init__(self, recordings: Sequence[Recording], task: str):
-        """`task` is named in the error for an unknown request."""
+        """Create a model.
+
+        Args:
+            recordings: the recordings to answer from, in this order.
+            task: the name of the task, for error messages.
+        """
         self.recordings = recordings
         self.task = task
         self.name = "recorded"
 
     def reply(self, messages: Sequence[Message], sample: int) -> str:
+        """Return the reply number `sample` to a request. See `Model.reply`."""
+        request = list(messages)
         for recording in self.recordings:
             replies = [
-                reply
-                for exchange in recording.exchanges
-                if exchange.messages == list(messages)
-                for reply in exchange.replies
+                reply for exchange in recording.exchanges if exchange.messages == request for reply in exchange.replies
             ]
             if sample < len(replies):
                 self.name = f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
                 return replies[sample]
         raise LareError(
-            f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}): only the shipped tasks have "
-            "recorded replies, for their exact texts. Ask a model (lare-rl design TASK --model NAME --out phi.py), train with a "
-            "function that you have (--function phi.py; in a sweep file, the table [functions]), or by a method that needs none "
-            "(--method bayes)"
+            f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}); only shipped tasks have them, for "
+            "their exact texts. Ask a model (lare-rl design TASK --model NAME --out phi.py), train with a function of your own "
+            "(--function phi.py; in a sweep file, the table [functions]), or by a method that needs none (--method bayes)"
         )
 
 
 @dataclass
 class Recorder:
-    """Records every exchange of a design, and saves it to `path`, if there is one, after each reply.
+    """Records every exchange of a design. With a `path`, it saves them to this file after each reply.
 
     An existing file is never overwritten: the file must not exist when the first reply comes. After that it is replaced as a
     whole, so that no reply is lost.
@@ -114,48 +123,41 @@ class Recorder:
     temperature: float | None = None
     path: Path | None = None
     exchanges: list[Exchange] = field(default_factory=list)
-    begun: bool = False
+    file_created: bool = False
     """Whether this recorder has created the file."""
 
-    def asked(self, stage: Stage, messages: Sequence[Message]) -> int:
-        """How many replies to a request are recorded already."""
-        return sum(len(one.replies) for one in self.exchanges if (one.stage, one.messages) == (stage, list(messages)))
+    def n_replies(self, stage: Stage, messages: Sequence[Message]) -> int:
+        """Return the number of recorded replies to a request."""
+        request = stage, list(messages)
+        return sum(
+            len(exchange.replies) for exchange in self.exchanges if (exchange.stage, exchange.messages) == request
+        )
 
-    def take(self, stage: Stage, messages: Sequence[Message], reply: str, model: str) -> None:
+    def add(self, stage: Stage, messages: Sequence[Message], reply: str, model: str) -> None:
         """Add a reply to a request. If the last request was the same, the reply is added to its replies."""
+        replies = [reply]
         if self.exchanges and (self.exchanges[-1].stage, self.exchanges[-1].messages) == (stage, list(messages)):
-            last = self.exchanges.pop()
-            replies = [*last.replies, reply]
-        else:
-            replies = [reply]
+            replies = [*self.exchanges.pop().replies, reply]
         self.exchanges.append(Exchange(stage=stage, messages=list(messages), replies=replies))
         if self.path is not None:
-            self.keep(model)
+            self.save(self.path, model, new=not self.file_created)
+            self.file_created = True
 
-    def keep(self, model: str) -> None:
-        """Write all exchanges to `path`."""
-        assert self.path is not None
-        self.write(self.path, model, new=not self.begun)
-        self.begun = True
+    def save(self, path: Path, model: str, new: bool = True) -> None:
+        """Write the recording to a file.
 
-    def write(self, path: Path, model: str, new: bool = True) -> None:
-        """Write the recording. Raises `LareError` if the file cannot be written, or if it exists and should be `new`."""
+        Raises:
+            LareError: the file cannot be written, or it exists and should be `new`.
+        """
+        if new and path.exists():
+            raise LareError(f"{path} exists, and is not overwritten; choose another file")
         try:
-            if new:
-                path.touch(exist_ok=False)
-            try:
-                replace(path, lambda file: file.write(self.text(model).encode()))
-            except OSError:
-                if new:
-                    path.unlink(missing_ok=True)
-                raise
-        except FileExistsError:
-            raise LareError(f"{path} exists, and is not overwritten; choose another file") from None
+            replace_file(path, lambda file: file.write(self.to_json(model).encode()))
         except OSError as error:
             raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
-    def text(self, model: str) -> str:
-        """The contents of the file."""
+    def to_json(self, model: str) -> str:
+        """Return the content of the file, without the key."""
         recording = Recording(
             task=self.task,
             kind=self.kind,
@@ -165,4 +167,4 @@ class Recorder:
             temperature=self.temperature,
             exchanges=self.exchanges,
         )
-        return without_key(recording.model_dump_json(indent=1)) + "\n"
+        return redact_key(recording.model_dump_json(indent=1)) + "\n"

@@ -1,4 +1,4 @@
-"""Episodes in memory: flat arrays, as in D4RL and CORL, or one mapping of arrays for each episode."""
+"""Logs in memory: flat arrays, as in D4RL and CORL, or one mapping of arrays for each episode."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -6,92 +6,78 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.errors import LareError, shortened
-from lare_rl.logs import npz
-from lare_rl.logs.episode import KEYS, NEEDED, Hints, Logged, Paid, checked, form_of
-from lare_rl.logs.output import check_free
+from lare_rl.errors import LareError, short_repr
+from lare_rl.logs.episode import KEYS, RelabelledEpisode
+from lare_rl.logs.log import Log
+from lare_rl.logs.npz import write_npz_directory
+from lare_rl.tasks.spec import TaskSpec
 
-D4RL = {"terminals": "terminations", "timeouts": "truncations"}
-"""From the names of flags in D4RL's data sets to the names here."""
+__all__ = ["FlatLog", "ListLog"]
+
+D4RL_NAMES = {"terminals": "terminations", "timeouts": "truncations"}
+"""Names of flags in D4RL's data sets, and the names here."""
 
 
-class ListedLogs:
-    """Any iterable of mappings that can be iterated more than once. One episode is read at a time."""
+class ListLog(Log):
+    """An iterable of mappings, which can be iterated more than once. One episode is read at a time."""
 
-    def __init__(self, episodes: Iterable[Mapping[str, Any]], hints: Hints):
-        self.name, self.given = "episodes", episodes
-        self.count: int | None = len(episodes) if hasattr(episodes, "__len__") else None  # pyright: ignore[reportArgumentType]
+    name = "the list of episodes"
+
+    def __init__(self, episodes: Iterable[Any], role: TaskSpec | None):
         if iter(episodes) is episodes:
-            raise LareError("episodes are read twice: give a list, or an object whose __iter__ begins anew")
-        first = next(iter(episodes), None)
-        if first is None:
-            raise LareError("there is no episode")
-        self.form = form_of("episode 0", mapping("episode 0", first), hints.sizes, hints.limit)
+            raise LareError("a log is read twice: give a list, or an object whose __iter__ starts again")
+        self.list = episodes
+        self.n_episodes = len(episodes) if hasattr(episodes, "__len__") else None  # pyright: ignore[reportArgumentType]
+        self.layout = self.infer_layout(role)
 
-    def episodes(self) -> Iterator[Logged]:
-        """All episodes, in their order."""
-        for number, values in enumerate(self.given):
-            name = f"episode {number}"
-            yield checked(name, mapping(name, values), self.form, values)
+    def read(self) -> Iterator[tuple[str, Mapping[str, Any], Mapping[str, Any]]]:
+        for number, arrays in enumerate(self.list):
+            if not isinstance(arrays, Mapping):
+                raise LareError(f"episode {number} must be a mapping of arrays, and is {short_repr(arrays)}")
+            yield f"episode {number}", arrays, arrays
 
-    def check_out(self, out: str | Path, overwrite: bool) -> None:
-        """Check the directory to write."""
-        check_free(Path(out), overwrite)
-
-    def write(self, out: str | Path, episodes: Iterable[Paid], overwrite: bool, about: str) -> str | Path:
+    def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> Path:
         """Write a directory of .npz files."""
-        return npz.write(Path(out), ((f"{number:08d}.npz", paid) for number, paid in enumerate(episodes)), overwrite)
+        return write_npz_directory(
+            out, ((f"{number:08d}.npz", item) for number, item in enumerate(episodes)), overwrite
+        )
 
 
-class FlatLogs(ListedLogs):
-    """Arrays of all steps, one after the other. A flag marks the end of an episode; steps after the last flag were cut off."""
+class FlatLog(ListLog):
+    """Arrays of all steps. A flag marks the end of an episode. Steps after the last flag are an episode that was cut."""
 
-    def __init__(self, arrays: Mapping[str, Any], hints: Hints):
-        flat = {D4RL.get(key, key): np.asarray(value) for key, value in arrays.items()}
-        for key in ("observations", "actions", "rewards"):
-            if key not in flat:
-                raise LareError(
-                    f"the arrays have no {key}: flat arrays need observations, actions, rewards and flags of ends"
-                )
-        steps = len(np.atleast_1d(flat["actions"]))
-        if not {"terminations", "truncations"} & set(flat):
-            raise LareError("the arrays have no terminations and no truncations: nothing says where episodes end")
-        if "next_observations" not in flat:
-            raise LareError("the arrays have no next_observations: flat arrays need the observation after each step")
+    def __init__(self, arrays: Mapping[str, Any], role: TaskSpec | None):
+        flat = {D4RL_NAMES.get(key, key): np.asarray(value) for key, value in arrays.items()}
+        missing = [key for key in ("observations", "next_observations", "actions", "rewards") if key not in flat]
+        if missing:
+            raise LareError(
+                f"flat arrays need observations, next_observations, actions and rewards: {missing[0]} is missing"
+            )
+        flags = [flat[key] for key in D4RL_NAMES.values() if key in flat]
+        if not flags:
+            raise LareError("flat arrays need terminations or truncations, which mark the ends of episodes")
+        n_steps = len(np.atleast_1d(flat["actions"]))
         # Arrays without a row for each step (D4RL's metadata) belong to no episode.
-        self.flat = {key: value for key, value in flat.items() if key in KEYS or np.shape(value)[:1] == (steps,)}
-        for key, value in self.flat.items():
-            if np.shape(value)[:1] != (steps,):
-                raise LareError(f"{key} must have {steps} rows, as many as actions, and its shape is {np.shape(value)}")
-        ends = [
-            np.asarray(self.flat[key]).astype(bool).reshape(steps, -1).any(axis=1)
-            for key in D4RL.values()
-            if key in flat
-        ]
-        self.ends = np.flatnonzero(np.logical_or.reduce(ends)) + 1
-        if steps and (not len(self.ends) or self.ends[-1] != steps):
-            self.ends = np.append(self.ends, steps)
-        super().__init__(Pieces(self.flat, self.ends), hints)
+        flat = {key: value for key, value in flat.items() if key in KEYS or np.shape(value)[:1] == (n_steps,)}
+        for key, value in flat.items():
+            if np.shape(value)[:1] != (n_steps,):
+                raise LareError(
+                    f"{key} must have {n_steps} rows, as many as actions, and its shape is {np.shape(value)}"
+                )
+        is_end = np.any([array.astype(bool).reshape(n_steps, -1).any(axis=1) for array in flags], axis=0)
+        is_end[-1:] = True
+        super().__init__(_FlatEpisodes(flat, np.flatnonzero(is_end) + 1), role)
 
 
-class Pieces:
+class _FlatEpisodes:
     """The episodes of flat arrays, without a copy."""
 
-    def __init__(self, flat: Mapping[str, np.ndarray], ends: np.ndarray):
-        self.flat, self.ends = flat, ends
+    def __init__(self, arrays: Mapping[str, np.ndarray], ends: np.ndarray):
+        self.arrays, self.ends = arrays, ends.tolist()
 
     def __len__(self) -> int:
         return len(self.ends)
 
     def __iter__(self) -> Iterator[Mapping[str, np.ndarray]]:
-        start = 0
-        for end in self.ends.tolist():
-            yield {key: value[start:end] for key, value in self.flat.items()}
-            start = end
-
-
-def mapping(name: str, values: Any) -> Mapping[str, Any]:
-    """The arrays of an episode by name."""
-    if not isinstance(values, Mapping):
-        raise LareError(f"{name} must be arrays by name, and is {shortened(values)}: {NEEDED}")
-    return values
+        for start, end in zip([0, *self.ends], self.ends, strict=False):
+            yield {key: value[start:end] for key, value in self.arrays.items()}

@@ -4,52 +4,56 @@ import re
 from typing import Any
 
 from lare_rl.assigner.layout import Layout
-from lare_rl.logs.source import Source, open_logs
-from lare_rl.new_task.documentation import plain, without_rewards
-from lare_rl.new_task.draft import SCORE, Draft, bodies, entries, warning
+from lare_rl.logs.log import Log, open_log
+from lare_rl.new_task.documentation import plain_lines, remove_rewards
+from lare_rl.new_task.draft import SCORE_LINE, Draft, count_entries, text_lines, warning_lines
 from lare_rl.tasks.spec import NO_ENVIRONMENT
 
-LIMIT = "# max_episode_steps = 1000 # episodes that did not terminate, and are shorter, were cut"
+__all__ = ["draft_log_task"]
+
+LIMIT_LINE = "# max_episode_steps = 1000 # episodes that did not terminate, and are shorter, were cut"
 
 
-def draft_of_logs(source: Any) -> Draft:
-    """A draft with all that a log says about itself.
-
-    Raises:
-        LareError: the log cannot be read.
-    """
-    logs = open_logs(source)
-    described, left_out = without_rewards(plain(description_of(logs)))
-    texts = {"description": described, "observation": "", "action": ""}
-    layouts = {"observation": logs.form.observation, "action": logs.form.action}
-    name = re.sub(r"[^\w.\-]+", "-", re.sub(r"\.parquet$", "", logs.name.rstrip("/")).rpartition("/")[2]) or "logs"
-    limit = logs.form.limit
+def draft_log_task(source: Any) -> Draft:
+    """Draft a task from what a log contains. Raises `LareError` if the log cannot be read."""
+    log = open_log(source)
+    description, removed = remove_rewards(plain_lines(_description(log)))
+    texts = {"description": description, "observation": "", "action": ""}
+    layouts = {"observation": log.layout.observation, "action": log.layout.action}
+    name = re.sub(r"[^\w.\-]+", "-", re.sub(r"\.parquet$", "", log.name.rstrip("/")).rpartition("/")[2]) or "logs"
+    limit = log.layout.max_episode_steps
     lines = [
-        *warning(left_out, "the log"),
+        *warning_lines(removed, "the log"),
         f'name = "{name}"',
         f'environment = "{NO_ENVIRONMENT}" # there are logs only; to train, the id of the environment that they come from',
         f"observation_size = {layouts['observation'].size}",
         f"action_size = {layouts['action'].size}",
         'judges = "after"',
-        SCORE,
-        f"max_episode_steps = {limit}" if limit else LIMIT,
-        *bodies(texts, {key: head(layout, key) for key, layout in layouts.items()}),
+        SCORE_LINE,
+        f"max_episode_steps = {limit}" if limit else LIMIT_LINE,
+        *text_lines(texts, {key: _first_line(layout, key) for key, layout in layouts.items()}),
     ]
-    missing = tuple(key for key, text in texts.items() if not text)
-    return Draft(name, "\n".join(lines) + "\n", missing, left_out, of_logs=True)
+    return Draft(
+        name=name,
+        toml="\n".join(lines) + "\n",
+        missing_keys=tuple(key for key, text in texts.items() if not text),
+        removed=removed,
+        logs_only=True,
+    )
 
 
-def description_of(logs: Source) -> str:
-    """The description of a Minari data set; empty for other logs."""
-    dataset = getattr(logs, "dataset", None)
+def _description(log: Log) -> str:
+    """Return the description of a Minari data set, or an empty text for other logs."""
+    dataset = getattr(log, "dataset", None)
     return "" if dataset is None else str(dataset.storage.metadata.get("description") or "")
 
 
-def head(layout: Layout, key: str) -> str:
-    """The first line of a text: how many entries there are, and which."""
+def _first_line(layout: Layout, key: str) -> str:
+    """Return the first line of the text of a key: the number of entries, and what they are."""
+    n_entries = count_entries(layout.size)
     if layout.kind == "choices":
-        return f"{entries(layout.size)}, all 0 but one: the {'action that is taken' if key == 'action' else 'state'}."
+        return f"{n_entries}, all 0 but one: the {'action that is taken' if key == 'action' else 'state'}."
     if layout.kind == "named":
-        parts = zip(layout.names, layout.parts, strict=True)
-        return f"{entries(layout.size)}: " + ", then ".join(f"{part.size} of {name}" for name, part in parts) + "."
-    return f"{entries(layout.size)}."
+        children = zip(layout.names, layout.parts, strict=True)
+        return f"{n_entries}: " + ", then ".join(f"{child.size} of {name}" for name, child in children) + "."
+    return f"{n_entries}."

@@ -1,4 +1,4 @@
-"""One logged episode, checked: no log is trusted, and a value that does not fit raises a `LareError` with file and key."""
+"""One episode of a log. No log is trusted: a value that does not fit raises a `LareError` that names the file and the key."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,193 +8,199 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.assigner.layout import Layout
-from lare_rl.errors import LareError, shortened
+from lare_rl.errors import LareError, short_repr
+from lare_rl.tasks.spec import TaskSpec
 
-LARGEST = 1e18
-"""Numbers of a log are smaller: their squares are summed in float32."""
+__all__ = ["KEYS", "LogLayout", "LoggedEpisode", "RelabelledEpisode", "infer_layout", "parse_episode"]
+
 KEYS = (
     *("observations", "actions", "rewards", "score", "next_observations"),
     *("terminations", "truncations", "cut", "paid"),
 )
-NEEDED = "observations, actions, and rewards or a score"
+"""The arrays of an episode that are read. The key `paid` has the rewards before the log was relabelled."""
+MAX_MAGNITUDE = 1e18
+"""The largest absolute value of a number in a log. Squares of numbers are summed in float32."""
 
 
 @dataclass(frozen=True)
-class Logged:
+class LoggedEpisode:
     """An episode of T steps."""
 
     name: str
-    """The file or the place of the episode, for messages."""
-    before: Float[np.ndarray, "steps observation"]
+    """The file, or the number of the episode in its log, for messages."""
+    observation: Float[np.ndarray, "steps observation"]
     action: Float[np.ndarray, "steps action"]
-    after: Float[np.ndarray, "steps observation"]
-    paid: Float[np.ndarray, " steps"]
-    """The original reward of each step. A score is that of the last step."""
-    whole: bool
-    """Whether the episode was not cut, so that its return can be learned from."""
-    kept: Any = field(repr=False)
-    """The contents of its file, to write them again."""
+    next_observation: Float[np.ndarray, "steps observation"]
+    reward: Float[np.ndarray, " steps"]
+    """The original reward of each step. A score is the reward of the last step."""
+    complete: bool
+    """Whether the episode was played to its end. Only then is its return known."""
+    contents: Any = field(repr=False)
+    """The episode as it was read, to write it again: a mapping of arrays, or a table."""
 
     def __len__(self) -> int:
-        return len(self.paid)
+        return len(self.reward)
 
 
-@dataclass(frozen=True)
-class Form:
-    """The form that all episodes of a log have in common."""
+class RelabelledEpisode(NamedTuple):
+    """An episode and its proxy rewards."""
 
-    observation: Layout
-    action: Layout
-    limit: int | None = None
-    """Steps after which the time limit ends an episode; None if it is not known."""
-
-
-class Paid(NamedTuple):
-    """An episode with its new rewards."""
-
-    episode: Logged
+    episode: LoggedEpisode
     r_hat: Float[np.ndarray, " steps"]
 
 
-class Hints(NamedTuple):
-    """What a task says about its logs."""
+@dataclass(frozen=True)
+class LogLayout:
+    """The layout that all episodes of a log share."""
 
-    sizes: Mapping[str, int]
-    """Sizes of `observation` and `action` rows."""
-    limit: int | None
-    """The time limit, in steps."""
+    observation: Layout
+    action: Layout
+    max_episode_steps: int | None = None
+    """The time limit; None if it is unknown."""
 
 
-def checked(name: str, values: Mapping[str, Any], form: Form, kept: Any) -> Logged:
-    """An episode from the contents of its file.
+def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) -> LogLayout:
+    """Infer the layout of a log without spaces from its first episode.
+
+    Args:
+        name: name of the episode.
+        values: arrays of the episode.
+        role: the task of the log, which has the sizes of one-hot observations and actions, and the time limit.
+
+    Raises:
+        LareError: actions or observations are whole numbers, and the number of choices is unknown.
+    """
+    sizes = {} if role is None else {"observation": role.observation_size, "action": role.action_size}
+    layouts = {}
+    for kind in ("observation", "action"):
+        array = np.asarray(values.get(f"{kind}s", np.zeros((0, 0))))
+        is_discrete = array.dtype.kind in "iu" and array.ndim == 1
+        if is_discrete and kind not in sizes:
+            raise LareError(
+                f"{name}: {kind}s are whole numbers, and the number of choices is unknown: write it into a task file ({kind}_size; "
+                "docs/logs.md), and give it with --task FILE"
+            )
+        if is_discrete and sizes[kind] != 1:
+            layouts[kind] = Layout(kind="choices", choices=(sizes[kind],), first=(0,))
+        else:
+            layouts[kind] = Layout(kind="numbers", shape=array.shape[1:])
+    return LogLayout(**layouts, max_episode_steps=None if role is None else role.max_episode_steps)
+
+
+def parse_episode(name: str, values: Mapping[str, Any], layout: LogLayout, contents: Any) -> LoggedEpisode:
+    """Check the arrays of an episode and bring them into rows.
 
     Args:
         name: name of the file, or of the episode in it.
         values: `observations` (T + 1, ...) or, with `next_observations` (T, ...), (T, ...); `actions` (T, ...); `rewards` (T,) or
             `score`, a single number. Optional: `terminations` and `truncations`, (T,) or one flag; `cut`, one flag; `paid` (T,),
-            the rewards before they were relabelled.
-        form: the form of all episodes.
-        kept: the contents of the file, to write them again.
+            the rewards before the log was relabelled.
+        layout: the layout of the log.
+        contents: what to write again, with new rewards.
 
     Raises:
-        LareError: something is missing, of another shape or type, or not finite.
+        LareError: an array is missing, has another shape or type, or holds a number that is not finite.
     """
     for key in ("observations", "actions"):
         if key not in values:
-            raise LareError(f"{name} has no {key}: an episode has {NEEDED}")
-    action = rows(name, "actions", values["actions"], form.action)
-    shown = rows(name, "observations", values["observations"], form.observation)
-    steps = len(action)
-    if not steps:
+            raise LareError(f"{name} has no {key}: an episode needs observations, actions, and rewards or a score")
+    action = _rows(f"{name}: actions", values["actions"], layout.action)
+    observation = _rows(f"{name}: observations", values["observations"], layout.observation)
+    n_steps = len(action)
+    if not n_steps:
         raise LareError(f"{name}: actions has no step")
     if "next_observations" in values:
-        before, after = shown, rows(name, "next_observations", values["next_observations"], form.observation)
-        wanted, there = f"{steps}, one for each action", (len(before), len(after))
+        next_observation = _rows(f"{name}: next_observations", values["next_observations"], layout.observation)
+        if not len(observation) == len(next_observation) == n_steps:
+            raise LareError(
+                f"{name}: observations and next_observations need {n_steps} rows, one for each action, and have "
+                f"{len(observation)} and {len(next_observation)}"
+            )
     else:
-        before, after = shown[:-1], shown[1:]
-        wanted, there = f"{steps + 1}, one more than there are actions (or give next_observations)", (len(before),)
-    if set(there) != {steps}:
-        what = "observations and next_observations" if "next_observations" in values else "observations"
-        raise LareError(f"{name}: {what} must have {wanted}, and the shape of observations is {shown.shape}")
-    return Logged(name, before, action, after, paid(name, values, steps), is_whole(name, values, steps, form), kept)
+        if len(observation) != n_steps + 1:
+            raise LareError(
+                f"{name}: observations needs {n_steps + 1} rows, one more than actions, and has {len(observation)}: add the last "
+                "observation, or next_observations"
+            )
+        observation, next_observation = observation[:-1], observation[1:]
+    return LoggedEpisode(
+        name=name,
+        observation=observation,
+        action=action,
+        next_observation=next_observation,
+        reward=_original_reward(name, values, n_steps),
+        complete=_is_complete(name, values, n_steps, layout.max_episode_steps),
+        contents=contents,
+    )
 
 
-def rows(name: str, key: str, values: Any, layout: Layout) -> Float[np.ndarray, "steps size"]:
-    """An array of a file as rows of numbers."""
-    where = f"{name}: {key}"
-    for part in leaves(values):
-        if part.dtype.kind not in "biuf":
-            raise LareError(f"{where} must be numbers, and is of type {part.dtype}")
-        with np.errstate(all="ignore"):
-            small = not part.size or np.abs(part.astype(np.float64)).max() <= LARGEST  # which is false for nan
-        if not small:
-            raise LareError(f"{where} holds a number that is not finite, or larger than {LARGEST:g}")
-    found = layout.rows(values, where)
-    if found.ndim != 2:
-        raise LareError(f"{where} must be (steps, {layout.size}) in rows, and is {found.shape}")
-    return found
+def _rows(where: str, values: Any, layout: Layout) -> Float[np.ndarray, "steps size"]:
+    for leaf in _leaves(values):
+        _check_numbers(where, leaf)
+    rows = layout.rows(values, where)
+    if rows.ndim != 2:
+        raise LareError(f"{where} must have rows of {layout.size} numbers, and its shape is {rows.shape}")
+    return rows
 
 
-def leaves(values: Any) -> list[np.ndarray]:
-    """The arrays in a mapping or a tuple of them, or the array itself."""
-    if isinstance(values, dict):
-        return [leaf for part in values.values() for leaf in leaves(part)]
-    if isinstance(values, tuple):
-        return [leaf for part in values for leaf in leaves(part)]
+def _leaves(values: Any) -> list[np.ndarray]:
+    """Return the arrays of a nested observation."""
+    if isinstance(values, dict | tuple):
+        children = values.values() if isinstance(values, dict) else values
+        return [leaf for child in children for leaf in _leaves(child)]
     return [np.asarray(values)]
 
 
-def paid(name: str, values: Mapping[str, Any], steps: int) -> Float[np.ndarray, " steps"]:
-    """The original rewards of an episode: those before it was relabelled, if it was."""
+def _check_numbers(where: str, array: np.ndarray) -> None:
+    if array.dtype.kind not in "biuf":
+        raise LareError(f"{where} must be numbers, and has the type {array.dtype}")
+    with np.errstate(all="ignore"):
+        in_range = not array.size or np.abs(array.astype(np.float64)).max() <= MAX_MAGNITUDE  # false for NaN
+    if not in_range:
+        raise LareError(f"{where} has a number that is not finite, or larger than {MAX_MAGNITUDE:g}")
+
+
+def _original_reward(name: str, values: Mapping[str, Any], n_steps: int) -> Float[np.ndarray, " steps"]:
+    """Return the rewards of an episode, or those before it was relabelled."""
     key = next((key for key in ("paid", "score", "rewards") if key in values), None)
     if key is None:
-        raise LareError(f"{name} has no rewards and no score: an episode has {NEEDED}")
-    found = np.asarray(values[key])
-    if found.dtype.kind not in "biuf":
-        raise LareError(f"{name}: {key} must be numbers, and is of type {found.dtype}")
-    with np.errstate(all="ignore"):
-        found, shape = found.astype(np.float64), () if key == "score" else (steps,)
-        small = np.abs(found).sum() <= LARGEST  # which is false for nan
-    if found.shape != shape:
-        wanted = f"one reward for each of {steps} steps" if shape else "a single number"
-        raise LareError(f"{name}: {key} must be {wanted}, and its shape is {found.shape}")
-    if not small:
-        raise LareError(f"{name}: {key} holds a number that is not finite, or larger than {LARGEST:g}")
-    return found if shape else np.append(np.zeros(steps - 1), found)
+        raise LareError(f"{name} has no rewards and no score: an episode needs observations, actions, and one of these")
+    where, reward = f"{name}: {key}", np.asarray(values[key])
+    _check_numbers(where, reward)
+    shape = () if key == "score" else (n_steps,)
+    if reward.shape != shape:
+        expected = f"have one number for each of {n_steps} steps" if shape else "be a single number"
+        raise LareError(f"{where} must {expected}, and its shape is {reward.shape}")
+    reward = reward.astype(np.float64)
+    _check_numbers(where, np.asarray(np.abs(reward).sum()))
+    return reward if shape else np.append(np.zeros(n_steps - 1), reward)
 
 
-def is_whole(name: str, values: Mapping[str, Any], steps: int, form: Form) -> bool:
-    """Whether an episode is complete: it terminated, or the time limit ended it.
+def _is_complete(name: str, values: Mapping[str, Any], n_steps: int, max_episode_steps: int | None) -> bool:
+    """Return whether an episode terminated, or the time limit ended it.
 
-    If the time limit is not known, every truncated episode counts as ended by it. Without any flags, every episode is whole.
+    If the time limit is unknown, every truncation counts as the time limit. Without any flags, every episode is complete.
     """
-    ends = {key: flag_at_end(name, key, values, steps) for key in ("terminations", "truncations")}
-    if flag_at_end(name, "cut", values, steps):
+    terminated, truncated = (_last_flag(name, key, values, n_steps) for key in ("terminations", "truncations"))
+    if _last_flag(name, "cut", values, n_steps):
         return False
-    if ends["terminations"] or all(flag is None for flag in ends.values()):
+    if terminated or (terminated is None and truncated is None):
         return True
-    return bool(ends["truncations"]) if form.limit is None else steps >= form.limit
+    return bool(truncated) if max_episode_steps is None else n_steps >= max_episode_steps
 
 
-def flag_at_end(name: str, key: str, values: Mapping[str, Any], steps: int) -> bool | None:
-    """The flag of the last step; None if there is no flag."""
+def _last_flag(name: str, key: str, values: Mapping[str, Any], n_steps: int) -> bool | None:
+    """Return the flag of the last step, or None without flags. `cut` is true if any of its flags is."""
     if key not in values:
         return None
     flags = np.asarray(values[key])
     if flags.dtype.kind not in "biuf" or not np.isin(flags, (0, 1)).all():
-        raise LareError(f"{name}: {key} must be true or false, and is {shortened(flags)}")
-    if flags.shape not in ((), (1,), (steps,)):
-        raise LareError(f"{name}: {key} must be one flag for each of {steps} steps, and its shape is {flags.shape}")
-    flat = np.atleast_1d(flags).astype(bool)
-    if key != "cut" and flat[:-1].any():
-        raise LareError(f"{name}: {key} ends the episode at step {int(flat.argmax())} of {steps}")
-    return bool(flat.any() if key == "cut" else flat[-1])
-
-
-def form_of(name: str, values: Mapping[str, Any], sizes: Mapping[str, int], limit: int | None) -> Form:
-    """The form of a log without spaces, from its first episode.
-
-    Args:
-        name: name of the episode.
-        values: the contents of its file.
-        sizes: sizes of `observation` and `action` rows, if a task gives them.
-        limit: the time limit, if it is known.
-
-    Raises:
-        LareError: actions are whole numbers, and the number of choices is not known.
-    """
-    found = {}
-    for kind in ("observation", "action"):
-        array = np.asarray(values.get(f"{kind}s", np.zeros((0, 0))))
-        size = sizes.get(kind)
-        chosen = array.dtype.kind in "iu" and array.ndim == 1
-        if chosen and size is None:
-            raise LareError(
-                f"{name}: {kind}s are whole numbers, choices maybe: write a task file that says how many there are ({kind}_size), "
-                "as docs/logs.md shows, and give it (--task FILE)"
-            )
-        if chosen and size != 1:
-            found[kind] = Layout(kind="choices", choices=(int(size or 0),), first=(0,))
-        else:
-            found[kind] = Layout(kind="numbers", shape=array.shape[1:])
-    return Form(found["observation"], found["action"], limit)
+        raise LareError(f"{name}: {key} must be true or false, and is {short_repr(flags)}")
+    if flags.shape not in ((), (1,), (n_steps,)):
+        raise LareError(f"{name}: {key} must have one flag for each of {n_steps} steps, and its shape is {flags.shape}")
+    flags = np.atleast_1d(flags).astype(bool)
+    if key == "cut":
+        return bool(flags.any())
+    if flags[:-1].any():
+        raise LareError(f"{name}: {key} ends the episode at step {int(flags.argmax())} of {n_steps}")
+    return bool(flags[-1])

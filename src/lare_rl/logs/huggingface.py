@@ -6,58 +6,52 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from lare_rl.errors import LareError, needs_extra, shortened
+from lare_rl.errors import LareError, missing_extra_error, short_repr
 
 try:
     import datasets
     import pyarrow as pa
 except ImportError as missing:
-    raise needs_extra("a Hugging Face data set", "datasets") from missing
+    raise missing_extra_error("a Hugging Face data set", "datasets") from missing
 
-from lare_rl.logs import tables
-from lare_rl.logs.tables import Format
+from lare_rl.logs.tables import BATCH_ROWS, TableLog, write_tables
+
+__all__ = ["HuggingFaceLog"]
 
 STATE, SPLITS = "state.json", "dataset_dict.json"
-"""Files of a data set, and of a directory of several."""
+"""The file that marks a data set, and the file that marks a directory of several."""
 
 
-def batches(path: Path) -> Iterator[pa.RecordBatch]:
-    """Read some rows at a time."""
-    if (path / SPLITS).exists():
-        names = ", ".join(sorted(str(state.parent) for state in path.glob(f"*/{STATE}")))
-        raise LareError(f"{path} holds several data sets: name one of {names}")
-    try:
-        rows: Any = datasets.Dataset.load_from_disk(str(path)).with_format("arrow")
-        for table in rows.iter(tables.ROWS):
-            yield from table.to_batches()
-    except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
-        raise LareError(f"{path} is no Hugging Face data set, or a damaged one: {shortened(error)}") from error
+class HuggingFaceLog(TableLog):
+    """A data set of one split."""
 
+    def read_batches(self) -> Iterator[pa.RecordBatch]:
+        if (self.path / SPLITS).exists():
+            names = ", ".join(sorted(str(state.parent) for state in self.path.glob(f"*/{STATE}")))
+            raise LareError(f"{self.path} has several splits: name one of {names}")
+        try:
+            dataset: Any = datasets.Dataset.load_from_disk(str(self.path)).with_format("arrow")
+            for table in dataset.iter(BATCH_ROWS):
+                yield from table.to_batches()
+        except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
+            raise LareError(f"{self.path} is not a Hugging Face data set, or damaged: {short_repr(error)}") from error
 
-def write(path: Path, parts: Iterator[pa.Table]) -> None:
-    """Write a data set of one split."""
-    rows = path / "rows" / "rows.arrow"
-    rows.parent.mkdir(parents=True)
-    first = next(parts)
-    with pa.OSFile(str(rows), "wb") as file, pa.ipc.new_stream(file, first.schema) as writer:
-        writer.write_table(first)
-        for part in parts:
-            writer.write_table(part)
-    with silent():
-        datasets.Dataset.from_file(str(rows)).save_to_disk(str(path))
-    shutil.rmtree(rows.parent)
+    def write_file(self, path: Path, tables: Iterator[pa.Table]) -> None:
+        rows = path / "rows" / "rows.arrow"
+        rows.parent.mkdir(parents=True)
+        with pa.OSFile(str(rows), "wb") as file:
+            write_tables(tables, lambda schema: pa.ipc.new_stream(file, schema))
+        with _no_progress_bars():
+            datasets.Dataset.from_file(str(rows)).save_to_disk(str(path))
+        shutil.rmtree(rows.parent)
 
 
 @contextlib.contextmanager
-def silent() -> Iterator[None]:
-    """Without the library's own progress bars."""
-    shown = not datasets.are_progress_bars_disabled()
+def _no_progress_bars() -> Iterator[None]:
+    were_enabled = not datasets.are_progress_bars_disabled()
     datasets.disable_progress_bars()
     try:
         yield
     finally:
-        if shown:
+        if were_enabled:
             datasets.enable_progress_bars()
-
-
-HUGGING_FACE = Format(batches, write)

@@ -1,4 +1,4 @@
-"""Minari data sets. r_hat replaces the rewards; the old ones are in `infos["paid"]`, whose first entry belongs to the reset."""
+"""Minari data sets. r_hat replaces the rewards. The original ones are in `infos["paid"]`, whose first entry belongs to the reset."""
 
 import warnings
 from collections.abc import Iterable, Iterator
@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.assigner.layout import layout_of
-from lare_rl.errors import LareError, needs_extra, shortened
-from lare_rl.logs.episode import Form, Hints, Logged, Paid, checked
-from lare_rl.logs.output import check_free, whole
+from lare_rl.assigner.layout import make_layout
+from lare_rl.errors import LareError, missing_extra_error, short_repr
+from lare_rl.logs.episode import LogLayout, RelabelledEpisode
+from lare_rl.logs.log import Log
+from lare_rl.logs.output import atomic_output, check_output
+from lare_rl.tasks.spec import TaskSpec
 
 try:
     import minari
@@ -20,64 +22,67 @@ try:
     from minari.namespace import create_namespace, list_local_namespaces
     from minari.storage.datasets_root_dir import get_dataset_path
 except ImportError as missing:
-    raise needs_extra("a Minari data set", "minari") from missing
+    raise missing_extra_error("a Minari data set", "minari") from missing
 
-COPIED = (
+__all__ = ["MinariLog", "is_local_dataset", "load_dataset"]
+
+COPIED_METADATA = (
     *("author", "author_email", "code_permalink", "algorithm_name", "requirements", "eval_env_spec"),
     *("ref_min_score", "ref_max_score", "num_episodes_average_score"),
 )
-"""Keys of a data set's metadata that are copied."""
 
 
-class MinariLogs:
-    """A data set of one agent, with any spaces that can be written as rows of numbers."""
+class MinariLog(Log):
+    """A data set of one agent, with spaces that can be written as rows of numbers."""
 
-    def __init__(self, dataset: Any, hints: Hints):
+    def __init__(self, dataset: Any, role: TaskSpec | None):
         self.dataset: MinariDataset = dataset
         self.name = str(dataset.spec.dataset_id)
-        self.count: int | None = int(dataset.total_episodes)
-        if not self.count:
+        self.n_episodes = int(dataset.total_episodes)
+        if not self.n_episodes:
             raise LareError(f"{self.name} has no episode")
-        spec = dataset.env_spec
-        limit = hints.limit or (spec.max_episode_steps if spec is not None else None)
-        observation = layout_of(dataset.observation_space, f"the observation space of {self.name}")
-        self.form = Form(observation, layout_of(dataset.action_space, f"the action space of {self.name}"), limit)
+        max_episode_steps = None if role is None else role.max_episode_steps
+        if max_episode_steps is None and dataset.env_spec is not None:
+            max_episode_steps = dataset.env_spec.max_episode_steps
+        self.layout = LogLayout(
+            observation=make_layout(dataset.observation_space, f"the observation space of {self.name}"),
+            action=make_layout(dataset.action_space, f"the action space of {self.name}"),
+            max_episode_steps=max_episode_steps,
+        )
 
-    def episodes(self) -> Iterator[Logged]:
-        """Read one episode at a time, in the order of their numbers."""
-        indices = self.dataset.episode_indices
-        storage = self.dataset.storage
-        both = zip(storage.get_episodes(indices), storage.get_episode_metadata(indices), strict=True)
+    def read(self) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
+        indices, storage = self.dataset.episode_indices, self.dataset.storage
+        records = zip(storage.get_episodes(indices), storage.get_episode_metadata(indices), strict=True)
         for number in indices.tolist():
             name = f"{self.name}, episode {number}"
             try:
-                values, about = next(both)
-            except Exception as error:  # h5py, pyarrow and Minari may raise anything for a file that is not trusted
-                raise LareError(f"{name} cannot be read: {shortened(error)}") from error
+                values, metadata = next(records)
+            except Exception as error:  # h5py, pyarrow and Minari may raise anything for an untrusted file
+                raise LareError(f"{name} cannot be read: {short_repr(error)}") from error
             values = {key: value for key, value in values.items() if key != "id"}
             infos = values.get("infos") or {}
             if "paid" in infos:
                 values["paid"] = np.asarray(infos["paid"])[1:]
-            yield checked(name, values, self.form, {**values, "infos": infos, "seed": about.get("seed")})
+            yield name, values, {**values, "infos": infos, "seed": metadata.get("seed")}
 
-    def check_out(self, out: str | Path, overwrite: bool) -> None:
-        """Check the Minari id to write."""
-        path = path_of(out)
-        if path.parent.exists():  # if it does not, `write` creates the namespace
-            check_free(path, overwrite)
+    def check_output(self, out: str | Path, overwrite: bool) -> None:
+        """Raise `LareError` if no data set with the id `out` can be written."""
+        path = _dataset_path(out)
+        if path.parent.exists():  # otherwise `write` creates the namespace
+            check_output(path, overwrite)
 
-    def write(self, out: str | Path, episodes: Iterable[Paid], overwrite: bool, about: str) -> str | Path:
-        """Write a data set with another id, in the same format."""
-        path, dataset_id, source = path_of(out), str(out), self.dataset.storage
+    def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> str:
+        """Write a data set with the id `out`, in the same format."""
+        path, dataset_id, source = _dataset_path(out), str(out), self.dataset.storage
         namespace, _, _ = parse_dataset_id(dataset_id)
         if namespace is not None and namespace not in list_local_namespaces():
             create_namespace(namespace)
         metadata = source.metadata
-        with whole(path, overwrite) as new, warnings.catch_warnings():
+        with atomic_output(path, overwrite) as directory, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Minari warns if the spec of an environment cannot be saved
-            new.mkdir()
+            directory.mkdir()
             storage = MinariStorage.new(
-                new / "data",
+                directory / "data",
                 source.observation_space,
                 source.action_space,
                 self.dataset.env_spec,
@@ -86,63 +91,38 @@ class MinariLogs:
             )
             storage.update_metadata(
                 {
-                    **{key: metadata[key] for key in COPIED if metadata.get(key) is not None},
+                    **{key: metadata[key] for key in COPIED_METADATA if metadata.get(key) is not None},
                     "dataset_id": dataset_id,
                     "minari_version": minari.__version__,
-                    "description": f"{metadata.get('description') or self.name}\n\n{about}",
+                    "description": f"{metadata.get('description') or self.name}\n\n{comment}",
                 }
             )
-            storage.update_episodes(buffer_of(paid, source.FORMAT) for paid in episodes)
+            storage.update_episodes(_episode_buffer(item, source.FORMAT) for item in episodes)
         return dataset_id
 
 
-def flat(infos: dict[str, Any]) -> dict[str, Any]:
-    """Rows of single numbers as lists: Minari writes them into Arrow as arrays, and cannot read those again."""
-    return {
-        key: flat(one)
-        if isinstance(one, dict)
-        else one.tolist()
-        if np.ndim(one) == 1 and hasattr(one, "tolist")
-        else one
-        for key, one in infos.items()
-    }
+def load_dataset(dataset_id: str) -> MinariDataset:
+    """Load a local data set. Nothing is downloaded.
 
-
-def buffer_of(paid: Paid, data_format: str) -> EpisodeBuffer:
-    """An episode in the form that Minari writes."""
-    kept = paid.episode.kept
-    infos = {**kept["infos"], "paid": np.append(0.0, paid.episode.paid)}
-    return EpisodeBuffer(
-        seed=kept["seed"],
-        observations=kept["observations"],
-        actions=kept["actions"],
-        rewards=paid.r_hat,  # pyright: ignore[reportArgumentType] - an array does as well
-        terminations=kept["terminations"],
-        truncations=kept["truncations"],
-        infos=infos if data_format == "hdf5" else flat(infos),
-    )
-
-
-def load(dataset_id: str) -> MinariDataset:
-    """A local data set. Raises `LareError` if there is none: nothing is downloaded."""
+    Raises:
+        LareError: there is no such data set, or it is damaged.
+    """
     try:
         return minari.load_dataset(dataset_id)
-    except Exception as error:  # h5py and Minari may raise anything for files that are not trusted
+    except Exception as error:  # h5py and Minari may raise anything for untrusted files
         if not (get_dataset_path(dataset_id) / "data").exists():
             raise LareError(
-                f"there is no {dataset_id}: neither a path nor a local data set of Minari (minari list local; "
-                "minari download fetches one)"
+                f"{dataset_id} is neither a path nor a local Minari data set: see minari list local; minari download fetches one"
             ) from error
-        raise LareError(f"{dataset_id} cannot be read by Minari: {shortened(error)}") from error
+        raise LareError(f"{dataset_id} cannot be read by Minari: {short_repr(error)}") from error
 
 
-def is_local(dataset_id: str) -> bool:
-    """Whether there is a local Minari data set with that id."""
+def is_local_dataset(dataset_id: str) -> bool:
+    """Return whether a local Minari data set has that id."""
     return (get_dataset_path(dataset_id) / "data").is_dir()
 
 
-def path_of(dataset_id: str | Path) -> Path:
-    """The path of the data set with that id. Raises `LareError` if it is not an id."""
+def _dataset_path(dataset_id: str | Path) -> Path:
     try:
         parse_dataset_id(str(dataset_id))
     except (ValueError, TypeError):
@@ -150,3 +130,28 @@ def path_of(dataset_id: str | Path) -> Path:
             f"{dataset_id} is not a Minari id, such as cheetah/relabelled-v0: a name, -v and a number"
         ) from None
     return get_dataset_path(str(dataset_id))
+
+
+def _episode_buffer(item: RelabelledEpisode, data_format: str) -> EpisodeBuffer:
+    contents = item.episode.contents
+    infos = {**contents["infos"], "paid": np.append(0.0, item.episode.reward)}
+    return EpisodeBuffer(
+        seed=contents["seed"],
+        observations=contents["observations"],
+        actions=contents["actions"],
+        rewards=item.r_hat,  # pyright: ignore[reportArgumentType] - an array works as well
+        terminations=contents["terminations"],
+        truncations=contents["truncations"],
+        infos=infos if data_format == "hdf5" else _lists_of_numbers(infos),
+    )
+
+
+def _lists_of_numbers(infos: dict[str, Any]) -> dict[str, Any]:
+    """Convert flat arrays to lists. Minari writes such arrays into Arrow, and cannot read them again."""
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, dict):
+            return _lists_of_numbers(value)
+        return value.tolist() if isinstance(value, np.ndarray) and value.ndim == 1 else value
+
+    return {key: convert(value) for key, value in infos.items()}

@@ -6,58 +6,55 @@ from pathlib import Path
 
 import numpy as np
 
-from lare_rl.errors import LareError, shortened
-from lare_rl.logs.episode import Hints, Logged, Paid, checked, form_of
-from lare_rl.logs.output import check_free, whole
+from lare_rl.errors import LareError, short_repr
+from lare_rl.logs.episode import RelabelledEpisode
+from lare_rl.logs.log import Log
+from lare_rl.logs.output import atomic_output
+from lare_rl.tasks.spec import TaskSpec
+
+__all__ = ["NpzLog", "read_npz", "write_npz_directory"]
 
 
-class NpzLogs:
-    """Files in the order of their names. The arrays have the names of `episode.checked`; other arrays are kept unchanged."""
+class NpzLog(Log):
+    """Files in the order of their names. Arrays with other names than those of `parse_episode` are copied unchanged."""
 
-    def __init__(self, directory: Path, hints: Hints):
+    def __init__(self, directory: Path, role: TaskSpec | None):
         self.name, self.files = str(directory), sorted(directory.glob("*.npz"))
         if not self.files:
             raise LareError(f"{directory} holds no .npz and no .parquet files")
-        self.count: int | None = len(self.files)
-        self.form = form_of(str(self.files[0]), read(self.files[0]), hints.sizes, hints.limit)
+        self.n_episodes = len(self.files)
+        self.layout = self.infer_layout(role)
 
-    def episodes(self) -> Iterator[Logged]:
-        """The episodes, one from each file."""
+    def read(self) -> Iterator[tuple[str, dict[str, np.ndarray], dict[str, np.ndarray]]]:
         for file in self.files:
-            values = read(file)
-            yield checked(str(file), values, self.form, (file.name, values))
+            arrays = read_npz(file)
+            yield str(file), arrays, arrays
 
-    def check_out(self, out: str | Path, overwrite: bool) -> None:
-        """Check the directory to write."""
-        check_free(Path(out), overwrite)
-
-    def write(self, out: str | Path, episodes: Iterable[Paid], overwrite: bool, about: str) -> str | Path:
-        """Write a directory of files with the same names."""
-        return write(Path(out), ((paid.episode.kept[0], paid) for paid in episodes), overwrite)
+    def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> Path:
+        return write_npz_directory(out, ((Path(item.episode.name).name, item) for item in episodes), overwrite)
 
 
-def read(file: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file. Raises `LareError` if it is damaged; nothing is unpickled."""
+def read_npz(file: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of a file, without unpickling anything. Raises `LareError` if the file is damaged."""
     try:
-        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as saved:
-            return {key: saved[key] for key in saved.files}
-    except Exception as error:  # NumPy and zipfile may raise anything for a file that is not trusted
-        raise LareError(f"{file} is no .npz file, or a damaged one: {shortened(error)}") from error
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except Exception as error:  # NumPy and zipfile may raise anything for an untrusted file
+        raise LareError(f"{file} is not an .npz file, or damaged: {short_repr(error)}") from error
 
 
-def write(out: Path, episodes: Iterable[tuple[str, Paid]], overwrite: bool) -> Path:
-    """Write a directory of episodes, given with the names of their files."""
-    with whole(out, overwrite) as new:
-        new.mkdir()
+def write_npz_directory(out: str | Path, episodes: Iterable[tuple[str, RelabelledEpisode]], overwrite: bool) -> Path:
+    """Write a directory of episodes, each with the name of its file."""
+    with atomic_output(Path(out), overwrite) as directory:
+        directory.mkdir()
         for name, (episode, r_hat) in episodes:
-            values = episode.kept if isinstance(episode.kept, Mapping) else episode.kept[1]
-            save(new / name, {**values, "rewards": r_hat, "paid": episode.paid})
-    return out
+            _save_npz(directory / name, {**episode.contents, "rewards": r_hat, "paid": episode.reward})
+    return Path(out)
 
 
-def save(file: Path, values: Mapping[str, np.ndarray]) -> None:
-    """Like `numpy.savez`, which cannot save an array whose name is one of its own arguments."""
+def _save_npz(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays of any name. `numpy.savez` cannot save an array whose name is one of its arguments."""
     with zipfile.ZipFile(file, "x", allowZip64=True) as archive:
-        for key, value in values.items():
+        for key, array in arrays.items():
             with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asanyarray(value), allow_pickle=False)
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)

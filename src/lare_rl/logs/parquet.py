@@ -3,39 +3,34 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from lare_rl.errors import LareError, needs_extra, shortened
+from lare_rl.errors import LareError, missing_extra_error, short_repr
 
 try:
     import pyarrow as pa
     import pyarrow.parquet as pq
 except ImportError as missing:
-    raise needs_extra("a Parquet file", "parquet") from missing
+    raise missing_extra_error("a Parquet file", "parquet") from missing
 
-from lare_rl.logs import tables
-from lare_rl.logs.tables import Format
+from lare_rl.logs.tables import BATCH_ROWS, TableLog, write_tables
 
-
-def batches(path: Path) -> Iterator[pa.RecordBatch]:
-    """Read some rows at a time, of all files."""
-    files, schema = sorted(path.glob("*.parquet")) if path.is_dir() else [path], None
-    for file in files:
-        try:
-            with pq.ParquetFile(file) as opened:
-                schema = schema or opened.schema_arrow
-                if opened.schema_arrow != schema:
-                    raise LareError(f"{file} has other columns than {files[0]}")
-                yield from opened.iter_batches(tables.ROWS)
-        except (OSError, pa.ArrowException, NotImplementedError) as error:
-            raise LareError(f"{file} is no Parquet file, or a damaged one: {shortened(error)}") from error
+__all__ = ["ParquetLog"]
 
 
-def write(path: Path, parts: Iterator[pa.Table]) -> None:
-    """Write one file."""
-    first = next(parts)
-    with pq.ParquetWriter(path, first.schema) as writer:
-        writer.write_table(first)
-        for part in parts:
-            writer.write_table(part)
+class ParquetLog(TableLog):
+    """Parquet files with the same columns."""
 
+    def read_batches(self) -> Iterator[pa.RecordBatch]:
+        files = sorted(self.path.glob("*.parquet")) if self.path.is_dir() else [self.path]
+        schema = None
+        for file in files:
+            try:
+                with pq.ParquetFile(file) as reader:
+                    schema = schema or reader.schema_arrow
+                    if reader.schema_arrow != schema:
+                        raise LareError(f"{file} has other columns than {files[0]}")
+                    yield from reader.iter_batches(BATCH_ROWS)
+            except (OSError, pa.ArrowException, NotImplementedError) as error:
+                raise LareError(f"{file} is not a Parquet file, or damaged: {short_repr(error)}") from error
 
-PARQUET = Format(batches, write)
+    def write_file(self, path: Path, tables: Iterator[pa.Table]) -> None:
+        write_tables(tables, lambda schema: pq.ParquetWriter(path, schema))

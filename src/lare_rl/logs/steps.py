@@ -1,29 +1,32 @@
-"""Steps and episodes of a log, on which a function is checked if there is no environment."""
+"""Steps and episodes of a log, for checks of a latent function without an environment."""
 
 import itertools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
-from lare_rl.envs.load import as_task
+from lare_rl.envs.load import resolve_task
 from lare_rl.envs.play import Episode
-from lare_rl.latent.verify import STEPS, Steps
-from lare_rl.logs.source import open_logs
-from lare_rl.tasks.spec import TaskSpec, judged_states
+from lare_rl.latent.verify import N_SAMPLE_STEPS, Steps
+from lare_rl.logs.log import open_log
+from lare_rl.tasks.spec import TaskSpec, select_states
 
-EPISODES = 64
-"""Steps are taken from so many first episodes."""
+__all__ = ["logged_episodes", "logged_steps"]
+
+SAMPLED_EPISODES = 64
+"""Number of first episodes from which steps are sampled."""
 
 
-def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = STEPS) -> Steps:
-    """Steps that are spread evenly over the first episodes of a log: for `steps=` of `design`, `load_function` and `verified`.
+def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = N_SAMPLE_STEPS) -> Steps:
+    """Return steps at even distances in the first episodes of a log, for `steps=` of `design`, `load_function` and `verified`.
 
     Args:
         source: as in `relabel`.
-        task: a name, a path, or a spec. It says which observation is judged, the one before or the one after a step, or both:
-            half of the rows are then observations before a step.
-        count: about how many steps. A shorter log gives fewer.
+        task: a name, a path, or a spec. Its `judges` says whether phi sees the observation before a step, the one after it, or
+            both. With both, the first half of the rows are observations before a step.
+        count: approximate number of steps. A shorter log has fewer.
 
     Returns:
         Observations (n, observation size) and actions (n, action size).
@@ -31,29 +34,34 @@ def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = STEPS) -
     Raises:
         LareError: the log cannot be read.
     """
-    task, parts = as_task(task, playable=False), []
-    for episode in itertools.islice(open_logs(source, task).episodes(), EPISODES):
-        places = np.unique(np.linspace(0, len(episode) - 1, min(count, len(episode))).astype(int))
-        sides = judged_states(task.judges, episode.before[places], episode.after[places])
-        parts.append([(observation, episode.action[places]) for observation in sides])
-    observation, action = (
-        np.concatenate(part) for part in zip(*itertools.chain(*zip(*parts, strict=True)), strict=True)
-    )
-    chosen = np.unique(np.linspace(0, len(action) - 1, min(count, len(action))).astype(int))
-    return observation[chosen], action[chosen]
+    task = resolve_task(task, playable=False)
+    observations, actions = [], []
+    for episode in itertools.islice(open_log(source, task).episodes(), SAMPLED_EPISODES):
+        steps = _spread(len(episode), count)
+        observations.append(select_states(task.judges, episode.observation[steps], episode.next_observation[steps]))
+        actions.append(episode.action[steps])
+    sides = [np.concatenate(side) for side in zip(*observations, strict=True)]
+    observation, action = np.concatenate(sides), np.concatenate(actions * len(sides))
+    rows = _spread(len(action), count)
+    return observation[rows], action[rows]
 
 
 def logged_episodes(source: Any, task: TaskSpec, count: int) -> list[Episode]:
-    """The first whole episodes of a log, at most `count`. Raises `LareError` if it cannot be read."""
-    whole = (episode for episode in open_logs(source, task).episodes() if episode.whole)
+    """Return the first `count` complete episodes of a log. Raises `LareError` if it cannot be read."""
+    complete = (episode for episode in open_log(source, task).episodes() if episode.complete)
     return [
         Episode(
-            episode.before[:, None],
-            episode.action[:, None],
-            episode.after[:, None],
-            np.ones((len(episode), 1), bool),
-            episode.paid[:, None],
-            episode.paid,
+            observation=episode.observation[:, None],
+            env_action=episode.action[:, None],
+            next_observation=episode.next_observation[:, None],
+            alive=np.ones((len(episode), 1), bool),
+            reward=episode.reward[:, None],
+            team_reward=episode.reward,
         )
-        for episode in itertools.islice(whole, count)
+        for episode in itertools.islice(complete, count)
     ]
+
+
+def _spread(length: int, count: int) -> Int[np.ndarray, " indices"]:
+    """Return at most `count` indices at even distances, from the first to the last."""
+    return np.unique(np.linspace(0, length - 1, min(count, length)).astype(int))

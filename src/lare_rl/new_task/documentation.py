@@ -2,10 +2,13 @@
 
 import inspect
 import re
+from collections.abc import Mapping, Sequence
+
+__all__ = ["first_section", "plain_lines", "remove_rewards", "split_sections", "write_texts"]
 
 HEADING = re.compile(r"^[ \t]*#+\s*(.+?)\s*$", re.MULTILINE)
 
-LEAKS = re.compile(
+REWARD_WORDS = re.compile(
     r"reward|penal|\bcosts?\b|\bscor(e|es|ed|ing)\b|\bgraded\b"
     r"|\b(a|the|final) (mark|grade) (is|of|from|for|between|at the end|out of|\(?-?\d)"
     r"|(\d|\b(earn|gain|get|give|lose|receive|win|award)\w*)( \w+)? points?\b"
@@ -14,106 +17,113 @@ LEAKS = re.compile(
 )
 """Words about rewards, which the language model must not read: it must find out what matters, not copy the reward."""
 
-SHORTEST_SENTENCE = 8
-"""The start of a sentence is only kept if it has at least this many words."""
+MIN_WORDS = 8
+"""The start of a sentence is only kept if it has at least this number of words."""
 
-SENTENCE = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
+SENTENCE_END = re.compile(r"(?<=[^\d][.!?])\s+(?=[A-Z`*])")
 
 FIGURE = re.compile(r"^```\{.*?^```|<[^<>\n]+>", re.MULTILINE | re.DOTALL)
 NOISE = re.compile(r"^!\[|^:?-{3,}|^```|^\s*$")
 NUMBERED = re.compile(r"\d+(\s*(-|to)\s*\d+)?[.:]\s")
-"""The start of a line about an entry or several: `3: ...`, `3 to 5: ...`."""
-ELSEWHERE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.IGNORECASE)
-"""References to figures, which are useless outside the original page."""
+"""The start of a line about one entry or several: `3: ...`, `3 to 5: ...`."""
+FIGURE_REFERENCE = re.compile(r"\b(diagram|figure|image|picture) (above|below)\b", re.IGNORECASE)
 
-ENDINGS = ("episode end", "episode termination")
-"""The sections about the end of an episode."""
+EPISODE_END_TITLES = ("episode end", "episode termination")
 
 
-def sections_of(documentation: str) -> dict[str, str]:
-    """The sections of a text, by their headings in lower case; "" is the text before the first heading."""
+def split_sections(documentation: str) -> dict[str, str]:
+    """Return the sections of a text by their headings in lower case. The key "" is the text before the first heading."""
     text = FIGURE.sub("", inspect.cleandoc(documentation))
-    parts = HEADING.split(text)
-    sections = {"": parts[0]}
-    for title, body in zip(parts[1::2], parts[2::2], strict=True):
+    first, *rest = HEADING.split(text)
+    sections = {"": first}
+    for title, body in zip(rest[::2], rest[1::2], strict=True):
         sections.setdefault(title.lower(), body)
     return sections
 
 
-def plain(text: str) -> list[str]:
-    """Lines of text and rows of tables, without markup."""
+def first_section(sections: Mapping[str, str], *titles: str) -> list[str]:
+    """Return the lines of the first section with one of these titles that is not empty."""
+    return plain_lines(next((sections[title] for title in titles if sections.get(title, "").strip()), ""))
+
+
+def write_texts(
+    lines: Mapping[str, Sequence[str]], sections: Mapping[str, str]
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Return the texts of a task file, and the lines that were removed because they mention rewards.
+
+    Args:
+        lines: the lines of each text, by its key. The description is extended by how an episode ends.
+        sections: the sections of the documentation.
+    """
+    cleaned = {key: remove_rewards(text) for key, text in lines.items()}
+    texts = {key: text for key, (text, _) in cleaned.items()}
+    endings = (remove_rewards(first_section(sections, title))[0] for title in EPISODE_END_TITLES)
+    if texts["description"] and (ending := next(filter(None, endings), "")):
+        texts["description"] += f"\n{ending}"
+    return texts, tuple(line for _, removed in cleaned.values() for line in removed)
+
+
+def plain_lines(text: str) -> list[str]:
+    """Return the sentences, list items and table rows of a text in Markdown, without markup."""
     lines: list[str] = []
     paragraph: list[str] = []
     table: list[str] = []
     for line in [*text.splitlines(), ""]:
         stripped = line.strip()
-        if table and not stripped.startswith("|"):
-            lines += rows(table)
+        is_row, is_item = stripped.startswith("|"), stripped.startswith(("- ", "* ")) or NUMBERED.match(stripped)
+        if table and not is_row:
+            lines += _table_lines(table)
             table = []
-        if stripped.startswith("|") or NOISE.match(stripped):
-            if paragraph:
-                lines += SENTENCE.split(" ".join(paragraph))
-                paragraph = []
-            if stripped.startswith("|"):
-                table.append(stripped)
-        elif stripped.startswith(("- ", "* ")) or NUMBERED.match(stripped):
-            if paragraph:
-                lines += SENTENCE.split(" ".join(paragraph))
-            paragraph = [stripped]
-        else:
+        if paragraph and (is_row or is_item or NOISE.match(stripped)):
+            lines += SENTENCE_END.split(" ".join(paragraph))
+            paragraph = []
+        if is_row:
+            table.append(stripped)
+        elif is_item or not NOISE.match(stripped):
             paragraph.append(stripped)
-    unset = [re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line).replace("**", "").replace("`", "").strip() for line in lines]
-    return [
-        re.sub(r"\$?\\?[a-z]*\{?\\infty\}?\$?", "inf", line) for line in unset if line and not ELSEWHERE.search(line)
-    ]
+    return [_remove_markup(line) for line in lines if _remove_markup(line) and not FIGURE_REFERENCE.search(line)]
 
 
-def rows(table: list[str]) -> list[str]:
-    """The rows of a table as text: the first cell, a colon, and the other cells.
+def _remove_markup(line: str) -> str:
+    line = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line).replace("**", "").replace("`", "").strip()
+    return re.sub(r"\$?\\?[a-z]*\{?\\infty\}?\$?", "inf", line)
 
-    From the third cell on, each has the title of its column before it, if the table has a head and the title does not mention
-    rewards.
+
+def _table_lines(table: Sequence[str]) -> list[str]:
+    """Return the rows of a table as text: the first cell, a colon, and the other cells.
+
+    Cells from the third on follow the title of their column, unless the title mentions rewards.
     """
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in table]
-    head: list[str] = []
-    if len(cells) > 1 and is_separator(cells[1]):
-        head = ["" if place < 2 or LEAKS.search(title) else f"{title} " for place, title in enumerate(cells[0])]
-        cells = cells[1:]
-    return [row(one, head) for one in cells if not is_separator(one)]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table]
+    titles: list[str] = []
+    if len(rows) > 1 and _is_separator(rows[1]):
+        head, *rows = rows
+        titles = ["" if column < 2 or REWARD_WORDS.search(title) else f"{title} " for column, title in enumerate(head)]
+    lines = []
+    for cells in rows:
+        if not _is_separator(cells):
+            titles += [""] * (len(cells) - len(titles))
+            first, *rest = [title + cell for title, cell in zip(titles, cells, strict=False) if cell] or [""]
+            lines.append(f"{first}: {'; '.join(rest)}" if rest else first)
+    return lines
 
 
-def row(cells: list[str], titles: list[str]) -> str:
-    """A row as text, without its empty cells."""
-    titles = titles + [""] * (len(cells) - len(titles))
-    first, *others = [f"{title}{cell}" for title, cell in zip(titles, cells, strict=False) if cell] or [""]
-    return f"{first}: {'; '.join(others)}" if others else first
-
-
-def is_separator(cells: list[str]) -> bool:
-    """Whether a row of a table only separates its head from its body, or is empty."""
+def _is_separator(cells: Sequence[str]) -> bool:
+    """Return whether a row separates the head of a table from its body, or is empty."""
     return all(re.fullmatch(r":?-*:?", cell) for cell in cells)
 
 
-def without_rewards(lines: list[str]) -> tuple[str, tuple[str, ...]]:
-    """The lines without everything that mentions rewards, and the lines that did."""
-    kept = [without_clause(line) for line in lines]
-    said = tuple(line for line, rest in zip(lines, kept, strict=True) if line != rest)
-    return "\n".join(line for line in kept if line), said
+def remove_rewards(lines: Sequence[str]) -> tuple[str, tuple[str, ...]]:
+    """Return the lines without all that mentions rewards, and the original lines that changed."""
+    cleaned = [_remove_reward_clause(line) for line in lines]
+    changed = tuple(line for line, rest in zip(lines, cleaned, strict=True) if line != rest)
+    return "\n".join(filter(None, cleaned)), changed
 
 
-def without_clause(line: str) -> str:
-    """A line up to the clause that mentions rewards, if the part before it is long enough for a sentence; else nothing."""
-    found = LEAKS.search(line)
-    if found is None:
+def _remove_reward_clause(line: str) -> str:
+    """Return a line up to the clause that mentions rewards, or an empty text if too little is left for a sentence."""
+    match = REWARD_WORDS.search(line)
+    if match is None:
         return line
-    before, _, _ = line[: found.start()].rpartition(", ")
-    return before + "." if len(before.split()) >= SHORTEST_SENTENCE else ""
-
-
-def ending(sections: dict[str, str]) -> str:
-    """How an episode ends, if the documentation describes this without mentioning rewards."""
-    for title in ENDINGS:
-        kept, _ = without_rewards(plain(sections.get(title, "")))
-        if kept:
-            return "\n" + kept
-    return ""
+    before, _, _ = line[: match.start()].rpartition(", ")
+    return before + "." if len(before.split()) >= MIN_WORDS else ""

@@ -1,23 +1,38 @@
-"""A draft of a task file, and the parts that every draft consists of."""
+"""A draft of a task file, and the lines that all drafts have."""
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import gymnasium
+from gymnasium.spaces import Box, Discrete
 
 from lare_rl.envs.spaces import OneHot
 from lare_rl.tasks.spec import FILL_IN
 
-JUDGES = 'judges = "after" # the observation that shows what a step earned: "after" the action, "before" it, or "both"'
-SCORE = (
+__all__ = [
+    "JUDGES_LINE",
+    "MEASURES_LINE",
+    "SCORE_LINE",
+    "Draft",
+    "count_entries",
+    "describe_action",
+    "describe_flattening",
+    "file_name",
+    "text_lines",
+    "warning_lines",
+]
+
+JUDGES_LINE = (
+    'judges = "after" # the observation that shows what a step earned: "after" the action, "before" it, or "both"'
+)
+SCORE_LINE = (
     '# score = "average" # only if episodes differ in length. "sum": steps or events add up; '
     '"average": how good steps were on average'
 )
+MEASURES_LINE = '# measures = ["distance"] # keys of the last step\'s info to report beside the return'
 
-MEASURES = '# measures = ["distance"] # keys of the last step\'s info to report beside the return'
-
-WANTED = {
+CONTENTS = {
     "description": "what is to be solved, and what the goal is; not a word about the reward",
     "observation": "what each entry of the observation means, with its unit",
     "action": "what each entry of the action means, with its unit",
@@ -26,72 +41,90 @@ WANTED = {
 
 @dataclass(frozen=True)
 class Draft:
-    """A draft of a spec, which a person must read before it is used."""
+    """A draft of a task file, which a person must read before it is used."""
 
     name: str
     """The name of the task, which is also suitable as a file name."""
     toml: str
-    missing: tuple[str, ...]
+    missing_keys: tuple[str, ...]
     """The keys that must be filled in."""
-    left_out: tuple[str, ...]
-    """The sentences and table rows that were left out, or cut short, because they mention rewards."""
+    removed: tuple[str, ...]
+    """The sentences and table rows that were removed or shortened because they mention rewards."""
     teams: dict[str, str] = field(default_factory=dict)
-    """The specs of the teams, by the file names that the spec refers to."""
-    unused: tuple[str, ...] = ()
-    """The titles of sections of the documentation that no text was taken from."""
-    of_logs: bool = False
-    """Whether the task has only logs and no environment."""
+    """The task files of the teams, by the file names that this one refers to."""
+    unused_sections: tuple[str, ...] = ()
+    """The titles of sections of the documentation that were not used."""
+    logs_only: bool = False
+    """Whether the task has logs but no environment."""
 
 
-def warning(
-    left_out: Sequence[str], origin: str = "the documentation of the environment", unused: Sequence[str] = ()
+def warning_lines(
+    removed: Sequence[str], origin: str = "the documentation of the environment", unused: Sequence[str] = ()
 ) -> list[str]:
-    sections = [f"# Sections that were not used: {', '.join(unused)}."] if unused else []
-    some = "1 sentence or row" if len(left_out) == 1 else f"{len(left_out)} sentences or rows"
-    fewer = [f"# Left out on purpose: {some} with words such as reward, cost or score."]
+    """Return the comments at the top of a draft.
+
+    Args:
+        removed: the sentences that were removed.
+        origin: the source of the texts.
+        unused: the titles of sections that were not used.
+    """
+    count = "1 sentence or row" if len(removed) == 1 else f"{len(removed)} sentences or rows"
     return [
         f"# A first draft, from {origin}. Read it before you use it: a language model will",
         "# know only these texts.",
-        *(fewer if left_out else []),
-        *sections,
+        *([f"# Left out on purpose: {count} with words such as reward, cost or score."] if removed else []),
+        *([f"# Sections that were not used: {', '.join(unused)}."] if unused else []),
         "# Take out every sentence that still reveals the reward. Describe the goal, not how it is rewarded.",
     ]
 
 
-def bodies(texts: Mapping[str, str], heads: Mapping[str, str]) -> list[str]:
-    """The texts of a spec. Missing texts are marked. A head is left out if the text begins with it."""
+def text_lines(texts: Mapping[str, str], first_lines: Mapping[str, str]) -> list[str]:
+    """Return the texts of a task file in TOML. Missing texts are marked.
 
-    def body(key: str, text: str) -> str:
-        head = heads.get(key, "")
-        return text if text.startswith(head.removesuffix(".")) else f"{head}\n{text}"
-
-    return [f"\n{key} = {quoted(body(key, text or f'{FILL_IN}: {WANTED[key]}'))}" for key, text in texts.items()]
-
-
-def entries(number: int) -> str:
-    return "1 entry" if number == 1 else f"{number} entries"
-
-
-def flattened(space: gymnasium.Space) -> str:
-    if isinstance(space, gymnasium.spaces.Discrete):
-        return ", all 0 but one: the number of the state"
-    if isinstance(space, gymnasium.spaces.Box) and len(space.shape) > 1:
-        return f", an array of shape {space.shape} row by row"
-    if not isinstance(space, gymnasium.spaces.Box):
-        return f", {space} one part behind the other"
-    return ""
+    Args:
+        texts: the texts by their keys.
+        first_lines: lines to put before the texts. They are left out where a text begins in the same way.
+    """
+    lines = []
+    for key, text in texts.items():
+        text, first = text or f"{FILL_IN}: {CONTENTS[key]}", first_lines.get(key, "")
+        if not text.startswith(first.removesuffix(".")):
+            text = f"{first}\n{text}"
+        lines.append(f"\n{key} = {_quote(text)}")
+    return lines
 
 
-def bounds(space: gymnasium.Space) -> str:
-    if isinstance(space, OneHot) or not isinstance(space, gymnasium.spaces.Box):
-        return ""
-    low, high = set(map(float, space.low)), set(map(float, space.high))
-    each = "each " if space.shape != (1,) else ""
-    return f", {each}between {low.pop():g} and {high.pop():g}" if len(low) == len(high) == 1 else ""
-
-
-def quoted(text: str) -> str:
-    """A text as a multi-line string in TOML."""
+def _quote(text: str) -> str:
+    """Return a text as a multi-line string in TOML."""
     escaped = text.replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
-    escaped = re.sub(r"[\x00-\x08\x0b-\x1f\x7f]", lambda letter: f"\\u{ord(letter[0]):04x}", escaped)
+    escaped = re.sub(r"[\x00-\x08\x0b-\x1f\x7f]", lambda match: f"\\u{ord(match[0]):04x}", escaped)
     return f'"""\n{escaped}\n"""'
+
+
+def file_name(text: str) -> str:
+    """Return a text with hyphens for characters that are not suitable for a task's name."""
+    return re.sub(r"[^\w.\-]+", "-", text)
+
+
+def count_entries(count: int) -> str:
+    """Return a number of entries as text."""
+    return "1 entry" if count == 1 else f"{count} entries"
+
+
+def describe_flattening(space: gymnasium.Space) -> str:
+    """Return how an observation was flattened, as the end of a sentence about its entries."""
+    if isinstance(space, Discrete):
+        return ", all 0 but one: the number of the state"
+    if not isinstance(space, Box):
+        return f", {space} one part behind the other"
+    return f", an array of shape {space.shape} row by row" if len(space.shape) > 1 else ""
+
+
+def describe_action(space: gymnasium.Space) -> str:
+    """Return the encoding or the common bounds of an action, as the end of a sentence about its entries."""
+    if isinstance(space, OneHot | Discrete):
+        return ", all 0 but one: the action that is taken"
+    assert isinstance(space, Box)
+    lows, highs = set(map(float, space.low.ravel())), set(map(float, space.high.ravel()))
+    prefix = "each " if space.shape != (1,) else ""
+    return f", {prefix}between {lows.pop():g} and {highs.pop():g}" if len(lows) == len(highs) == 1 else ""

@@ -1,178 +1,183 @@
-"""Drafts a spec for a PettingZoo environment and, if its agents are of several kinds, one for each team."""
+"""Drafts the task file of a PettingZoo environment and, if its agents are of several kinds, one for each team."""
 
+import contextlib
 import inspect
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
 
-from lare_rl.envs import agent_arrays as rows_of
-from lare_rl.envs.agent_arrays import Agent, kind
+from lare_rl.envs.agent_arrays import Agent
+from lare_rl.envs.agent_teams import agent_kind
 from lare_rl.envs.interface import Team
-from lare_rl.envs.pettingzoo_construct import construct, limit_of
+from lare_rl.envs.pettingzoo_construct import find_time_limit, make_parallel_env
 from lare_rl.envs.pettingzoo_env import ParallelHost
-from lare_rl.new_task.documentation import ending, plain, sections_of, without_rewards
-from lare_rl.new_task.draft import JUDGES, SCORE, Draft, bodies, bounds, entries, flattened, warning
-from lare_rl.tasks.spec import PETTINGZOO, TaskSpec
+from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
+from lare_rl.new_task.draft import (
+    JUDGES_LINE,
+    SCORE_LINE,
+    Draft,
+    count_entries,
+    describe_action,
+    describe_flattening,
+    file_name,
+    text_lines,
+    warning_lines,
+)
+from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
-MAKERS = ("parallel_env", "env", "raw_env")
+__all__ = ["draft_multi_agent_task"]
+
+GENERIC_MAKERS = ("parallel_env", "env", "raw_env")
 """Common names of functions that make environments. For these, the draft is named after the module."""
 
-BESIDE = re.compile(r"^(This environment is part of|Please read that page)|\bobservations?( space)?: |\baction space: ")
-"""Lines that belong to other keys, or to none."""
+IRRELEVANT = re.compile(
+    r"^(This environment is part of|Please read that page)|\bobservations?( space)?: |\baction space: "
+)
+"""Lines of a description that belong to other keys, or to none."""
+
+TEAMS_COMMENT = [
+    "# The agents of each kind are a team, which learns on its own. If all agents are one team, remove this line and",
+    "# describe observations and actions below, as the files of the teams do.",
+]
 
 
-def draft_of_agents(environment_id: str) -> Draft:
-    """Draft a spec from a PettingZoo environment's documentation and spaces. Raises `LareError` if it cannot be made."""
-    environment = construct(environment_id, {})
-    limit = limit_of(environment, {})
-    kinds = list(dict.fromkeys(kind(name) for name in getattr(environment, "possible_agents", None) or ()))
-    module, _, maker = environment_id.removeprefix(PETTINGZOO).partition(":")
-    name = re.sub(r"[^\w.\-]+", "-", module.rpartition(".")[2] if maker in MAKERS else maker)
+def draft_multi_agent_task(environment_id: str) -> Draft:
+    """Draft a task file from a PettingZoo environment's documentation and spaces. Raises `LareError` if it cannot be made."""
+    env = make_parallel_env(environment_id, {})
+    limit, kinds = find_time_limit(env, {}), list(dict.fromkeys(map(agent_kind, env.possible_agents or ())))
+    module, _, maker = environment_id.removeprefix(PETTINGZOO_PREFIX).partition(":")
+    name = file_name(module.rpartition(".")[2] if maker in GENERIC_MAKERS else maker)
     several = len(kinds) > 1
-    teams = tuple(stub(one, environment_id, team=one, agents=patterns(one)) for one in kinds) if several else ()
-    host = ParallelHost(environment, stub(name, environment_id, teams=teams, max_episode_steps=limit or 1000))
-    try:
-        texts, left_out = documented(environment.unwrapped if hasattr(environment, "unwrapped") else environment)
-        sizes = [f"observation_size = {host.spec.observation_size}", f"action_size = {host.spec.action_size}"]
-        specs = {
-            f"{name}-{team.name}.toml": write_team(environment_id, host, team, texts, left_out, sizes)
-            for team in host.spec.teams
-            if several
-        }
-    finally:
-        host.close()
-    if several:
-        own = {"description": texts["description"], "observation": "See the teams.", "action": "See the teams."}
-        heads: dict[str, str] = {}
-        head = [
-            "# The agents of each kind are a team, which learns on its own. If all agents are one team, remove this line and",
-            "# describe observations and actions below, as the files of the teams do.",
-            f"teams = {json.dumps(list(specs))}",
+    teams = [_stub(kind, environment_id, team=kind, agents=_patterns(kind)) for kind in kinds] if several else ()
+    task = _stub(name, environment_id, teams=teams, max_episode_steps=limit or 1000)
+    with contextlib.closing(ParallelHost(env, task)) as host:
+        texts, removed = _read_texts(getattr(env, "unwrapped", env))
+        environment_lines = [
+            f'environment = "{environment_id}"',
+            f"observation_size = {host.spec.observation_size}",
+            f"action_size = {host.spec.action_size}",
+            JUDGES_LINE,
         ]
-    else:
-        own, heads, head = texts, heads_of(host, host.spec.teams[0]), []
-    arguments = defaults(environment)
+        files = {
+            f"{name}-{team.name}.toml": "\n".join(
+                [
+                    *warning_lines(removed),
+                    *_team_lines(host, team),
+                    *environment_lines,
+                    *_team_text_lines(host, team, texts),
+                ]
+            )
+            + "\n"
+            for team in (host.spec.teams if several else ())
+        }
+        if several:
+            own_texts = {
+                "description": texts["description"],
+                "observation": "See the teams.",
+                "action": "See the teams.",
+            }
+            own_text_lines = text_lines(own_texts, {})
+        else:
+            own_text_lines = text_lines(texts, _first_lines(host, host.spec.teams[0]))
+    arguments = _default_arguments(env)
     lines = [
-        *warning(left_out),
+        *warning_lines(removed),
         f'name = "{name}"',
-        f'environment = "{environment_id}"',
-        *head,
-        *sizes,
-        JUDGES,
-        SCORE,
+        *([*TEAMS_COMMENT, f"teams = {json.dumps(list(files))}"] if several else []),
+        *environment_lines,
+        SCORE_LINE,
         *([] if limit else ["max_episode_steps = 1000 # the environment does not state its own limit"]),
         *([f"# arguments = {{ {arguments} }} # the defaults, unless they are set here"] if arguments else []),
-        *bodies(own, heads),
+        *own_text_lines,
     ]
-    missing = tuple(key for key in texts if not texts[key])
-    return Draft(name, "\n".join(lines) + "\n", missing, left_out, specs)
+    return Draft(
+        name=name,
+        toml="\n".join(lines) + "\n",
+        missing_keys=tuple(key for key in texts if not texts[key]),
+        removed=removed,
+        teams=files,
+    )
 
 
-def stub(name: str, environment: str, **keys: Any) -> TaskSpec:
-    """A spec that only names the agents. Its sizes are placeholders, because the draft must determine them first."""
+def _stub(name: str, environment: str, **keys: Any) -> TaskSpec:
+    """Return a task that only names the agents. Its sizes are placeholders, because the draft must determine them first."""
     texts = dict.fromkeys(("description", "observation", "action"), "-")
     return TaskSpec(name=name, environment=environment, observation_size=1, action_size=1, **texts, **keys)
 
 
-def patterns(name: str) -> tuple[str, ...]:
-    """Patterns that match the agents of a kind. An agent without a number has the name of its kind."""
-    return (name, f"{name}_[0-9]*", f"{name}[0-9]*")
+def _patterns(kind: str) -> tuple[str, ...]:
+    """Return patterns that match the agents of a kind. An agent without a number has the name of its kind."""
+    return (kind, f"{kind}_[0-9]*", f"{kind}[0-9]*")
 
 
-def documented(environment: Any) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Texts by their keys, and the lines that were left out. The documentation is that of the class or of its module."""
-    own = type(environment)
-    module = sys.modules.get(own.__module__)
-    sections = sections_of(max(vars(own).get("__doc__") or "", getattr(module, "__doc__", None) or "", key=len))
+def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Return the texts by their keys, and the removed lines, from the docstring of the class or of its module."""
+    module = sys.modules.get(type(env).__module__)
+    sections = split_sections(
+        max(vars(type(env)).get("__doc__") or "", getattr(module, "__doc__", None) or "", key=len)
+    )
     titled = next((body for title, body in sections.items() if title and body.strip()), "")
-    about = plain(rows_out(sections.get("description") or "\n\n".join(filter(None, (sections[""], titled)))))
-    found = {"description": [line for line in about if not BESIDE.search(line)]}
+    summary = sections.get("description") or f"{sections['']}\n\n{titled}"
+    # PettingZoo's pages begin with a table about the library, not about the task.
+    rows = [line for line in summary.splitlines() if not line.strip().startswith("|")]
+    about = plain_lines("\n".join(rows))
+    lines = {"description": [line for line in about if not IRRELEVANT.search(line)]}
     for key in ("observation", "action"):
-        names = (f"{key} space", key, f"{key}s")
-        section = next((sections[name] for name in names if sections.get(name, "").strip()), "")
-        found[key] = plain(section) or [line for line in about if re.search(rf"\b{key}s?( space)?: ", line)]
-    texts: dict[str, str] = {}
-    left_out: tuple[str, ...] = ()
-    for key, lines in found.items():
-        texts[key], dropped = without_rewards(lines)
-        left_out += dropped
+        section = first_section(sections, f"{key} space", key, f"{key}s")
+        lines[key] = section or [line for line in about if re.search(rf"\b{key}s?( space)?: ", line)]
+    return write_texts(lines, sections)
+
+
+def _team_lines(host: ParallelHost, team: Team) -> list[str]:
+    names = [str(agent.name) for agent in host.layout.agents[team.agents]]
+    patterns = [pattern for pattern in _patterns(team.name) if any(fnmatchcase(name, pattern) for name in names)]
+    return [f'name = "{team.name}"', f'team = "{team.name}"', f"agents = {json.dumps(patterns)}"]
+
+
+def _team_text_lines(host: ParallelHost, team: Team, texts: Mapping[str, str]) -> list[str]:
+    """Return the texts of a team: the lines that do not begin with the name of another team."""
+    other_teams = {other.name for other in host.spec.teams} - {team.name}
+    team_texts = dict(texts)
+    for key in ("observation", "action"):
+        lines = texts[key].splitlines()
+        team_texts[key] = "\n".join(line for line in lines if line.split(" ")[0].lower() not in other_teams)
     if texts["description"]:
-        texts["description"] += ending(sections)
-    return texts, left_out
+        team_texts["description"] += f"\nYou judge each agent that is called {team.name}, from what it observes itself."
+    return text_lines(team_texts, _first_lines(host, team))
 
 
-def rows_out(text: str) -> str:
-    """A text without tables: PettingZoo's pages begin with a table about the library, not about the task."""
-    return "\n".join(line for line in text.splitlines() if not line.strip().startswith("|"))
-
-
-def write_team(
-    environment_id: str,
-    host: ParallelHost,
-    team: Team,
-    texts: dict[str, str],
-    left_out: Sequence[str],
-    sizes: Sequence[str],
-) -> str:
-    own = dict(texts)
-    others = {other.name for other in host.spec.teams} - {team.name}
-    for key in ("observation", "action"):
-        speaks = [line for line in texts[key].splitlines() if line.split(" ")[0].lower() not in others]
-        own[key] = "\n".join(speaks)
-    if own["description"]:
-        own["description"] += f"\nYou judge each agent that is called {team.name}, from what it observes itself."
-    members = [str(one.name) for one in host.agents[team.agents]]
-    lines = [
-        *warning(left_out),
-        f'name = "{team.name}"',
-        f'team = "{team.name}"',
-        f'environment = "{environment_id}"',
-        f"agents = {json.dumps([one for one in patterns(team.name) if matched(one, members)])}",
-        *sizes,
-        JUDGES,
-        *bodies(own, heads_of(host, team)),
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def matched(pattern: str, names: Sequence[str]) -> bool:
-    return any(fnmatchcase(name, pattern) for name in names)
-
-
-def heads_of(host: ParallelHost, team: Team) -> dict[str, str]:
-    """Descriptions of the spaces of a team's first agent, with the padding that other agents require."""
-    first = host.agents[team.start]
+def _first_lines(host: ParallelHost, team: Team) -> dict[str, str]:
+    """Return the descriptions of the spaces of a team's first agent, with the padding that other agents require."""
+    agent, spec = host.layout.agents[team.start], host.spec
+    flattening, padding = describe_flattening(agent.observation_space), _describe_padding(host, agent)
+    fewer = f"; {agent.name} has only the first {agent.action_size}"
+    missing_actions = fewer if agent.discrete and agent.action_size < spec.action_size else ""
     return {
-        "observation": f"{entries(host.spec.observation_size)}{flattened(first.observation)}{padding(host, first)}.",
-        "action": f"{entries(host.spec.action_size)}{chosen(host, first)}.",
+        "observation": f"{count_entries(spec.observation_size)}{flattening}{padding}.",
+        "action": f"{count_entries(spec.action_size)}{describe_action(agent.action_space)}{missing_actions}.",
     }
 
 
-def padding(host: ParallelHost, one: Agent) -> str:
-    if not rows_of.unlike(host.agents):
+def _describe_padding(host: ParallelHost, agent: Agent) -> str:
+    layout = host.layout
+    if not layout.adds_index:
         return ""
-    most = max(other.observation_size for other in host.agents)
-    zeros = f", then {most - one.observation_size} zeros" if most > one.observation_size else ""
-    names = ", ".join(str(other.name) for other in host.agents)
-    return f": {one.observation_size} of {one.name}'s own{zeros}, then all 0 but one: which agent it is ({names})"
+    n_zeros = layout.longest_observation - agent.observation_size
+    zeros = f", then {n_zeros} zeros" if n_zeros else ""
+    names = ", ".join(str(other.name) for other in layout.agents)
+    return f": {agent.observation_size} of {agent.name}'s own{zeros}, then all 0 but one: which agent it is ({names})"
 
 
-def chosen(host: ParallelHost, one: Agent) -> str:
-    if not one.discrete:
-        return bounds(one.action)
-    fewer = f"; {one.name} has only the first {one.action_size}" if one.action_size < host.spec.action_size else ""
-    return f", all 0 but one: the action that is taken{fewer}"
-
-
-def defaults(environment: Any) -> str:
-    """The arguments of the environment's class that TOML can represent, as a table."""
-    raw = getattr(environment, "unwrapped", environment)
+def _default_arguments(env: Any) -> str:
+    """Return the arguments of the environment's class that TOML can represent, as a table."""
     try:
-        parameters = inspect.signature(type(raw).__init__).parameters.values()
+        parameters: Sequence[Any] = list(
+            inspect.signature(type(getattr(env, "unwrapped", env)).__init__).parameters.values()
+        )
     except (TypeError, ValueError):
         return ""
-    told = [one for one in parameters if isinstance(one.default, bool | int | float | str)]
-    return ", ".join(f"{one.name} = {json.dumps(one.default)}" for one in told if one.name != "render_mode")
+    simple = [parameter for parameter in parameters if isinstance(parameter.default, bool | int | float | str)]
+    return ", ".join(f"{item.name} = {json.dumps(item.default)}" for item in simple if item.name != "render_mode")

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+__all__ = ["LayerNorm", "attend", "causal_mask"]
+
 
 class LayerNorm(eqx.Module):
     """(x - mean) / std of each row, then scaled and shifted (Ba, Kiros and Hinton, 2016)."""
@@ -29,25 +31,30 @@ def attend(
     key: Float[Array, "*batch tokens heads size"],
     value: Float[Array, "*batch tokens heads size"],
     mask: Bool[Array, "queries tokens"] | None = None,
-    drop: Callable[[Array], Array] = lambda weights: weights,
-) -> Float[Array, "*batch queries joined"]:
-    """softmax(Q K^T / sqrt(size)) V of each head; the heads are concatenated (Vaswani et al., 2017, Eq. 1).
+    dropout: Callable[[Array], Array] = lambda weights: weights,
+) -> Float[Array, "*batch queries concatenated"]:
+    """Return softmax(Q K^T / sqrt(size)) V of each head, concatenated over heads (Vaswani et al., 2017, Eq. 1).
 
-    A query ignores the tokens where `mask` is false. `drop` is applied to the attention weights, for dropout.
+    Args:
+        query: Q of each head.
+        key: K of each head.
+        value: V of each head.
+        mask: which tokens each query attends to.
+        dropout: a function that is applied to the attention weights.
     """
     *batch, queries, heads, size = query.shape
 
     def by_head(x: Float[Array, "*batch tokens heads size"]) -> Float[Array, "rows tokens size"]:
-        """Merge batch axes and heads into one axis, because XLA is fastest at products of arrays with three axes."""
+        # Batch axes and heads become one axis, because XLA is fastest at products of arrays with three axes.
         return jnp.swapaxes(x, -2, -3).reshape(-1, x.shape[-3], size)
 
     scores = jax.lax.batch_matmul(by_head(query), jnp.swapaxes(by_head(key), 1, 2)) / jnp.sqrt(size)
     if mask is not None:
         scores = jnp.where(mask, scores, -1e9)
-    found = jax.lax.batch_matmul(drop(jax.nn.softmax(scores)), by_head(value))
-    return jnp.swapaxes(found.reshape(*batch, heads, queries, size), -2, -3).reshape(*batch, queries, -1)
+    output = jax.lax.batch_matmul(dropout(jax.nn.softmax(scores)), by_head(value))
+    return jnp.swapaxes(output.reshape(*batch, heads, queries, size), -2, -3).reshape(*batch, queries, -1)
 
 
-def causal(length: int) -> Bool[Array, "length length"]:
-    """A mask that lets each step attend to itself and to earlier steps."""
+def causal_mask(length: int) -> Bool[Array, "length length"]:
+    """Return a mask by which each step attends to itself and to earlier steps."""
     return jnp.tril(jnp.ones((length, length), bool))

@@ -1,4 +1,4 @@
-"""The network shapes that actors, critics and decoders share, and the steps that change their parameters."""
+"""The network shapes that actors, critics and decoders share, and updates of their parameters."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
@@ -9,9 +9,15 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
+__all__ = ["GRU", "MLP", "Linear", "adam_step", "clip_gradient", "init_adam", "init_orthogonal", "polyak_update"]
+
 
 class Linear(eqx.Module):
-    """x W + b. The weight is stored as (in, out), so that neither the forward nor the backward pass has to transpose it."""
+    """x W + b.
+
+    The weight has the shape (in, out), unlike that of `equinox.nn.Linear`: neither the forward nor the backward pass has to
+    transpose it.
+    """
 
     weight: Float[Array, "*stack in out"]
     bias: Float[Array, "*stack out"]
@@ -29,9 +35,8 @@ class Linear(eqx.Module):
 class MLP(eqx.Module):
     """Linear layers with an activation between them, ReLU by default.
 
-    `MLP(3, (256, 256), 1, key=key)` is `Linear(3, 256)`, ReLU, `Linear(256, 256)`, ReLU, `Linear(256, 1)`.
-    Weights and biases start uniform in ±1/sqrt(fan-in). Every leaf is an array, so that a whole training state can
-    be scanned, vmapped and saved as one pytree.
+    `MLP(3, (256, 256), 1, key=key)` is `Linear(3, 256)`, ReLU, `Linear(256, 256)`, ReLU, `Linear(256, 1)`. Weights and biases start
+    uniform in ±1/sqrt(fan-in). All leaves are arrays, so a training state can be scanned, vmapped and saved as one pytree.
     """
 
     layers: tuple[Linear, ...]
@@ -65,64 +70,69 @@ class GRU(eqx.Module):
 
         z = s(x U_z + h W_z)    r = s(x U_r + h W_r)    n = tanh(x U_n + r * (h W_n))    h' = (1 - z) n + z h
 
-    with a bias in each of the six products.
+    Each of the six products has a bias.
     """
 
-    given: Linear
+    input_projection: Linear
     """U_z, U_r and U_n side by side."""
-    kept: Linear
+    hidden_projection: Linear
     """W_z, W_r and W_n side by side."""
 
-    def __init__(self, features: int, size: int, *, key: PRNGKeyArray):
-        given_key, kept_key = jax.random.split(key)
-        self.given, self.kept = Linear(features, 3 * size, key=given_key), Linear(size, 3 * size, key=kept_key)
+    def __init__(self, n_features: int, size: int, *, key: PRNGKeyArray):
+        input_key, hidden_key = jax.random.split(key)
+        self.input_projection = Linear(n_features, 3 * size, key=input_key)
+        self.hidden_projection = Linear(size, 3 * size, key=hidden_key)
 
     def __call__(
-        self, given: Float[Array, "*batch three"], h: Float[Array, "*batch size"]
+        self, projected: Float[Array, "*batch three"], h: Float[Array, "*batch size"]
     ) -> Float[Array, "*batch size"]:
-        """One step; `given` is x U, which a caller has computed for all steps at once."""
-        (z, r, n), (kept_z, kept_r, kept_n) = (jnp.split(part, 3, axis=-1) for part in (given, self.kept(h)))
-        z, r = jax.nn.sigmoid(z + kept_z), jax.nn.sigmoid(r + kept_r)
-        return (1 - z) * jnp.tanh(n + r * kept_n) + z * h
+        """Return h'. `projected` is x U, which a caller computes for all steps at once."""
+        z, r, n = jnp.split(projected, 3, axis=-1)
+        hidden_z, hidden_r, hidden_n = jnp.split(self.hidden_projection(h), 3, axis=-1)
+        z, r = jax.nn.sigmoid(z + hidden_z), jax.nn.sigmoid(r + hidden_r)
+        return (1 - z) * jnp.tanh(n + r * hidden_n) + z * h
 
 
-def orthogonal(network: MLP, last_gain: float, *, key: PRNGKeyArray) -> MLP:
-    """The same network with orthogonal weights (Saxe et al., 2014), of gain 1 (`last_gain` in the last layer), and zero biases."""
-    keys = jax.random.split(key, len(network.layers))
+def init_orthogonal(network: MLP, last_gain: float, *, key: PRNGKeyArray) -> MLP:
+    """Return the network with zero biases and orthogonal weights (Saxe et al., 2014).
+
+    Args:
+        network: the network.
+        last_gain: the gain of the last layer. The other layers have gain 1.
+        key: the random key.
+    """
+
+    def init_layer(layer: Linear, gain: float, layer_key: PRNGKeyArray) -> Linear:
+        weight = jax.nn.initializers.orthogonal(gain)(layer_key, layer.weight.shape)
+        return eqx.tree_at(lambda layer: (layer.weight, layer.bias), layer, (weight, jnp.zeros_like(layer.bias)))
+
     gains = (1.0,) * (len(network.layers) - 1) + (last_gain,)
-    started = tuple(
-        eqx.tree_at(
-            lambda layer: (layer.weight, layer.bias),
-            layer,
-            (jax.nn.initializers.orthogonal(gain)(layer_key, layer.weight.shape), jnp.zeros_like(layer.bias)),
-        )
-        for layer, gain, layer_key in zip(network.layers, gains, keys, strict=True)
-    )
-    return eqx.tree_at(lambda network: network.layers, network, started)
+    keys = jax.random.split(key, len(network.layers))
+    return eqx.tree_at(lambda network: network.layers, network, tuple(map(init_layer, network.layers, gains, keys)))
 
 
 Parameters = TypeVar("Parameters")
 
 
-def start_adam(parameters: Any, learning_rate: float) -> optax.OptState:
-    """The state of Adam before its first step."""
+def init_adam(parameters: Any, learning_rate: float) -> optax.OptState:
+    """Return the initial state of Adam."""
     return optax.adam(learning_rate).init(parameters)
 
 
-def descend(
+def adam_step(
     parameters: Parameters, gradient: Parameters, state: optax.OptState, learning_rate: float | Array
 ) -> tuple[Parameters, optax.OptState]:
-    """One step of Adam (Kingma and Ba, 2015) against the gradient."""
-    change, state = optax.adam(cast(float, learning_rate)).update(cast(Any, gradient), state)
-    return cast(Parameters, optax.apply_updates(cast(Any, parameters), change)), state
+    """Take one step of Adam (Kingma and Ba, 2015) against the gradient."""
+    updates, state = optax.adam(cast(float, learning_rate)).update(cast(Any, gradient), state)
+    return cast(Parameters, optax.apply_updates(cast(Any, parameters), updates)), state
 
 
-def clipped(gradient: Parameters, most: float) -> Parameters:
-    """The gradient, scaled down to the norm `most` if its norm is larger (Pascanu et al., 2013)."""
-    shrink = most / jnp.maximum(optax.tree.norm(gradient), most)
-    return jax.tree.map(lambda leaf: leaf * shrink, gradient)
+def clip_gradient(gradient: Parameters, max_norm: float) -> Parameters:
+    """Return the gradient, scaled down to the norm `max_norm` if its norm is larger (Pascanu et al., 2013)."""
+    factor = max_norm / jnp.maximum(optax.tree.norm(gradient), max_norm)
+    return jax.tree.map(lambda leaf: leaf * factor, gradient)
 
 
-def move_towards(target: Parameters, online: Parameters, tau: float) -> Parameters:
-    """(1 - tau) target + tau online, leaf by leaf."""
+def polyak_update(target: Parameters, online: Parameters, tau: float) -> Parameters:
+    """Return (1 - tau) target + tau online, leaf by leaf."""
     return jax.tree.map(lambda old, new: old + tau * (new - old), target, online)

@@ -1,107 +1,122 @@
-"""Running statistics, kept in the training state, so that the scale of features and returns does not matter."""
+"""Running statistics in the training state, by which features and returns of any scale are learned alike."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+__all__ = [
+    "CLIP",
+    "RunningMeanStd",
+    "Scale",
+    "empty_mean_std",
+    "empty_scale",
+    "min_max_scale",
+    "root_mean_square",
+    "running_std",
+    "standardise",
+    "standardise_if_observed",
+    "update_mean_std",
+    "update_scale",
+]
+
 CLIP = 10.0
-"""Normalised features are clipped to this many standard deviations."""
+"""Standardised features are clipped to this many standard deviations."""
 
 
 class RunningMeanStd(NamedTuple):
-    """Mean and spread of each feature over all rows so far."""
+    """Mean and standard deviation of each feature over all rows so far."""
 
-    rows: Float[Array, ""]
-    """The number of rows."""
+    n_rows: Float[Array, ""]
     mean: Float[Array, " features"]
-    squares: Float[Array, " features"]
-    """Sum of the squared deviations from the mean."""
+    sum_squares: Float[Array, " features"]
+    """The sum of the squared deviations from the mean."""
 
 
-def new_mean_std(features: int) -> RunningMeanStd:
-    """Empty statistics."""
-    return RunningMeanStd(jnp.zeros(()), jnp.zeros(features), jnp.zeros(features))
+def empty_mean_std(n_features: int) -> RunningMeanStd:
+    """Return the statistics of no rows."""
+    return RunningMeanStd(jnp.zeros(()), jnp.zeros(n_features), jnp.zeros(n_features))
 
 
-def observe(
+def update_mean_std(
     statistics: RunningMeanStd, rows: Float[Array, "batch features"], mask: Bool[Array, " batch"] | None = None
 ) -> RunningMeanStd:
-    """Add a batch (the parallel update of Chan, Golub and LeVeque, 1983: no catastrophic cancellation).
+    """Add a batch of rows. Rows where `mask` is false are ignored.
 
-    Rows where `mask` is false are ignored.
+    This is the parallel update of Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
     """
     if mask is None:
-        added, mean = rows.shape[0], jnp.mean(rows, axis=0)
-        spread = jnp.sum((rows - mean) ** 2, axis=0)
+        n_new, mean = rows.shape[0], jnp.mean(rows, axis=0)
+        batch_squares = jnp.sum((rows - mean) ** 2, axis=0)
     else:
-        added, mean = jnp.sum(mask), jnp.sum(rows, axis=0, where=mask[:, None]) / jnp.maximum(jnp.sum(mask), 1)
-        spread = jnp.sum((rows - mean) ** 2, axis=0, where=mask[:, None])
-    count = statistics.rows + added
-    gap = mean - statistics.mean
-    share = added / jnp.maximum(count, 1)
-    squares = statistics.squares + spread + gap**2 * statistics.rows * share
-    return RunningMeanStd(count, statistics.mean + gap * share, squares)
+        n_new = jnp.sum(mask)
+        mean = jnp.sum(rows, axis=0, where=mask[:, None]) / jnp.maximum(n_new, 1)
+        batch_squares = jnp.sum((rows - mean) ** 2, axis=0, where=mask[:, None])
+    n_rows = statistics.n_rows + n_new
+    difference = mean - statistics.mean
+    fraction = n_new / jnp.maximum(n_rows, 1)
+    between = difference**2 * statistics.n_rows * fraction
+    return RunningMeanStd(
+        n_rows, statistics.mean + difference * fraction, statistics.sum_squares + batch_squares + between
+    )
 
 
-def deviation(statistics: RunningMeanStd) -> Float[Array, " features"]:
-    """Standard deviations; 0 for a feature that never varied."""
-    found = jnp.sqrt(statistics.squares / jnp.maximum(statistics.rows, 1))
+def running_std(statistics: RunningMeanStd) -> Float[Array, " features"]:
+    """Return the standard deviations. That of a feature that has never varied is 0."""
+    std = jnp.sqrt(statistics.sum_squares / jnp.maximum(statistics.n_rows, 1))
     # A deviation within float32's rounding of the mean is noise, whatever its absolute size.
-    return jnp.where(found > 1e-6 * jnp.abs(statistics.mean), found, 0)
+    return jnp.where(std > 1e-6 * jnp.abs(statistics.mean), std, 0)
 
 
 def standardise(statistics: RunningMeanStd, rows: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
-    """(x - mean) / std, clipped to ±10. A feature that never varied becomes 0."""
-    spread = deviation(statistics)
-    scaled = (rows - statistics.mean) / jnp.where(spread > 0, spread, 1)
-    return jnp.where(spread > 0, jnp.clip(scaled, -CLIP, CLIP), 0)
+    """Return (x - mean) / std, clipped to ±10. A feature that has never varied becomes 0."""
+    std = running_std(statistics)
+    scaled = (rows - statistics.mean) / jnp.where(std > 0, std, 1)
+    return jnp.where(std > 0, jnp.clip(scaled, -CLIP, CLIP), 0)
 
 
-def standardise_if_known(
+def standardise_if_observed(
     statistics: RunningMeanStd, rows: Float[Array, "*batch features"]
 ) -> Float[Array, "*batch features"]:
-    """Like `standardise`, but the rows are unchanged while the statistics are empty."""
-    return jnp.where(statistics.rows > 0, standardise(statistics, rows), rows)
+    """Return standardised rows, or the rows unchanged while the statistics are empty."""
+    return jnp.where(statistics.n_rows > 0, standardise(statistics, rows), rows)
 
 
 class Scale(NamedTuple):
-    """The scale of an episode's mean reward, R/T."""
+    """The scale of a number that each episode has, such as its mean reward R/T."""
 
-    episodes: Float[Array, ""]
-    """The number of episodes."""
+    n_episodes: Float[Array, ""]
     mean_square: Float[Array, ""]
     lowest: Float[Array, ""]
     highest: Float[Array, ""]
 
 
-def new_scale() -> Scale:
-    """An empty scale."""
+def empty_scale() -> Scale:
+    """Return the scale of no episodes."""
     return Scale(*(jnp.zeros(()) for _ in Scale._fields))
 
 
-def observe_scale(scale: Scale, values: Float[Array, " batch"], mask: Bool[Array, " batch"]) -> Scale:
+def update_scale(scale: Scale, values: Float[Array, " batch"], mask: Bool[Array, " batch"]) -> Scale:
     """Add the values where `mask` is true."""
-    count = scale.episodes + jnp.sum(mask)
+    n_episodes = scale.n_episodes + jnp.sum(mask)
     excess = jnp.sum(jnp.where(mask, values**2 - scale.mean_square, 0))
-    known = scale.episodes > 0
     lowest = jnp.min(values, where=mask, initial=jnp.inf)
     highest = jnp.max(values, where=mask, initial=-jnp.inf)
-    some = count > 0
+    had_episodes, has_episodes = scale.n_episodes > 0, n_episodes > 0
     return Scale(
-        count,
-        scale.mean_square + excess / jnp.maximum(count, 1),
-        jnp.where(some, jnp.where(known, jnp.minimum(scale.lowest, lowest), lowest), 0),
-        jnp.where(some, jnp.where(known, jnp.maximum(scale.highest, highest), highest), 0),
+        n_episodes=n_episodes,
+        mean_square=scale.mean_square + excess / jnp.maximum(n_episodes, 1),
+        lowest=jnp.where(has_episodes, jnp.where(had_episodes, jnp.minimum(scale.lowest, lowest), lowest), 0),
+        highest=jnp.where(has_episodes, jnp.where(had_episodes, jnp.maximum(scale.highest, highest), highest), 0),
     )
 
 
-def within_range(scale: Scale, values: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """(x - lowest) / (highest - lowest); 0.5 while lowest and highest are the same."""
+def min_max_scale(scale: Scale, values: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Return (x - lowest) / (highest - lowest), or 0.5 while lowest and highest are the same."""
     width = scale.highest - scale.lowest
     return jnp.where(width > 0, (values - scale.lowest) / jnp.where(width > 0, width, 1), 0.5)
 
 
-def magnitude(scale: Scale) -> Float[Array, ""]:
-    """The root mean square of R/T, or 1 while every return is 0."""
+def root_mean_square(scale: Scale) -> Float[Array, ""]:
+    """Return the root mean square of the values, or 1 while all of them are 0."""
     return jnp.where(scale.mean_square > 0, jnp.sqrt(scale.mean_square), 1)

@@ -1,8 +1,9 @@
-"""The agent network of QMIX: the values of one agent's actions, given all that it has observed (Rashid et al., 2018).
+"""The agent network of QMIX (Rashid et al., 2018).
 
     u_t = relu(x_t A + a)        h_t = GRU(u_t, h_{t-1}), h_{-1} = 0        Q_t = h_t B + b
 
-All agents share it; x_t includes the agent's index.
+Q_t are the values of an agent's actions, given all that it has observed. All agents share the network, and x_t includes the
+agent's index.
 """
 
 import equinox as eqx
@@ -12,40 +13,41 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.nn.networks import GRU, Linear
 
+__all__ = ["RecurrentNetwork"]
 
-class Recurrent(eqx.Module):
+
+class RecurrentNetwork(eqx.Module):
     """Linear, ReLU, GRU, Linear.
 
-    The GRU's input is as wide as its memory, so that all its parameters start uniform in ±1/sqrt(width), as in PyTorch.
+    The GRU's input is as wide as its hidden state, so that all its parameters start uniform in ±1/sqrt(width), as in PyTorch.
     """
 
     encoder: Linear
-    memory: GRU
-    decoder: Linear
+    gru: GRU
+    head: Linear
 
     def __init__(self, in_size: int, hidden: int, out_size: int, *, key: PRNGKeyArray):
-        encoder_key, memory_key, decoder_key = jax.random.split(key, 3)
+        encoder_key, gru_key, head_key = jax.random.split(key, 3)
         self.encoder = Linear(in_size, hidden, key=encoder_key)
-        self.memory = GRU(hidden, hidden, key=memory_key)
-        self.decoder = Linear(hidden, out_size, key=decoder_key)
-
-    def given(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch three"]:
-        """The part of the GRU's step that depends on the input alone."""
-        return self.memory.given(jax.nn.relu(self.encoder(x)))
+        self.gru = GRU(hidden, hidden, key=gru_key)
+        self.head = Linear(hidden, out_size, key=head_key)
 
     def __call__(
         self, x: Float[Array, "*batch in"], h: Float[Array, "*batch hidden"]
     ) -> tuple[Float[Array, "*batch out"], Float[Array, "*batch hidden"]]:
-        """One step: the output, and the new memory."""
-        h = self.memory(self.given(x), h)
-        return self.decoder(h), h
+        """Return the output of one step, and the new hidden state."""
+        h = self.gru(self._project(x), h)
+        return self.head(h), h
 
     def unroll(self, x: Float[Array, "time *batch in"]) -> Float[Array, "time *batch out"]:
-        """All steps, from an empty memory. Only the products with the memory are computed one step after the other."""
+        """Return the outputs of all steps, from a hidden state of zeros."""
 
-        def one(h: Float[Array, "*batch hidden"], given: Float[Array, "*batch three"]):
-            h = self.memory(given, h)
+        def step(h: Float[Array, "*batch hidden"], projected: Float[Array, "*batch three"]):
+            h = self.gru(projected, h)
             return h, h
 
-        nothing = jnp.zeros((*x.shape[1:-1], self.decoder.weight.shape[-2]))
-        return self.decoder(jax.lax.scan(one, nothing, self.given(x))[1])
+        h = jnp.zeros((*x.shape[1:-1], self.head.weight.shape[-2]))
+        return self.head(jax.lax.scan(step, h, self._project(x))[1])
+
+    def _project(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch three"]:
+        return self.gru.input_projection(jax.nn.relu(self.encoder(x)))

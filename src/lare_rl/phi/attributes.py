@@ -1,29 +1,25 @@
 """What a program can import, and which attributes its values have. Every attribute is in a table of this file."""
 
-from __future__ import annotations
-
 import ast
 import difflib
 import functools
 import math
-from collections.abc import Iterator as Iterate
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
-from lare_rl.phi import python_functions
-from lare_rl.phi.arrays import Array, BatchSize, Masked
-from lare_rl.phi.complex_numbers import Complex, call_with_complex
-from lare_rl.phi.graph import Refused
-from lare_rl.phi.numpy_functions import FUNCTIONS, call_numpy
-from lare_rl.phi.numpy_functions.creation import INDEXED
-from lare_rl.phi.numpy_functions.registry import KIND_OF_DTYPE
-from lare_rl.phi.numpy_functions.tables import Polynomial
-from lare_rl.phi.text import DICT_METHODS, LIST_METHODS, SET_METHODS, TEXT_METHODS, call_method
-from lare_rl.phi.values import Bound, Function, Named, Set, type_of
+from lare_rl.phi.arrays import Array, Complex, Masked
+from lare_rl.phi.batch import BatchSize
+from lare_rl.phi.complex_numbers import call_with_complex
+from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.numpy_functions import FUNCTIONS, INDEXED, KIND_OF_DTYPE, Polynomial, call_numpy
+from lare_rl.phi.python_functions import BUILTINS
+from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.text import METHODS, call_method
+from lare_rl.phi.values import Bound, Function, Symbol, value_type
 
-if TYPE_CHECKING:
-    from lare_rl.phi.interpreter import Interpreter
+__all__ = ["IGNORED_CALLS", "get_attribute", "imported_names", "module_attribute"]
 
 MODULES = {
     "numpy": "np", "numpy.linalg": "np.linalg", "numpy.polynomial": "np.polynomial", "numpy.typing": "np.typing",
@@ -34,7 +30,7 @@ MODULES = {
         "types"
     ).split()},
 }  # fmt: skip
-"""Modules that can be imported. Of most of them, only the names below and the functions of `python_functions.py` exist."""
+"""Modules that can be imported. Of most of them, only the names below and the functions of `python_functions` exist."""
 
 NAMES = frozenset(
     "dataclasses.dataclass dataclasses.field enum.Enum enum.IntEnum enum.IntFlag enum.auto abc.ABC abc.abstractmethod "
@@ -85,55 +81,50 @@ HINTS = {
 """What to write instead of some names that are not available."""
 
 
-def imported(statement: ast.Import | ast.ImportFrom) -> Iterate[tuple[str, Any]]:
-    """The names that an import defines, and their values."""
+def imported_names(statement: ast.Import | ast.ImportFrom) -> Iterable[tuple[str, Any]]:
+    """Return the names that an import defines, and their values."""
     if isinstance(statement, ast.Import):
         for alias in statement.names:
             _check_module(alias.name)
             package = alias.name.partition(".")[0]
-            yield alias.asname or package, Named(MODULES[alias.name if alias.asname else package])
+            yield alias.asname or package, Symbol(MODULES[alias.name if alias.asname else package])
         return
     module = statement.module or ""
     if statement.level:
-        raise Refused("E-IMPORT", "relative imports are not available: import numpy and math only")
+        raise RefusedError("E-IMPORT", "relative imports are not available: import numpy and math only")
     _check_module(module)
     for alias in statement.names:
         if alias.name == "*":
-            prefix, names = (
-                f"{MODULES[module]}.",
-                [*CONSTANTS, *NAMES, *python_functions.BUILTINS, *(f"np.{name}" for name in FUNCTIONS)],
-            )
-            yield from (
-                (n[len(prefix) :], CONSTANTS.get(n, Named(n)))
-                for n in names
-                if n.startswith(prefix) and n.count(".") == 1
-            )
+            prefix = f"{MODULES[module]}."
+            names = [*CONSTANTS, *NAMES, *BUILTINS, *(f"np.{name}" for name in FUNCTIONS)]
+            members = [name for name in names if name.startswith(prefix) and name.count(".") == 1]
+            yield from ((name.removeprefix(prefix), CONSTANTS.get(name, Symbol(name))) for name in members)
             continue
         full = f"{module}.{alias.name}"
-        value = Named(MODULES[full]) if full in MODULES else module_attribute(MODULES[module], alias.name)
+        value = Symbol(MODULES[full]) if full in MODULES else module_attribute(MODULES[module], alias.name)
         yield alias.asname or alias.name, value
 
 
 def _check_module(name: str) -> None:
     if name not in MODULES:
-        raise Refused("E-IMPORT", f"import {name[:60]}: only numpy and math are available")
+        raise RefusedError("E-IMPORT", f"import {name[:60]}: only numpy and math are available")
 
 
-def attribute(interpreter: Interpreter, owner: Any, name: str) -> Any:
-    """owner.name, for every owner that is not of a class of the program.
+def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
+    """Return owner.name, for every owner that is not of a class of the program.
 
     Raises:
-        Refused: NumPy or Python may have it, but it is not available.
+        RefusedError: it is not available, though NumPy or Python may have it.
     """
     match owner:
-        case Named(module):
+        case Symbol(module):
             return module_attribute(module, name)
         case Array():
-            return array_attribute(interpreter, owner, name)
+            return _array_attribute(runtime, owner, name)
         case Complex() if name in ("real", "imag"):
             return getattr(owner, name)
         case Complex() if name in ("shape", "ndim", "size"):
-            return array_attribute(interpreter, owner.real, name)
+            return _array_attribute(runtime, owner.real, name)
         case Complex():
             return Bound(lambda *args, **kwargs: call_with_complex(name, [owner, *args], kwargs))
         case complex() if name in ("real", "imag"):
@@ -144,10 +135,10 @@ def attribute(interpreter: Interpreter, owner: Any, name: str) -> Any:
             return Bound(lambda: Polynomial(call_numpy("polyder", [owner.falling], {})))
         case np.finfo() | np.iinfo() if name in ("eps", "tiny", "max", "min", "resolution", "smallest_normal"):
             return getattr(owner, name).item() if hasattr(getattr(owner, name), "item") else getattr(owner, name)
-        case str() | list() | dict() if name in _methods(owner):
-            return Bound(lambda *args, **kwargs: call_method(interpreter, owner, name, args, kwargs))
+        case str() | list() | dict() if name in METHODS.get(type(owner), METHODS[list]):
+            return Bound(lambda *args, **kwargs: call_method(runtime, owner, name, args, kwargs))
         case tuple() if name in ("index", "count"):
-            return Bound(lambda value: call_method(interpreter, list(owner), name, [value], {}))
+            return Bound(lambda value: call_method(runtime, list(owner), name, [value], {}))
         case slice() if name in ("start", "stop", "step"):
             return {"start": owner.start, "stop": owner.stop, "step": owner.step}[name]
         case bool() | int() | float():
@@ -160,45 +151,43 @@ def attribute(interpreter: Interpreter, owner: Any, name: str) -> Any:
         case Masked() if name in ("clip", "astype", "round", "copy"):
             return Bound(lambda *args, **kwargs: call_numpy(name, [owner, *args], kwargs) if name != "copy" else owner)
     if isinstance(owner, Masked):
-        raise Refused(
+        raise RefusedError(
             "E-ROWS", f"x[mask].{name[:60]}: what a mask selects differs from row to row: use np.where(mask, x, 0)"
         )
-    raise Refused("E-ATTRIBUTE", f".{name[:60]} of a {type_of(owner)} is not available")
+    raise RefusedError("E-ATTRIBUTE", f".{name[:60]} of a {value_type(owner)} is not available")
 
 
 def module_attribute(module: str, name: str) -> Any:
-    """module.name"""
+    """Return module.name."""
     full = f"{module}.{name}"
     if full in CONSTANTS:
         return CONSTANTS[full]
-    if module == "np" and name == "dtype":
-        return Named("np.dtype")
-    if module in ("typing", "__future__") or full in NAMES or full in python_functions.BUILTINS:
-        return Named(full)
+    if module in ("typing", "__future__") or full in NAMES or full in BUILTINS:
+        return Symbol(full)
     if module.startswith("np"):
         short = full.removeprefix("np.")
         if short in FUNCTIONS or short in INDEXED or short in KIND_OF_DTYPE or f"{short}.outer" in FUNCTIONS:
-            return Named(full)
+            return Symbol(full)
         if name == "__name__":
             return module
-        raise Refused("E-NUMPY", f"{full[:80]} is not available{hint(full)}")
+        raise RefusedError("E-NUMPY", f"{full[:80]} is not available{_hint(full)}")
     if name == "__name__":
         return module.rpartition(".")[2]
-    raise Refused("E-ATTRIBUTE", f"{full[:80]} is not available{hint(full)}")
+    raise RefusedError("E-ATTRIBUTE", f"{full[:80]} is not available{_hint(full)}")
 
 
 @functools.lru_cache(maxsize=256)
-def hint(full: str) -> str:
-    """What to write instead of a name that is not available."""
+def _hint(full: str) -> str:
+    """Return what to write instead of a name that is not available."""
     full = full[:80]
     if full in HINTS:
         return f": {HINTS[full]}"
-    names = [f"np.{name}" for name in FUNCTIONS] + list(python_functions.BUILTINS)
+    names = [f"np.{name}" for name in FUNCTIONS] + list(BUILTINS)
     near = difflib.get_close_matches(full, names, 1, 0.8)
     return f": is {near[0]} meant?" if near else ""
 
 
-def array_attribute(interpreter: Interpreter, array: Array, name: str) -> Any:
+def _array_attribute(runtime: Runtime, array: Array, name: str) -> Any:
     match name:
         case "shape" | "ndim":
             return getattr(array, name)
@@ -209,13 +198,13 @@ def array_attribute(interpreter: Interpreter, array: Array, name: str) -> Any:
         case "real":
             return array
         case "dtype":
-            return Named({"float": "np.float32", "int": "np.int64", "bool": "np.bool_"}[array.kind])
+            return Symbol({"float": "np.float32", "int": "np.int64", "bool": "np.bool_"}[array.kind])
         case "flat":
-            return list(interpreter.items(call_numpy("ravel", [array], {})))
+            return list(runtime.items(call_numpy("ravel", [array], {})))
         case "item":
             return Bound(lambda *index: (array[index] if index else array).number())
         case "tolist":
-            return Bound(lambda: _to_list(interpreter, array))
+            return Bound(lambda: _to_list(runtime, array))
         case "fill":
             return Bound(lambda value: array.__setitem__(..., value))
         case "sort":
@@ -223,26 +212,26 @@ def array_attribute(interpreter: Interpreter, array: Array, name: str) -> Any:
         case "view":
             return Bound(lambda *dtype: array if not dtype else _refuse_view())
         case _ if name in ARRAY_METHODS:
-            return Bound(lambda *args, **kwargs: array_method(array, name, args, kwargs))
+            return Bound(lambda *args, **kwargs: _call_array_method(array, name, args, kwargs))
     names = difflib.get_close_matches(name, ARRAY_METHODS, 1, 0.8)
     more = f": is .{names[0]} meant?" if names else ": call a function of NumPy"
-    raise Refused("E-ATTRIBUTE", f".{name[:60]} of an array is not available{more}")
+    raise RefusedError("E-ATTRIBUTE", f".{name[:60]} of an array is not available{more}")
 
 
 def _refuse_view() -> None:
-    raise Refused("E-ATTRIBUTE", ".view of another type is not available: use astype")
+    raise RefusedError("E-ATTRIBUTE", ".view of another type is not available: use astype")
 
 
-def _to_list(interpreter: Interpreter, array: Array) -> Any:
+def _to_list(runtime: Runtime, array: Array) -> Any:
     values = array.constant
     if values is None:
-        raise Refused("E-FLOW", "numbers that differ from row to row cannot become a list: compute with the array")
-    interpreter.meter.pay_for_list(values.size)
+        raise RefusedError("E-FLOW", "numbers that differ from row to row cannot become a list: compute with the array")
+    runtime.meter.pay_for_list(values.size)
     return values.tolist()
 
 
-def array_method(array: Array, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """A method of an array: the function of NumPy of this name."""
+def _call_array_method(array: Array, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """Call a method of an array: the function of NumPy of this name."""
     if name == "flatten":
         return call_numpy("ravel", [array], {}).copy()
     if name in ("reshape", "transpose") and (len(args) > 1 or (args and isinstance(args[0], BatchSize))):
@@ -250,9 +239,3 @@ def array_method(array: Array, name: str, args: tuple[Any, ...], kwargs: dict[st
     if name == "reshape" and "shape" not in kwargs and not args:
         args = (kwargs.pop("newshape", ()),)
     return call_numpy(name, [array, *args], kwargs)
-
-
-def _methods(owner: Any) -> frozenset[str]:
-    """The methods of a text, a list, a set or a dictionary."""
-    tables = {str: TEXT_METHODS, Set: SET_METHODS, dict: DICT_METHODS}
-    return tables.get(type(owner), LIST_METHODS)

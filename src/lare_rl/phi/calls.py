@@ -1,14 +1,134 @@
-"""How the arguments of a call become the names of a function of the program."""
+"""Calls: which functions there are, and how the arguments of a call become the names of a function of the program."""
 
 import ast
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lare_rl.phi.values import Function
+from lare_rl.phi.attributes import IGNORED_CALLS
+from lare_rl.phi.classes import new_instance, super_object
+from lare_rl.phi.complex_numbers import call_with_complex, is_complex
+from lare_rl.phi.limits import MAX_CALL_DEPTH, RefusedError
+from lare_rl.phi.numpy_functions import FUNCTIONS, Polynomial, call_numpy
+from lare_rl.phi.python_functions import BUILTINS
+from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.values import (
+    Bound,
+    Class,
+    Decorated,
+    Function,
+    Instance,
+    Iterator,
+    ReturnSignal,
+    Scope,
+    Symbol,
+    type_name,
+)
+
+__all__ = ["call", "define_function", "evaluate_call"]
 
 
-def bind_arguments(function: Function, args: Sequence[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the value of each parameter: its argument, or its default if there is none."""
+def evaluate_call(runtime: Runtime, node: ast.Call, scope: Scope) -> Any:
+    if isinstance(node.func, ast.Name) and node.func.id == "super" and not node.args:
+        return super_object(scope)
+    function = runtime.evaluate(node.func, scope)
+    args = runtime.entries(node.args, scope)
+    kwargs: dict[str, Any] = {}
+    for keyword in node.keywords:
+        value = runtime.evaluate(keyword.value, scope)
+        more = {keyword.arg: value} if keyword.arg is not None else value
+        if not isinstance(more, dict) or not all(isinstance(key, str) for key in more):
+            raise TypeError("** needs a dictionary whose keys are texts")
+        kwargs |= more
+        runtime.meter.pay(len(more))
+    runtime.line = runtime.builder.line = node.lineno
+    return runtime.call(function, args, kwargs)
+
+
+def call(runtime: Runtime, function: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+    """Call a function of the program, of Python or of NumPy. Nothing else can be called."""
+    if isinstance(function, Function):
+        return _call_program_function(runtime, function, args, kwargs)
+    runtime.meter.pay_for_all_within([*args, *kwargs.values()])
+    match function:
+        case Class():
+            return new_instance(runtime, function, args, kwargs)
+        case Instance():
+            return runtime.call(runtime.attribute(function, "__call__"), args, kwargs)
+        case Bound(call=bound):
+            return bound(*args, **kwargs)
+        case Decorated(function=inner):
+            return runtime.call(inner, args, kwargs)
+        case Symbol(name) if name in BUILTINS:
+            return BUILTINS[name](runtime, *args, **kwargs)
+        case Symbol(name) if name.startswith("np.") and name[3:] in FUNCTIONS:
+            if any(map(is_complex, args)):
+                return call_with_complex(name[3:], args, kwargs)
+            return call_numpy(name[3:], _convert_callables(runtime, name, args), kwargs)
+        case Polynomial():
+            return function(*args)
+        case Symbol("staticmethod" | "classmethod" | "property" as name) if len(args) == 1:
+            return Decorated(name, args[0])
+        case Symbol(name) if name in IGNORED_CALLS:
+            return None
+    raise TypeError(f"{function if isinstance(function, Symbol) else 'a ' + type_name(function)} cannot be called")
+
+
+def _convert_callables(runtime: Runtime, name: str, args: Sequence[Any]) -> Sequence[Any]:
+    """Return the arguments of a function of NumPy, with functions among them called, or made such that it can call them."""
+    if name == "np.piecewise" and len(args) > 2:
+        callables = (Function, Bound, Symbol)
+        values = [
+            runtime.call(f, [args[0], *args[3:]], {}) if isinstance(f, callables) else f for f in runtime.items(args[2])
+        ]
+        return [*args[:2], values]
+    if name in ("np.apply_along_axis", "np.fromfunction") and args:
+        return [lambda *inner, **keywords: runtime.call(args[0], inner, keywords), *args[1:]]
+    return args
+
+
+def define_function(runtime: Runtime, node: ast.FunctionDef | ast.Lambda, scope: Scope) -> Function:
+    """Return the function of a definition or of a lambda. Its defaults are evaluated now."""
+    defaults = [runtime.evaluate(default, scope) for default in node.args.defaults]
+    more = [None if default is None else runtime.evaluate(default, scope) for default in node.args.kw_defaults]
+    name = node.name if isinstance(node, ast.FunctionDef) else "<lambda>"
+    yields = runtime.has_yield and _has_yield(node.body)
+    return Function(name, node.args, node.body, scope.closure, defaults, more, yields)
+
+
+def _has_yield(body: Sequence[ast.stmt] | ast.expr) -> bool:
+    """Return whether the body of a function yields, apart from functions within it."""
+    stack: list[ast.AST] = list(body) if isinstance(body, list) else []
+    while stack:
+        node = stack.pop()
+        if isinstance(node, (ast.Yield, ast.YieldFrom)):
+            return True
+        if not isinstance(node, (ast.FunctionDef, ast.Lambda, ast.ClassDef)):
+            stack.extend(ast.iter_child_nodes(node))
+    return False
+
+
+def _call_program_function(runtime: Runtime, function: Function, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+    scope = Scope(function.scope)
+    scope |= _bind_arguments(function, args, kwargs)
+    scope.yielded = [] if function.yields else None
+    scope.owner, scope.instance = function.owner, args[0] if args else None
+    runtime.call_depth += 1
+    if runtime.call_depth > MAX_CALL_DEPTH:
+        raise RefusedError("E-COST", f"more than {MAX_CALL_DEPTH} calls within each other")
+    try:
+        if isinstance(function.body, ast.expr):
+            return runtime.evaluate(function.body, scope)
+        runtime.run(function.body, scope)
+    except ReturnSignal as signal:
+        if scope.yielded is None:
+            return signal.value
+    finally:
+        runtime.call_depth -= 1
+    return None if scope.yielded is None else Iterator(scope.yielded)
+
+
+def _bind_arguments(function: Function, args: Sequence[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the value of each parameter: its argument, or else its default."""
     parameters = function.parameters
     positional = [parameter.arg for parameter in (*parameters.posonlyargs, *parameters.args)]
     values = dict(zip(positional[len(positional) - len(function.defaults) :], function.defaults, strict=True))
@@ -18,28 +138,16 @@ def bind_arguments(function: Function, args: Sequence[Any], kwargs: Mapping[str,
     if len(args) > len(positional) and parameters.vararg is None:
         raise TypeError(f"{function.name} takes {len(positional)} arguments, and {len(args)} were given")
     values |= dict(zip(positional, args, strict=False))
-    rest = dict(kwargs)
+    unused = dict(kwargs)
     for name in [*positional, *keyword_only]:
-        if name in rest:
-            values[name] = rest.pop(name)
+        if name in unused:
+            values[name] = unused.pop(name)
         if name not in values:
             raise TypeError(f"{function.name} needs the argument {name!r}")
     if parameters.vararg is not None:
         values[parameters.vararg.arg] = tuple(args[len(positional) :])
     if parameters.kwarg is not None:
-        values[parameters.kwarg.arg] = rest
-    elif rest:
-        raise TypeError(f"{function.name} has no argument {next(iter(rest))!r}")
+        values[parameters.kwarg.arg] = unused
+    elif unused:
+        raise TypeError(f"{function.name} has no argument {next(iter(unused))!r}")
     return values
-
-
-def has_yield(body: Sequence[ast.stmt] | ast.expr) -> bool:
-    """Whether the body of a function has a `yield` of its own."""
-    rest: list[ast.AST] = list(body) if isinstance(body, list) else []
-    while rest:
-        node = rest.pop()
-        if isinstance(node, (ast.Yield, ast.YieldFrom)):
-            return True
-        if not isinstance(node, (ast.FunctionDef, ast.Lambda, ast.ClassDef)):
-            rest.extend(ast.iter_child_nodes(node))
-    return False

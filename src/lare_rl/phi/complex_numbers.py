@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import COMPLEX_OPERATIONS, Array, Complex, Operand, as_array, elementwise
-from lare_rl.phi.graph import Refused, current_builder
+from lare_rl.phi.arrays import COMPLEX_OPERATIONS, Array, Complex, as_array, elementwise
+from lare_rl.phi.builder import current_builder
+from lare_rl.phi.limits import MAX_TRANSFORM_LENGTH, RefusedError
 from lare_rl.phi.numpy_functions import call_numpy
-from lare_rl.phi.numpy_functions.registry import numpy_function
+from lare_rl.phi.numpy_functions.registry import array_functions, numpy_function
 
-LONGEST_TRANSFORM = 256
-"""The most numbers of a Fourier transform."""
-PART_BY_PART = frozenset(
+BY_COMPONENT = frozenset(
     "sum mean reshape ravel transpose swapaxes moveaxis take concatenate stack cumsum diff roll flip expand_dims squeeze copy "
     "broadcast_to repeat tile split hsplit array_split array asarray hstack vstack column_stack atleast_1d atleast_2d".split()
 )
-"""Functions that act on the real and on the imaginary part in the same way."""
+"""Functions that act on the real and on the imaginary component in the same way."""
 
 
 def as_complex(value: Any) -> Complex:
@@ -32,31 +31,33 @@ def as_complex(value: Any) -> Complex:
 
 
 def is_complex(value: Any) -> bool:
-    """Whether a value, or an entry of a list, is complex."""
+    """Return whether a value, or an entry of a list, is complex."""
     if isinstance(value, (list, tuple)):
         return any(isinstance(item, (Complex, complex)) for item in value)
     return isinstance(value, (Complex, complex))
 
 
 def call_with_complex(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
-    """Call a function of NumPy. At least one argument is complex."""
+    """Call a function of NumPy with at least one complex argument."""
     if name in COMPLEX_FUNCTIONS:
         return COMPLEX_FUNCTIONS[name](*args, **kwargs)
-    if name not in PART_BY_PART:
-        raise Refused("E-NUMPY", f"np.{name} of complex numbers is not available: use np.abs, np.angle, .real or .imag")
+    if name not in BY_COMPONENT:
+        raise RefusedError(
+            "E-NUMPY", f"np.{name} of complex numbers is not available: use np.abs, np.angle, .real or .imag"
+        )
 
-    def part(value: Any, which: str) -> Any:
+    def component(value: Any, key: str) -> Any:
         if isinstance(value, (list, tuple)) and is_complex(value):
-            return [part(item, which) for item in value]
-        return getattr(as_complex(value), which) if is_complex(value) or isinstance(value, Array) else value
+            return [component(item, key) for item in value]
+        return getattr(as_complex(value), key) if is_complex(value) or isinstance(value, Array) else value
 
-    parts = [
-        call_numpy(name, [part(args[0], which), *args[1:]], {key: part(value, which) for key, value in kwargs.items()})
-        for which in ("real", "imag")
-    ]
-    if isinstance(parts[0], list):
-        return [Complex(*pair) for pair in zip(*parts, strict=True)]
-    return Complex(*parts)
+    real, imag = (
+        call_numpy(
+            name, [component(args[0], key), *args[1:]], {name_: component(x, key) for name_, x in kwargs.items()}
+        )
+        for key in ("real", "imag")
+    )
+    return [Complex(*pair) for pair in zip(real, imag, strict=True)] if isinstance(real, list) else Complex(real, imag)
 
 
 def _multiply(x: Complex, y: Complex) -> Complex:
@@ -71,7 +72,7 @@ def _divide(x: Complex, y: Complex) -> Complex:
 
 def _power(x: Any, y: Any) -> Any:
     if not isinstance(y, int) or not 0 < y <= 8:
-        raise Refused("E-NUMPY", "complex numbers have whole powers from 1 to 8 only")
+        raise RefusedError("E-NUMPY", "complex numbers have whole powers from 1 to 8 only")
     result = as_complex(x)
     for _ in range(y - 1):
         result = _multiply(result, as_complex(x))
@@ -111,30 +112,25 @@ COMPLEX_FUNCTIONS: dict[str, Callable[..., Any]] = {
 }
 
 
-@numpy_function()
-def angle(z: Operand) -> Any:
-    return elementwise("arctan2", elementwise("multiply", z, 0.0), z)
+array_functions(
+    {
+        "angle": lambda z: elementwise("arctan2", elementwise("multiply", z, 0.0), z),
+        "imag": lambda val: elementwise("multiply", val, 0.0),
+    }
+)
 
 
-@numpy_function()
-def imag(val: Operand) -> Any:
-    return elementwise("multiply", val, 0.0)
-
-
-@numpy_function("fft.fft")
 def fft(a: Any, n: Any = None, axis: int = -1) -> Complex:
-    """Sum over t of a_t exp(-2 pi i k t / n)."""
+    """Return the sum over t of a_t exp(-2 pi i k t / n)."""
     return _transform(a, axis, -1.0, half=False)
 
 
-@numpy_function("fft.ifft")
 def ifft(a: Any, n: Any = None, axis: int = -1) -> Complex:
     result = _transform(a, axis, 1.0, half=False)
     size = result.real.row_shape[result.real.axis(axis)]
     return Complex(result.real / size, result.imag / size)
 
 
-@numpy_function("fft.rfft")
 def rfft(a: Any, n: Any = None, axis: int = -1) -> Complex:
     return _transform(a, axis, -1.0, half=True)
 
@@ -143,8 +139,8 @@ def _transform(a: Any, axis: int, sign: float, half: bool) -> Complex:
     x = as_complex(a)
     (at,) = x.real.row_axes(axis)
     n = x.real.row_shape[at]
-    if n > LONGEST_TRANSFORM:
-        raise Refused("E-COST", f"np.fft of {n} numbers: at most {LONGEST_TRANSFORM}")
+    if n > MAX_TRANSFORM_LENGTH:
+        raise RefusedError("E-COST", f"np.fft of {n} numbers: at most {MAX_TRANSFORM_LENGTH}")
     phase = sign * 2 * math.pi * np.outer(np.arange(n), np.arange(n // 2 + 1 if half else n)) / n
     cos, sin = np.cos(phase), np.sin(phase)
 
@@ -155,7 +151,8 @@ def _transform(a: Any, axis: int, sign: float, half: bool) -> Complex:
     return Complex(real, product(x.real, sin) + product(x.imag, cos))
 
 
-COMPLEX_FUNCTIONS |= {"fft.fft": fft, "fft.ifft": ifft, "fft.rfft": rfft}
+for _name, _function in {"fft.fft": fft, "fft.ifft": ifft, "fft.rfft": rfft}.items():
+    COMPLEX_FUNCTIONS[_name] = numpy_function(_name)(_function)
 
 
 def _register_frequencies(name: str) -> None:

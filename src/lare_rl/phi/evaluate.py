@@ -2,7 +2,7 @@
 
 An array has the axes of its row last. In front of them are the batch axes, as many as the caller has: (observation size,),
 (batch, observation size), (seeds, time, envs, observation size). Operations name their axes from the end, so they never touch a
-batch axis. Constants have no batch axes. `lare-rl export` copies this file beside the exported graphs: it needs NumPy alone.
+batch axis. Constants have no batch axes. `lare-rl export` copies this file next to the exported graphs, so it may import NumPy only.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
     from lare_rl.phi.graph import Graph, Node
 
-LARGEST_INT = 2.0**31 - 128
-"""The largest float32 that fits into an int32."""
+__all__ = ["compute", "evaluate"]
+
+MAX_INT32_IN_FLOAT32 = 2.0**31 - 128
+"""The largest float32 that an int32 can hold."""
 
 
 def evaluate(graph: Graph, inputs: Mapping[str, Any], xp: Any = np, dtype: Any = np.float32) -> dict[str, Any]:
@@ -42,16 +44,22 @@ def evaluate(graph: Graph, inputs: Mapping[str, Any], xp: Any = np, dtype: Any =
                 values.append(compute(node, [values[i] for i in node.inputs], batch, xp, dtype))
             for i in unused:
                 values[i] = None
-    return {
-        name: xp.broadcast_to(values[i], (*batch, *graph.nodes[i].shape)) for name, i in graph.outputs.items()
-    }  # fmt: skip
+    return {name: xp.broadcast_to(values[i], (*batch, *graph.nodes[i].shape)) for name, i in graph.outputs.items()}
 
 
 def compute(node: Node, x: Sequence[Any], batch: tuple[int, ...], xp: Any = np, dtype: Any = np.float64) -> Any:
-    """Compute the result of one operation from the results that it needs."""
+    """Compute the result of one operation.
+
+    Args:
+        node: the operation.
+        x: the results of its inputs, each of shape (*batch, *row); constants have the shape of their row.
+        batch: the batch axes.
+        xp: `numpy` or `jax.numpy`.
+        dtype: the type of floating-point numbers.
+    """
     option = node.option
     match node.op:
-        case "gather":  # positions that form a box are read by a slice, which costs less
+        case "gather":  # a box is read by slices, which costs less
             if option.slices is not None:
                 result = x[0][(..., *option.slices)].reshape((*batch, *node.shape))
             else:
@@ -66,7 +74,7 @@ def compute(node: Node, x: Sequence[Any], batch: tuple[int, ...], xp: Any = np, 
                 flat = xp.broadcast_to(index, (*batch, *node.shape)).reshape((*batch, math.prod(node.shape)))
                 result = xp.take_along_axis(table, flat, -1).reshape((*batch, *node.shape))
         case "cast" if node.kind == "int" and x[0].dtype != bool:
-            result = xp.where(xp.isnan(x[0]), 0, xp.clip(x[0], -LARGEST_INT, LARGEST_INT))
+            result = xp.where(xp.isnan(x[0]), 0, xp.clip(x[0], -MAX_INT32_IN_FLOAT32, MAX_INT32_IN_FLOAT32))
         case "cast":
             result = x[0] != 0 if node.kind == "bool" else x[0]
         case "einsum":
@@ -77,9 +85,7 @@ def compute(node: Node, x: Sequence[Any], batch: tuple[int, ...], xp: Any = np, 
             result = getattr(xp, node.op)(x[0], xp.maximum(x[1], 0))
         case "det":
             result = xp.linalg.det(x[0])
-        case "sum" | "prod" | "max" | "min" | "any" | "all" | "argmax" | "argmin":
-            result = getattr(xp, node.op)(x[0], axis=option)
-        case "cumsum" | "cumprod" | "sort":
+        case "sum" | "prod" | "max" | "min" | "any" | "all" | "argmax" | "argmin" | "cumsum" | "cumprod" | "sort":
             result = getattr(xp, node.op)(x[0], axis=option)
         case "argsort":
             result = xp.argsort(x[0], axis=option, stable=True)
@@ -89,7 +95,7 @@ def compute(node: Node, x: Sequence[Any], batch: tuple[int, ...], xp: Any = np, 
 
 
 def _batch_shape(graph: Graph, inputs: Mapping[str, Any]) -> tuple[int, ...]:
-    """The shape of the batch axes, which all inputs share."""
+    """Return the shape of the batch axes, which all inputs share."""
     for node in graph.nodes:
         if node.op == "input":
             shape = np.shape(inputs[node.option])
@@ -98,5 +104,5 @@ def _batch_shape(graph: Graph, inputs: Mapping[str, Any]) -> tuple[int, ...]:
 
 
 def _dtypes(dtype: Any) -> dict[str, Any]:
-    """The type of the numbers of each kind."""
+    """Return the type of the numbers of each kind."""
     return {"float": dtype, "int": np.int64 if dtype is np.float64 else np.int32, "bool": bool}

@@ -5,25 +5,27 @@ import itertools
 import re
 from collections.abc import Sequence
 
-from lare_rl.phi.graph import Refused
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.parse import parse
-from lare_rl.phi.read import FUNCTION
+from lare_rl.phi.read import FUNCTION_NAME
+
+__all__ = ["factor_meanings", "factor_names"]
 
 NUMBERING = re.compile(r"^(factor\s*)?\d+\s*[.:)]\s*", re.IGNORECASE)
 
 
 def factor_names(source: str, count: int) -> list[str]:
-    """A name for each factor: its variable in the list that the function returns, or else `factor_1` and so on."""
-    names = _returned_names(_parsed(source))
+    """Return a name for each factor: its variable in the list that the function returns, or else `factor_1` and so on."""
+    names = _returned_names(_parse_or_empty(source))
     return names if names and len(names) == count else [f"factor_{number}" for number in range(1, count + 1)]
 
 
 def factor_meanings(source: str, names: Sequence[str]) -> list[str]:
-    """How the author explains each factor: the comment directly above its assignment; empty without one.
+    """Return how the author explains each factor: the comment directly above its assignment, or an empty text.
 
     If a factor is computed in several lines, its comment may be above the first of them, but must then be numbered.
     """
-    tree, lines = _parsed(source), source.split("\n")
+    tree, lines = _parse_or_empty(source), source.split("\n")
     assigned = {
         node.lineno - 1: node.targets[0].id
         for node in ast.walk(tree)
@@ -32,7 +34,7 @@ def factor_meanings(source: str, names: Sequence[str]) -> list[str]:
     meanings, comment, numbered = {}, "", ""
     for number, line in enumerate(lines):
         if _is_comment(line) and not (number and _is_comment(lines[number - 1])):
-            comment = _comment_at(lines[number:])
+            comment = _leading_comment(lines[number:])
             numbered = comment if NUMBERING.match(comment) else ""
         name = assigned.get(number)
         above = number and _is_comment(lines[number - 1])
@@ -43,19 +45,19 @@ def factor_meanings(source: str, names: Sequence[str]) -> list[str]:
     return [meanings.get(name, "") for name in names]
 
 
-def _parsed(source: str) -> ast.Module:
-    """The syntax tree; an empty one for a text that is not accepted."""
+def _parse_or_empty(source: str) -> ast.Module:
+    """Return the syntax tree, which is empty for a text that is not accepted."""
     try:
         return parse(source)
-    except Refused:
+    except RefusedError:
         return ast.Module([], [])
 
 
 def _returned_names(tree: ast.Module) -> list[str] | None:
-    """The names in the list that the function returns; None if the list is not written out."""
+    """Return the names in the list that the function returns; None if the list is not written out."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef) and node.name == FUNCTION and isinstance(node.body[-1], ast.Return):
-            items = _written_out(node, node.body[-1].value)
+        if isinstance(node, ast.FunctionDef) and node.name == FUNCTION_NAME and isinstance(node.body[-1], ast.Return):
+            items = _returned_items(node, node.body[-1].value)
             if items is not None:
                 return [
                     item.id if isinstance(item, ast.Name) else f"factor_{number}"
@@ -64,8 +66,8 @@ def _returned_names(tree: ast.Module) -> list[str] | None:
     return None
 
 
-def _written_out(function: ast.FunctionDef, returned: ast.expr | None) -> list[ast.expr] | None:
-    """The items of `[a, b]`, of `factors`, or of `[f[:, None] for f in factors]`, where the function assigns `factors` once."""
+def _returned_items(function: ast.FunctionDef, returned: ast.expr | None) -> list[ast.expr] | None:
+    """Return the items of `[a, b]`, of `factors`, or of `[f[:, None] for f in factors]`, where the function assigns `factors` once."""
     if isinstance(returned, ast.ListComp) and len(returned.generators) == 1 and not returned.generators[0].ifs:
         returned = returned.generators[0].iter
         returned = returned if isinstance(returned, ast.Name) else None
@@ -85,7 +87,7 @@ def _is_comment(line: str) -> bool:
     return line.strip().startswith("#")
 
 
-def _comment_at(lines: list[str]) -> str:
-    """The comment at the start of the lines."""
+def _leading_comment(lines: list[str]) -> str:
+    """Return the comment at the start of the lines."""
     texts = (line.strip().lstrip("#").strip() for line in itertools.takewhile(_is_comment, lines))
     return " ".join(texts)

@@ -12,6 +12,8 @@ import numpy as np
 
 from lare_rl.phi.graph import Graph, Node
 
+__all__ = ["BATCH", "is_installed", "onnx_model"]
+
 OPSET = 18
 """Version of ONNX's operations. Runtimes of 2023 and later support it."""
 BATCH = "batch"
@@ -35,12 +37,12 @@ DTYPES = {"float": np.float32, "int": np.int64, "bool": np.bool_}
 
 
 def is_installed() -> bool:
-    """Whether the package `onnx` is installed."""
+    """Return whether the package `onnx` is installed."""
     return find_spec("onnx") is not None
 
 
 def onnx_model(graph: Graph, name: str) -> Any:
-    """The model, checked by ONNX itself."""
+    """Return the ONNX model of a graph, checked by ONNX itself."""
     import onnx
     from onnx import helper
 
@@ -49,10 +51,10 @@ def onnx_model(graph: Graph, name: str) -> Any:
         values.append(node.option if node.op == "input" else writer.write(node, [values[i] for i in node.inputs]))
     for output, i in graph.outputs.items():
         node = graph.nodes[i]
-        value = writer.for_each_row(values[i], node.shape) if node.op == "constant" else values[i]
+        value = writer.repeat_for_rows(values[i], node.shape) if node.op == "constant" else values[i]
         writer.nodes.append(helper.make_node("Identity", [value], [output]))
 
-    def described(nodes: dict[str, Node]) -> list[Any]:
+    def describe(nodes: dict[str, Node]) -> list[Any]:
         dtype = helper.np_dtype_to_tensor_dtype
         return [
             helper.make_tensor_value_info(key, dtype(np.dtype(DTYPES[node.kind])), (BATCH, *node.shape))
@@ -60,7 +62,7 @@ def onnx_model(graph: Graph, name: str) -> Any:
         ]
 
     outputs = {key: graph.nodes[i] for key, i in graph.outputs.items()}
-    body = helper.make_graph(writer.nodes, name, described(graph.inputs), described(outputs), writer.constants)
+    body = helper.make_graph(writer.nodes, name, describe(graph.inputs), describe(outputs), writer.constants)
     model = helper.make_model(body, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="lare", ir_version=9)
     onnx.checker.check_model(model)
     return model
@@ -91,7 +93,7 @@ class _Writer:
         )
         return self.constants[-1].name
 
-    def for_each_row(self, constant: str, shape: tuple[int, ...]) -> str:
+    def repeat_for_rows(self, constant: str, shape: tuple[int, ...]) -> str:
         rows = self.op("Shape", next(iter(self.graph.inputs)), start=0, end=1)
         return self.op("Expand", constant, self.op("Concat", rows, np.array(shape, int), axis=0))
 
@@ -118,7 +120,7 @@ class _Writer:
             case "cast":
                 return self.cast(x[0], kind)
             case "gather" | "take" | "concat" | "einsum":
-                return self.rearranged(node, x, inputs)
+                return self._write_rearrangement(node, x, inputs)
             case "argmax" | "argmin":
                 numbers = self.cast(x[0], "float") if inputs[0].kind == "bool" else x[0]
                 return op({"argmax": "ArgMax", "argmin": "ArgMin"}[node.op], numbers, axis=option, keepdims=0)
@@ -141,9 +143,9 @@ class _Writer:
                 numbers = self.cast(x[0], "int") if inputs[0].kind == "bool" else x[0]
                 result = op("TopK", numbers, size, axis=option, largest=0, results=2)[node.op == "argsort"]
                 return self.cast(result, "bool") if kind == "bool" else result
-        return self.composed(node, x, kind)
+        return self._write_composed(node, x, kind)
 
-    def rearranged(self, node: Node, x: list[str], inputs: Sequence[Node]) -> str:
+    def _write_rearrangement(self, node: Node, x: list[str], inputs: Sequence[Node]) -> str:
         op, option = self.op, node.option
         match node.op:
             case "gather" if option.slices is not None:
@@ -160,7 +162,7 @@ class _Writer:
                 return op("Reshape", numbers, np.array([-1, *node.shape], int))
             case "concat":
                 arrays = [
-                    self.for_each_row(value, i.shape) if i.op == "constant" else value
+                    self.repeat_for_rows(value, i.shape) if i.op == "constant" else value
                     for value, i in zip(x, inputs, strict=True)
                 ]
                 return op("Concat", *arrays, axis=-1)
@@ -178,8 +180,8 @@ class _Writer:
         ]
         return op("Einsum", *x, equation=",".join(marked) + "->" + result.replace("...", letter))
 
-    def composed(self, node: Node, x: list[str], kind: str) -> str:
-        """An operation on each number that needs several of ONNX."""
+    def _write_composed(self, node: Node, x: list[str], kind: str) -> str:
+        """Add an operation on each number that needs several of ONNX."""
         op = self.op
         match node.op:
             case "power":
@@ -236,6 +238,6 @@ class _Writer:
                 side = op("Where", op("Less", x[0], 0.0), np.float32(-math.pi), np.float32(math.pi))
                 half = op("Mul", op("Sign", x[0]), math.pi / 2)
                 angle = op("Atan", op("Div", *x))
-                left = op("Where", op("Equal", x[1], 0.0), half, op("Add", angle, side))
-                return op("Where", op("Greater", x[1], 0.0), angle, left)
+                half_plane = op("Where", op("Equal", x[1], 0.0), half, op("Add", angle, side))
+                return op("Where", op("Greater", x[1], 0.0), angle, half_plane)
         raise NotImplementedError(node.op)

@@ -1,50 +1,54 @@
-"""Texts, lists, dictionaries and sets of a program: their operators, their methods, and texts of values."""
-
-from __future__ import annotations
+"""Texts, lists, dictionaries and sets of a program: their operators, their methods, and the texts of values."""
 
 import operator
 import re
 import string
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from lare_rl.phi.arrays import Array, BatchSize, Operand
-from lare_rl.phi.graph import Refused
-from lare_rl.phi.values import Meter, Named, Set, as_key, check_text_length, checked_text, type_of
+from lare_rl.phi.arrays import Array
+from lare_rl.phi.batch import BatchSize
+from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.meter import Meter, check_key, check_text, check_text_length
+from lare_rl.phi.operand import Operand
+from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.values import Set, Symbol, value_type
 
-if TYPE_CHECKING:
-    from lare_rl.phi.interpreter import Interpreter
+__all__ = ["METHODS", "call_method", "combine_values", "format_value"]
 
 FORMAT = re.compile(r"[<>^=]?[-+ ]?#?0?\d{0,2}[,_]?(\.\d{1,2})?[bdeEfFgGnosxX%]?")
-"""Format specifications of bounded width."""
+"""Format specifications of limited width."""
 PERCENT = re.compile(r"%(%|[-+ #0]*\d{0,2}(\.\d{1,2})?[sdifeEgG])")
 
-TEXT_METHODS = frozenset(
-    "upper lower strip lstrip rstrip split rsplit startswith endswith title capitalize isdigit isalpha removeprefix removesuffix "
-    "partition find count index replace join format zfill".split()
-)
-LIST_METHODS = frozenset("append extend insert pop copy index count reverse sort remove clear".split())
-DICT_METHODS = frozenset("get items keys values pop update copy setdefault clear".split())
-SET_METHODS = frozenset("add union intersection difference issubset issuperset discard copy update".split())
+METHODS: dict[type, frozenset[str]] = {
+    str: frozenset(
+        "upper lower strip lstrip rstrip split rsplit startswith endswith title capitalize isdigit isalpha removeprefix "
+        "removesuffix partition find count index replace join format zfill".split()
+    ),
+    list: frozenset("append extend insert pop copy index count reverse sort remove clear".split()),
+    dict: frozenset("get items keys values pop update copy setdefault clear".split()),
+    Set: frozenset("add union intersection difference issubset issuperset discard copy update".split()),
+}  # fmt: skip
+"""Methods that a program can call, by the type of their owner."""
 
 
-def formatted(meter: Meter, value: Any, spec: str) -> str:
-    """A value as a text. The numbers of an array are not known yet, unless it is constant."""
+def format_value(meter: Meter, value: Any, spec: str) -> str:
+    """Return the text of a value. The numbers of an array are not known yet, unless it is constant."""
     if isinstance(value, Array) and value.constant is not None and not spec:
         value = value.constant.tolist()
     if isinstance(value, Operand):
         return "<array>"
     meter.pay_for_all_within([value])
     if not FORMAT.fullmatch(spec):
-        raise Refused("E-PYTHON", f"the format {spec[:40]!r} is not available")
+        raise RefusedError("E-PYTHON", f"the format {spec[:40]!r} is not available")
     if isinstance(value, (bool, int, float, str)):
-        return checked_text(format(value, spec))
+        return check_text(format(value, spec))
     check_text_length(_text_length(value))
-    return checked_text(str(value)) if _is_plain(value) else f"<{type_of(value)}>"
+    return check_text(str(value)) if _is_plain(value) else f"<{value_type(value)}>"
 
 
 def _text_length(value: Any) -> int:
-    """About how long the text of a value is."""
+    """Return about how long the text of a value is."""
     if isinstance(value, (list, tuple)):
         return sum(map(_text_length, value))
     return 4 * len(value) if isinstance(value, str) else 4
@@ -53,11 +57,11 @@ def _text_length(value: Any) -> int:
 def _is_plain(value: Any) -> bool:
     if isinstance(value, (list, tuple)):
         return all(map(_is_plain, value))
-    return isinstance(value, (bool, int, float, str, Named, BatchSize)) or value is None
+    return isinstance(value, (bool, int, float, str, Symbol, BatchSize)) or value is None
 
 
-def combined(meter: Meter, name: str, x: Any, y: Any) -> Any:
-    """An operator on texts, lists, dictionaries and sets, by the name of Python's method."""
+def combine_values(meter: Meter, name: str, x: Any, y: Any) -> Any:
+    """Apply an operator, by the name of Python's method, to texts, lists, dictionaries or sets."""
     for value, times in ((x, y), (y, x)):
         if name == "mul" and isinstance(value, (list, tuple, str)) and isinstance(times, int):
             meter.pay_for_list(len(value) * max(times, 0))
@@ -69,37 +73,42 @@ def combined(meter: Meter, name: str, x: Any, y: Any) -> Any:
         return x + y if name == "add" else x | y
     if isinstance(x, Set) and isinstance(y, Set) and name in ("or", "and", "sub", "xor"):
         meter.pay(len(x) + len(y))
-        keeps = {"or": lambda key: True, "and": lambda key: key in y, "sub": lambda key: key not in y}
-        keep = keeps.get(name, lambda key: (key in x) != (key in y))
-        return Set({key: None for key in (x | y if name in ("or", "xor") else x) if keep(key)})
+        return Set(
+            {
+                "or": lambda: dict(x | y),
+                "and": lambda: {key: None for key in x if key in y},
+                "sub": lambda: {key: None for key in x if key not in y},
+                "xor": lambda: {key: None for key in x | y if (key in x) != (key in y)},
+            }[name]()
+        )
     if name == "mod" and isinstance(x, str):
         values = y if isinstance(y, tuple) else (y,)
         texts = sum(len(value) for value in values if isinstance(value, str))
         check_text_length(len(x) + texts + 100 * len(values))
         if "%" in PERCENT.sub("", x) or not all(isinstance(value, (bool, int, float, str)) for value in values):
-            raise Refused("E-PYTHON", "this format is not available: use an f-string")
-        return checked_text(x % values)
-    raise TypeError(f"unsupported operand types for {name}: {type_of(x)} and {type_of(y)}")
+            raise RefusedError("E-PYTHON", "this format is not available: use an f-string")
+        return check_text(x % values)
+    raise TypeError(f"unsupported operand types for {name}: {value_type(x)} and {value_type(y)}")
 
 
-def call_method(interpreter: Interpreter, owner: Any, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
-    """A method of a text, list, dictionary or set that is in one of the tables above."""
-    interpreter.meter.pay(len(owner) + 1)
+def call_method(runtime: Runtime, owner: Any, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+    """Call a method of a text, list, dictionary or set that is in `METHODS`."""
+    runtime.meter.pay(len(owner) + 1)
     if isinstance(owner, str):
-        return _text_method(interpreter, owner, name, args, kwargs)
+        return _text_method(runtime, owner, name, args, kwargs)
     if isinstance(owner, Set):
-        return _set_method(interpreter, owner, name, args)
+        return _set_method(runtime, owner, name, args)
     if isinstance(owner, dict):
-        return _dict_method(interpreter, owner, name, args, kwargs)
-    return _list_method(interpreter, owner, name, args, kwargs)
+        return _dict_method(runtime, owner, name, args, kwargs)
+    return _list_method(runtime, owner, name, args, kwargs)
 
 
-def _text_method(interpreter: Interpreter, text: str, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+def _text_method(runtime: Runtime, text: str, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     if name == "format":
-        return _format_fields(interpreter, text, args, kwargs)
+        return _format_fields(runtime, text, args, kwargs)
     length = 0
     if name == "join":
-        args = [[part for part in interpreter.items(args[0]) if isinstance(part, str)]]
+        args = [[item for item in runtime.items(args[0]) if isinstance(item, str)]]
         length = sum(map(len, args[0])) + len(text) * len(args[0])
     elif name == "replace":
         length = (text.count(args[0]) if args[0] else len(text) + 1) * len(args[1])
@@ -109,58 +118,58 @@ def _text_method(interpreter: Interpreter, text: str, name: str, args: Sequence[
     return getattr(str, name)(text, *args)
 
 
-def _format_fields(interpreter: Interpreter, text: str, args: Sequence[Any], kwargs: dict[str, Any]) -> str:
-    """str.format, whose fields are numbers and names: no attributes, no indices."""
+def _format_fields(runtime: Runtime, text: str, args: Sequence[Any], kwargs: dict[str, Any]) -> str:
+    """Apply str.format. Its fields are numbers and names, without attributes and indices."""
     pieces, number = [], 0
     for literal, field, spec, _ in string.Formatter().parse(text):
         pieces.append(literal)
         if field is not None:
             value = args[int(field or number)] if field.isdigit() or not field else kwargs[field]
             number += not field
-            pieces.append(formatted(interpreter.meter, value, spec or ""))
+            pieces.append(format_value(runtime.meter, value, spec or ""))
             check_text_length(sum(map(len, pieces)))
-    return checked_text("".join(pieces))
+    return check_text("".join(pieces))
 
 
-def _list_method(
-    interpreter: Interpreter, values: list[Any], name: str, args: Sequence[Any], kwargs: dict[str, Any]
-) -> Any:
+def _list_method(runtime: Runtime, values: list[Any], name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     if name == "sort":
-        values[:] = interpreter.call(Named("sorted"), [values], kwargs)
+        values[:] = runtime.call(Symbol("sorted"), [values], kwargs)
         return None
     if name == "extend":
-        args = [list(interpreter.items(args[0]))]
+        args = [list(runtime.items(args[0]))]
     added = len(args[0]) if name == "extend" else name in ("append", "insert")
     if added:
-        interpreter.meter.pay_for_list(len(values) + added)
+        runtime.meter.pay_for_list(len(values) + added)
     if name in ("index", "count", "remove"):
-        interpreter.meter.pay_for_all_within(values)
+        runtime.meter.pay_for_all_within(values)
     return getattr(list, name)(values, *args)
 
 
 def _dict_method(
-    interpreter: Interpreter, values: dict[Any, Any], name: str, args: Sequence[Any], kwargs: dict[str, Any]
+    runtime: Runtime, values: dict[Any, Any], name: str, args: Sequence[Any], kwargs: dict[str, Any]
 ) -> Any:
     if name in ("get", "pop", "setdefault"):
-        as_key(args[0])
+        check_key(args[0])
     if name == "update":
-        values |= interpreter.call(Named("dict"), args, kwargs)
-        interpreter.meter.pay_for_list(len(values))
+        values |= runtime.call(Symbol("dict"), args, kwargs)
+        runtime.meter.pay_for_list(len(values))
         return None
     result = getattr(dict, name)(values, *args)
     return list(result) if name in ("items", "keys", "values") else result
 
 
-def _set_method(interpreter: Interpreter, values: Set, name: str, args: Sequence[Any]) -> Any:
+def _set_method(runtime: Runtime, values: Set, name: str, args: Sequence[Any]) -> Any:
     if name == "copy":
         return Set(values)
     if name == "discard":
-        return values.pop(as_key(args[0]), None)
-    other = Set(dict.fromkeys(map(as_key, [args[0]] if name == "add" else interpreter.items(args[0]))))
+        return values.pop(check_key(args[0]), None)
+    other = Set(dict.fromkeys(map(check_key, [args[0]] if name == "add" else runtime.items(args[0]))))
     if name in ("add", "update"):
-        interpreter.meter.pay_for_list(len(values) + len(other))
+        runtime.meter.pay_for_list(len(values) + len(other))
         return values.update(other)
     if name in ("issubset", "issuperset"):
         small, large = (values, other) if name == "issubset" else (other, values)
         return all(key in large for key in small)
-    return combined(interpreter.meter, {"union": "or", "intersection": "and", "difference": "sub"}[name], values, other)
+    return combine_values(
+        runtime.meter, {"union": "or", "intersection": "and", "difference": "sub"}[name], values, other
+    )

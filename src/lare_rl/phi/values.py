@@ -1,35 +1,26 @@
-"""The values of a program that are neither numbers nor arrays, and what a program may spend."""
+"""The values of a program that are neither numbers nor arrays: names, functions, classes, scopes."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from lare_rl.phi.arrays import BatchSize, Operand
-from lare_rl.phi.graph import Refused
-
-MOST_STEPS = 40_000
-"""The most steps of a program: statements, expressions, and entries of lists that are made or looked into."""
-LONGEST_LIST = 10_000
-LONGEST_TEXT = 10_000
-LONGEST_KEY = 16
-"""The most entries of a tuple that is the key of a dictionary."""
-MOST_BITS = 63
-"""The most bits of an integer."""
+from lare_rl.phi.batch import BatchSize
+from lare_rl.phi.operand import Operand
 
 
 class _Value:
-    """A value whose text tells nothing of the process."""
+    """A value whose text tells nothing about the process."""
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__.lower()}>"
 
 
 @dataclass(frozen=True)
-class Named:
-    """What is known by its name: a module, a function or a type of Python or NumPy."""
+class Symbol:
+    """A module, a function or a type of Python or NumPy. A program has only its name."""
 
     name: str
 
@@ -54,14 +45,14 @@ class Function(_Value):
 
 @dataclass(eq=False, repr=False)
 class Bound(_Value):
-    """A function, or a method of Python's or NumPy's types, with its first argument."""
+    """A function, or a method of a type of Python or NumPy, with its first argument."""
 
     call: Callable[..., Any]
 
 
 @dataclass(eq=False, repr=False)
 class Decorated(_Value):
-    """A function in a class: a static method, a class method or a property."""
+    """A static method, a class method or a property."""
 
     kind: str
     function: Any
@@ -75,11 +66,11 @@ class Class(_Value):
     attributes: dict[str, Any]
     bases: Sequence[Class] = ()
     fields: Sequence[str] | None = None
-    """The names of the fields of a dataclass or of a named tuple, in order."""
+    """Names of the fields of a dataclass or of a named tuple, in order."""
     is_tuple: bool = False
 
     def find(self, name: str) -> Any:
-        """An attribute, also of the bases. Raises `AttributeError` if there is none."""
+        """Return an attribute of the class or of its bases. Raises `AttributeError` if none of them has it."""
         for cls in (self, *self.bases):
             if name in cls.attributes:
                 return cls.attributes[name]
@@ -102,11 +93,11 @@ class Set(dict):
 
 
 class Iterator(list):
-    """What zip, map, a generator and their like return. Its entries can be gone through once."""
+    """The result of zip, map, a generator and the like. Its entries can be read once."""
 
 
 class Scope(dict):
-    """The names of a call, of a class or of a comprehension, within those of the scopes around it."""
+    """The names of a call, of a class or of a comprehension. Names that are not in it are searched in the scopes around it."""
 
     def __init__(self, parent: Scope | None = None, kind: str = "function"):
         super().__init__()
@@ -121,7 +112,7 @@ class Scope(dict):
         """The object that the method is called on."""
 
     def find(self, name: str) -> Any:
-        """The value of a name. Raises `NameError` if there is none."""
+        """Return the value of a name. Raises `NameError` if it is not defined."""
         scope: Scope | None = self
         while scope is not None:
             if name in scope.elsewhere:
@@ -141,77 +132,11 @@ class Scope(dict):
 
     @property
     def closure(self) -> Scope:
-        """The scope that functions see which are defined here: not that of a class."""
+        """The scope that functions see which are defined here. They do not see that of a class."""
         return self.parent if self.kind == "class" and self.parent is not None else self
 
 
-class Meter:
-    """Counts the steps of a program. All that takes time or memory is paid for before it happens."""
-
-    def __init__(self) -> None:
-        self.steps = 0
-
-    def pay(self, steps: int = 1) -> None:
-        self.steps += max(steps, 0)
-        if self.steps > MOST_STEPS:
-            raise Refused("E-COST", f"the program takes more than {MOST_STEPS} steps")
-
-    def pay_for_list(self, values: Sequence[Any] | int) -> Any:
-        """Pay for a new list of these entries, or of this many, and return it."""
-        count = values if isinstance(values, int) else len(values)
-        if count > LONGEST_LIST:
-            raise Refused("E-COST", f"a list is too long: it may have at most {LONGEST_LIST} entries")
-        self.pay(count)
-        return values
-
-    def pay_for_all_within(self, values: Iterable[Any]) -> None:
-        """Pay for all that is within values. A list that holds another twice, and so on, has very many entries."""
-        rest = list(values)
-        while rest:
-            value = rest.pop()
-            self.pay()
-            if isinstance(value, dict):
-                self.pay(len(value))
-                rest.extend(value.values())
-            elif isinstance(value, (list, tuple)):
-                rest.extend(value)
-            elif isinstance(value, slice):
-                rest.extend((value.start, value.stop, value.step))
-            elif isinstance(value, str):
-                self.pay(len(value) // 100)
-            elif isinstance(value, Instance):
-                rest.extend(value.attributes.values())
-
-
-def checked_number(value: Any) -> Any:
-    """A number of Python. Raises `Refused` if it is too large."""
-    if isinstance(value, int) and value.bit_length() > MOST_BITS:
-        raise Refused("E-COST", "an integer is too large")
-    return value
-
-
-def check_text_length(length: int) -> None:
-    """Raises `Refused` if a text of this length, which need not be made yet, is too long."""
-    if length > LONGEST_TEXT:
-        raise Refused("E-COST", f"a text is too long: it may have at most {LONGEST_TEXT} characters")
-
-
-def checked_text(text: str) -> str:
-    check_text_length(len(text))
-    return text
-
-
-def as_key(value: Any) -> Any:
-    """A value as the key of a dictionary. Raises `TypeError` if it is none."""
-    parts = value if isinstance(value, tuple) else (value,)
-    if len(parts) > LONGEST_KEY or not all(
-        isinstance(part, (str, bool, int, float, Named)) or part is None for part in parts
-    ):
-        raise TypeError("the keys of dictionaries and the entries of sets are texts, numbers, or tuples of them")
-    return value
-
-
-class Return(Exception):
+class ReturnSignal(Exception):
     """Leaves a function of the program."""
 
     def __init__(self, value: Any):
@@ -219,15 +144,15 @@ class Return(Exception):
         self.value = value
 
 
-class Break(Exception):
+class BreakSignal(Exception):
     """Leaves a loop."""
 
 
-class Continue(Exception):
+class ContinueSignal(Exception):
     """Goes on with the next turn of a loop."""
 
 
-class Raised(Exception):
+class ProgramError(Exception):
     """The program raised an error. `name` is that of its class."""
 
     def __init__(self, name: str, message: str):
@@ -235,19 +160,23 @@ class Raised(Exception):
         self.name, self.message = name, message
 
 
-def type_of(value: Any) -> Named:
-    """The type of a value, as a program sees it."""
+PYTHON_ERRORS = (ArithmeticError, AttributeError, LookupError, NameError, TypeError, ValueError, ProgramError)
+"""The errors that Python and NumPy would raise, too. A program can catch them; it cannot catch `RefusedError`."""
+
+_TYPE_NAMES: dict[type, str] = {
+    Set: "set", Iterator: "iterator", Bound: "function", Class: "type", BatchSize: "int", Symbol: "type", Function: "function",
+}  # fmt: skip
+
+
+def value_type(value: Any) -> Symbol:
+    """Return the type of a value, as a program sees it."""
     if isinstance(value, Operand):
-        return Named("np.ndarray")
+        return Symbol("np.ndarray")
     if isinstance(value, Instance):
-        return Named(value.cls.name)
-    names = {
-        Set: "set",
-        Iterator: "iterator",
-        Bound: "function",
-        Class: "type",
-        BatchSize: "int",
-        Named: "type",
-        Function: "function",
-    }
-    return Named(names.get(type(value), type(value).__name__))
+        return Symbol(value.cls.name)
+    return Symbol(_TYPE_NAMES.get(type(value), type(value).__name__))
+
+
+def type_name(value: Any) -> str:
+    """Return the type of a value, for a message."""
+    return value_type(value).name.removeprefix("np.")

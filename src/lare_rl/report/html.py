@@ -1,15 +1,30 @@
 """The parts of an HTML page, and the page itself."""
 
-import math
+import base64
 from collections.abc import Iterable, Sequence
 from html import escape
 from importlib.resources import files
+from itertools import groupby
 from pathlib import Path
 
-from lare_rl.errors import LareError
-from lare_rl.util.files import replace
+import numpy as np
+from jaxtyping import Float
 
-PAGE = """<!doctype html>
+from lare_rl.errors import LareError
+from lare_rl.latent.function import LatentFunction
+from lare_rl.util.files import replace_file
+
+__all__ = [
+    "render_factor_table",
+    "render_function",
+    "render_gif",
+    "render_lines",
+    "render_note",
+    "render_table",
+    "write_page",
+]
+
+_PAGE = """<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
@@ -31,46 +46,62 @@ def write_page(path: Path, title: str, body: str, refresh: int | None = None) ->
     Raises:
         LareError: the file cannot be written. An older file is left unchanged.
     """
-    again = "" if refresh is None else f'<meta http-equiv="refresh" content="{refresh}">\n'
+    reload = "" if refresh is None else f'<meta http-equiv="refresh" content="{refresh}">\n'
     style = (files("lare_rl.report") / "report.css").read_text(encoding="utf-8")
-    page = PAGE.format(title=escape(title), style=style, body=body, refresh=again).encode()
+    page = _PAGE.format(title=escape(title), style=style, body=body, refresh=reload).encode()
     try:
-        replace(path, lambda file: file.write(page))
+        replace_file(path, lambda file: file.write(page))
     except OSError as error:
         raise LareError(f"the report {path} cannot be written: {error.strerror}") from error
     return path
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """An HTML table of escaped cells; the columns in `numbers` are formatted as numbers."""
+def render_table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
+    """Return an HTML table of escaped cells. The columns in `numbers` are formatted as numbers."""
 
-    def cells(tag: str, row: Sequence[str]) -> str:
-        kinds = (' class="number"' if place in numbers else "" for place in range(len(row)))
-        return "".join(f"<{tag}{kind}>{escape(cell)}</{tag}>" for kind, cell in zip(kinds, row, strict=True))
+    def render_cells(tag: str, cells: Sequence[str]) -> str:
+        classes = (' class="number"' if column in numbers else "" for column in range(len(cells)))
+        return "".join(f"<{tag}{class_}>{escape(cell)}</{tag}>" for class_, cell in zip(classes, cells, strict=True))
 
-    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return f'<div class="wide"><table><tr>{cells("th", head)}</tr>\n{body}\n</table></div>'
-
-
-def factor_table(labels: Iterable[tuple[str, str, str]], correlations: Iterable[float]) -> str:
-    """Names, meanings and entries of factors and, if any is known, their correlations with the true reward."""
-    values, head = list(correlations), ("factor", "meaning, by the comments in phi", "entries that it reads")
-    if all(map(math.isnan, values)):
-        return table(head, labels)
-    rows = [(*label, "-" if math.isnan(value) else f"{value:.2f}") for label, value in zip(labels, values, strict=True)]
-    return table((*head, "correlation with the true reward"), rows, (3,))
+    body = "\n".join(f"<tr>{render_cells('td', row)}</tr>" for row in rows)
+    return f'<div class="wide"><table><tr>{render_cells("th", header)}</tr>\n{body}\n</table></div>'
 
 
-def note(text: str) -> str:
-    """A paragraph in small print."""
+def render_note(text: str) -> str:
+    """Return a paragraph in small print."""
     return f'<p class="note">{escape(text)}</p>'
 
 
-def function_text(model: str, digest: str, source: str) -> str:
-    """The source of a latent function, and who wrote it."""
-    by = (
-        "Written by hand, or from a file that names no language model"
-        if model.startswith("none: written by hand")
-        else f"By {model}"
+def render_lines(lines: Iterable[str]) -> str:
+    """Return a paragraph for each line, and lists of the lines that begin with a dash."""
+    blocks = []
+    for is_list, group in groupby(lines, key=lambda line: line.startswith("- ")):
+        if is_list:
+            blocks.append("<ul>" + "".join(f"<li>{escape(line[2:])}</li>" for line in group) + "</ul>")
+        else:
+            blocks += [f"<p>{escape(line)}</p>" for line in group]
+    return "\n".join(blocks)
+
+
+def render_gif(data: bytes, description: str) -> str:
+    """Return an image that holds its data."""
+    return (
+        f'<img class="film" alt="{escape(description)}" src="data:image/gif;base64,{base64.b64encode(data).decode()}">'
     )
-    return note(f"{by}. SHA-256 {digest}.") + f"<pre>{escape(source)}</pre>"
+
+
+def render_factor_table(labels: Sequence[tuple[str, str, str]], correlations: Float[np.ndarray, " factors"]) -> str:
+    """Return a table of factors (name, meaning, entries) and, if any is known, of their correlations with the true reward."""
+    header = ("factor", "meaning, by the comments in phi", "entries that it reads")
+    if np.isnan(correlations).all():
+        return render_table(header, labels)
+    texts = ("-" if np.isnan(correlation) else f"{correlation:.2f}" for correlation in correlations)
+    rows = [(*label, text) for label, text in zip(labels, texts, strict=True)]
+    return render_table((*header, "correlation with the true reward"), rows, numbers=(len(header),))
+
+
+def render_function(function: LatentFunction) -> str:
+    """Return the source of a latent function, with its author."""
+    by_hand = function.model.startswith("none: written by hand")
+    author = "Written by hand, or from a file that names no language model" if by_hand else f"By {function.model}"
+    return render_note(f"{author}. SHA-256 {function.digest}.") + f"<pre>{escape(function.source)}</pre>"

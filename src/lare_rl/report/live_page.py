@@ -1,65 +1,74 @@
-"""A page that shows a run while it trains: the verdict and the curves, redrawn after every evaluation."""
+"""A page that shows a run while it trains: the diagnosis and the curves, redrawn after every evaluation."""
 
 import webbrowser
 from contextlib import suppress
 from html import escape
 from pathlib import Path
 
+import numpy as np
+
 from lare_rl.errors import LareError
-from lare_rl.evaluation.evaluate import random_returns
-from lare_rl.report.html import note, write_page
-from lare_rl.report.report import learning, verdicts
-from lare_rl.runs.directory import read_measured
+from lare_rl.evaluation.evaluate import measure_random_returns
+from lare_rl.report.html import render_note, write_page
+from lare_rl.report.overview import render_diagnoses, render_learning_curves
+from lare_rl.report.reported_run import ReportedRun
+from lare_rl.runs.directory import open_without_functions
 from lare_rl.training.progress import Metrics
+
+__all__ = ["PAGE", "LivePage"]
 
 PAGE = "watch.html"
 """The file in the run's directory."""
-
-REFRESH = 10
+REFRESH_S = 10
 """Seconds after which a browser reloads the page."""
 
 
 class LivePage:
-    """Writes the page, and opens it in the browser when training begins if `browser`. Errors of writing are ignored."""
+    """A listener that writes the page. It ignores errors of writing.
+
+    Args:
+        directory: the run's directory.
+        browser: whether to open the page in the browser when training begins.
+    """
 
     def __init__(self, directory: Path, browser: bool = True):
-        self.directory, self.browser, self.running, self.random = directory, browser, False, None
+        self._directory, self._browser, self._is_running = directory, browser, False
+        self._random_returns: np.ndarray | None = None
 
-    def started(self, name: str, step: int, steps: int) -> None:
-        self.running = True
-        self.draw()
-        if self.browser:
-            webbrowser.open((self.directory / PAGE).resolve().as_uri())
+    def on_start(self, name: str, step: int, steps: int) -> None:
+        self._is_running = True
+        self._write()
+        if self._browser:
+            webbrowser.open((self._directory / PAGE).resolve().as_uri())
 
-    def stepped(self, step: int) -> None: ...
-    def said(self, message: str) -> None: ...
+    def on_step(self, step: int) -> None: ...
+    def on_message(self, message: str) -> None: ...
 
-    def evaluated(self, metrics: Metrics) -> None:
-        self.draw()
+    def on_evaluation(self, metrics: Metrics) -> None:
+        self._write()
 
-    def stopped(self) -> None:
-        if self.running:
-            self.running = False
-            self.draw()
+    def on_stop(self) -> None:
+        if self._is_running:
+            self._is_running = False
+            self._write()
 
-    def draw(self) -> None:
-        """Write the page for the current state of the run."""
+    def _write(self) -> None:
         with suppress(LareError):
-            run = read_measured(self.directory)
-            task, method = run.config.task, run.config.settings.method
-            if self.random is None:
-                self.random = random_returns(task)
-            title = f"{task.name}: {method}"
-            parts = [f"<h1>{escape(title)}</h1>"]
-            if metrics := run.metrics():
-                parts += [*verdicts({method: run}, self.random), *learning(task.name, {method: run}, self.random)]
-                done = metrics[-1]["step"]
-            else:
-                done = 0
-            state = f"reloaded every {REFRESH} seconds" if self.running else "not running"
-            parts.append(
-                note(
-                    f"Step {done:,} of {run.config.settings.steps:,}; {state}. lare-rl report draws credit and factors too."
+            run = open_without_functions(self._directory)
+            task, settings = run.config.task, run.config.settings
+            if self._random_returns is None:
+                self._random_returns = measure_random_returns(task)
+            reported = ReportedRun(settings.method, run)
+            title = f"{task.name}: {settings.method}"
+            sections = [f"<h1>{escape(title)}</h1>"]
+            if reported.metrics:
+                sections += render_diagnoses([reported], self._random_returns)
+                sections += render_learning_curves(task, [reported], self._random_returns)
+            step = reported.metrics[-1]["step"] if reported.metrics else 0
+            state = f"reloaded every {REFRESH_S} seconds" if self._is_running else "not running"
+            sections.append(
+                render_note(
+                    f"Step {step:,} of {settings.steps:,}; {state}. lare-rl report draws credit and factors too."
                 )
             )
-            write_page(self.directory / PAGE, title, "\n".join(parts), REFRESH if self.running else None)
+            write_page(self._directory / PAGE, title, "\n".join(sections), REFRESH_S if self._is_running else None)

@@ -1,4 +1,4 @@
-"""The policy of each seed's best evaluation, kept beside the last checkpoint.
+"""The policy of each seed's best evaluation, saved next to the last checkpoint.
 
     checkpoint/best.npz     the arrays that are needed to act; score and step of each seed
 
@@ -6,7 +6,6 @@ The best of many evaluations overestimates its policy. So `lare-rl evaluate --be
 has used.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,67 +14,72 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lare_rl.errors import LareError
-from lare_rl.runs.checkpoint import DAMAGED, fill, named_leaves, opened
+from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
 from lare_rl.util.files import write_atomically
+from lare_rl.util.renamed_fields import rename_fields
 
-FILE = "best.npz"
+__all__ = ["BEST_FILE", "BestPolicy", "empty_best", "load_best", "save_best", "update_best"]
+
+BEST_FILE = "best.npz"
 
 
-class Best(NamedTuple):
-    """The best evaluation of each seed."""
+class BestPolicy(NamedTuple):
+    """The policy of each seed's best evaluation."""
 
     score: Float[np.ndarray, " seeds"]
-    """The mean return of its best evaluation; -inf before the first."""
+    """The mean return of the best evaluation; -inf before the first."""
     step: Int[np.ndarray, " seeds"]
     """The environment step of that evaluation."""
     actor: Any
-    """The arrays that are needed to act as in that evaluation. None before the first one."""
+    """The arrays that are needed to act as in that evaluation; None before the first."""
 
 
-def none_yet(seeds: int) -> Best:
-    """The state before the first evaluation."""
-    return Best(np.full(seeds, -np.inf), np.zeros(seeds, np.int64), None)
+def empty_best(n_seeds: int) -> BestPolicy:
+    """Return the state before the first evaluation."""
+    return BestPolicy(np.full(n_seeds, -np.inf), np.zeros(n_seeds, np.int64), None)
 
 
-def better_of(best: Best, score: Float[np.ndarray, " seeds"], step: int, actor: Any) -> Best:
-    """For each seed, the newest policy if its evaluation is better than all earlier ones, else the old one. NaN is never better."""
-    better = np.asarray(score) > best.score
-    if best.actor is None:
-        kept = jax.tree.map(np.asarray, actor)
-    else:
+def update_best(best: BestPolicy, score: Float[np.ndarray, " seeds"], step: int, actor: Any) -> BestPolicy:
+    """Replace the policy of each seed whose evaluation is better than all earlier ones. NaN is never better."""
+    is_better = np.asarray(score) > best.score
 
-        def chosen(old: Any, new: Any) -> np.ndarray:
-            return np.where(better.reshape(-1, *[1] * (old.ndim - 1)), np.asarray(new), np.asarray(old))
+    def choose(old: Any, new: Any) -> np.ndarray:
+        return np.where(is_better.reshape(-1, *[1] * (old.ndim - 1)), np.asarray(new), np.asarray(old))
 
-        kept = jax.tree.map(chosen, best.actor, actor)
-    return Best(np.where(better, score, best.score), np.where(better, step, best.step), kept)
+    old_actor = actor if best.actor is None else best.actor
+    return BestPolicy(
+        score=np.where(is_better, score, best.score),
+        step=np.where(is_better, step, best.step),
+        actor=jax.tree.map(choose, old_actor, actor),
+    )
 
 
-def save(directory: Path, best: Best) -> None:
-    """Write it into a checkpoint's directory. Raises `LareError` if it cannot be written."""
+def save_best(directory: Path, best: BestPolicy) -> None:
+    """Write the best policies into a checkpoint's directory. Raises `LareError` if they cannot be written."""
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(best).items()}
     directory.mkdir(exist_ok=True)
-    write_atomically(directory / FILE, lambda file: np.savez(file, allow_pickle=False, **arrays))
+    write_atomically(directory / BEST_FILE, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
-def load(directory: Path, shapes: Any, seeds: Sequence[int]) -> Best:
-    """Read it from a checkpoint's directory.
+def load_best(directory: Path, actor_shape: Any, n_seeds: int) -> BestPolicy:
+    """Read the best policies from a checkpoint's directory.
 
     Args:
         directory: the directory of the checkpoint.
-        shapes: an actor, whose leaves may be only shapes.
-        seeds: the seeds of the run.
+        actor_shape: an actor, whose leaves may be shapes.
+        n_seeds: the number of seeds.
 
     Raises:
         LareError: there is no such file, or it has another structure.
     """
-    path = directory / FILE
+    path = directory / BEST_FILE
     if not path.is_file():
         raise LareError(
             f"there is no {path}: the run has not been evaluated yet, trains several teams, or is of an older version"
         )
     try:
-        with opened(path) as saved:
-            return fill(none_yet(len(seeds))._replace(actor=shapes), saved)
-    except DAMAGED as error:
+        with open_npz(path) as arrays:
+            renamed = {rename_fields(name): arrays[name] for name in arrays.files}
+            return fill_template(empty_best(n_seeds)._replace(actor=actor_shape), renamed)
+    except DAMAGED_FILE_ERRORS as error:
         raise LareError(f"{path} cannot be read: {error or type(error).__name__}") from error

@@ -4,7 +4,7 @@
       rows-0.npz, rows-1.npz, ...   the replay's rows, in the order in which they came; each is written once
       state.npz                     everything else, and the list of the row files in use
 
-Row files are only added. A new `state.npz` is written beside the old one, and then replaces it. So `state.npz` always lists
+Row files are only added. A new `state.npz` is written next to the old one, and then replaces it. So `state.npz` always lists
 complete row files. No pickle anywhere.
 """
 
@@ -14,41 +14,43 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import numpy as np
 
-from lare_rl.errors import LareError, shortened
+from lare_rl.errors import LareError, short_repr
 from lare_rl.util.files import write_atomically
+from lare_rl.util.renamed_fields import rename_fields
 from lare_rl.util.safe_io import read_json
 
-STATE = "state.npz"
+__all__ = [
+    "DAMAGED_FILE_ERRORS",
+    "STATE_FILE",
+    "fill_template",
+    "load",
+    "named_leaves",
+    "open_npz",
+    "read_host_state",
+    "save",
+]
 
-REPLAY = ".replay."
-"""The part of the state that holds the replay."""
+STATE_FILE = "state.npz"
 
-BY_ROW = f"{REPLAY}columns"
-"""The part of the replay that is saved by row."""
-
-DAMAGED = (
-    *(
-        OSError,
-        ValueError,
-        KeyError,
-        EOFError,
-        NotImplementedError,
-        zipfile.BadZipFile,
-        zlib.error,
-        tokenize.TokenError,
-    ),
-    *(TypeError, IndexError, AttributeError, OverflowError, MemoryError, SyntaxError),
+DAMAGED_FILE_ERRORS = (
+    *(OSError, ValueError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error),
+    *(tokenize.TokenError, TypeError, IndexError, AttributeError, OverflowError, MemoryError, SyntaxError),
 )
 """Errors that may be raised by reading a file that is damaged, or holds something else."""
 
-LARGEST_COUNT = 2**53
-"""The largest count in a checkpoint."""
+REPLAY = ".replay."
+"""The path of the replay within the state."""
+SAVED_BY_ROW = f"{REPLAY}columns"
+"""The path of the arrays that are saved by row."""
+
+MAX_COUNT = 2**53
 
 
 @runtime_checkable
@@ -64,161 +66,133 @@ class WithReplay(Protocol):
     def _replace(self, **changes: Any) -> Any: ...
 
 
-Some = TypeVar("Some", bound=WithReplay)
-Filled = TypeVar("Filled")
+State = TypeVar("State", bound=WithReplay)
+Template = TypeVar("Template")
 
 
-@contextlib.contextmanager
-def opened(path: Path) -> Iterator[Any]:
-    """The arrays of a file, which must not be compressed. A damaged file is closed too, unlike by `numpy.load` alone."""
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as saved:
-        if not isinstance(saved, np.lib.npyio.NpzFile):
-            raise ValueError("it holds a single array")
-        check_stored(file)
-        yield saved
+@dataclass(frozen=True)
+class _Segment:
+    """A file of rows."""
+
+    number: int
+    """The number in the file's name."""
+    start: list[Any]
+    """The number of the first row, of each environment of each seed."""
+    count: list[Any]
+    """The number of rows, of each environment of each seed."""
 
 
-def check_stored(file: Any) -> None:
-    """Raise `ValueError` if an archive has a packed entry, because a few bytes can unpack to gigabytes."""
-    with zipfile.ZipFile(file) as archive:
-        for entry in archive.infolist():
-            if entry.compress_type != zipfile.ZIP_STORED:
-                raise ValueError(f"{entry.filename} is packed, which no checkpoint is")
-
-
-def counted(value: Any) -> Any:
-    """A count, or nested lists of counts, unchanged. Raises `ValueError` for anything else."""
-    if isinstance(value, list):
-        return [counted(one) for one in value]
-    if type(value) is not int or not 0 <= value <= LARGEST_COUNT:
-        raise ValueError(f"{shortened(value)} is not a count")
-    return value
-
-
-def read_host(text: Any) -> dict[str, Any]:
-    """The other data of a checkpoint, from JSON. Raises `ValueError` if they are not valid."""
-    host = read_json(str(text))
-    if not isinstance(host, dict):
-        raise ValueError("host is no object")
-    counted([host[name] for name in ("step", "metrics_length", "functions_since") if name in host])
-    digests = host.get("function_sha256", [])
-    if not (isinstance(digests, list) and all(isinstance(one, str) for one in digests)):
-        raise ValueError("function_sha256 is no list of texts")
-    return host
-
-
-def read_segments(text: Any) -> list[dict[str, Any]]:
-    """The list of the row files in use. Raises `ValueError` like `read_host`."""
-    return [{name: counted(one[name]) for name in ("number", "start", "count")} for one in read_json(str(text))]
-
-
-def named_leaves(learner: Any) -> dict[str, Any]:
-    """Every array of the state by its path, except the arrays that are saved by row."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(learner)
-    named = {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
-    return {name: leaf for name, leaf in named.items() if not name.startswith(BY_ROW)}
-
-
-@jax.jit
-def take(columns: dict[str, jax.Array], index: jax.Array) -> dict[str, jax.Array]:
-    """Rows of every environment of every seed."""
-    of_env = jax.vmap(jax.vmap(lambda rows, where: rows[where]))
-    return {name: of_env(column, index) for name, column in columns.items()}
-
-
-def save(
-    directory: Path,
-    learner: WithReplay,
-    host: Mapping[str, Any],
-    arrays: Mapping[str, np.ndarray],
-    anew: bool = False,
-) -> None:
+def save(directory: Path, learner: WithReplay, host: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Write a checkpoint.
 
     Args:
+        directory: the directory of the checkpoint.
+        learner: the training state.
         host: other data to save, as JSON.
         arrays: other data to save, as arrays.
-        anew: whether rows that were saved before have changed, so that all rows are saved again.
+
+    Raises:
+        LareError: it cannot be written.
     """
     directory.mkdir(exist_ok=True)
-    for left in directory.glob("*.new"):  # by a process that was killed while it wrote
-        left.unlink(missing_ok=True)
-    buffer, rows = learner.replay, capacity(learner)
-    end = np.asarray(buffer.next_row)
-    start, segments, old = np.zeros_like(end), [], []
-    if (directory / STATE).exists():
-        with opened(directory / STATE) as saved:
-            start, segments = saved[".replay.next_row"], read_segments(saved["segments"])
-    number = segments[-1]["number"] + 1 if segments else 0
-    if anew:
-        start, segments, old = np.maximum(end - rows + 1, 0), [], segments
+    for partial_file in directory.glob("*.new"):  # of a process that was killed while it wrote
+        partial_file.unlink(missing_ok=True)
+    capacity, end = _capacity(learner), np.asarray(learner.replay.next_row)
+    start, segments = np.zeros_like(end), []
+    if (directory / STATE_FILE).exists():
+        with open_npz(directory / STATE_FILE) as saved:
+            start, segments = saved[".replay.next_row"], _read_segments(saved["segments"])
     # The last saved row is saved again, because it held only the newest observation then. And if an episode has just
     # been dropped, `end` is smaller than before.
     start = np.minimum(start, end)
     count = end - start + 1
     width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations
-    taken = take(buffer.columns, (start[..., None] + np.arange(width)) % rows)
-    segment = {name: np.asarray(values)[:, :, : count.max()] for name, values in taken.items()}
-    write_atomically(directory / f"rows-{number}.npz", lambda file: np.savez(file, allow_pickle=False, **segment))
-    segments.append({"number": number, "start": start.tolist(), "count": count.tolist()})
-    alive = [one for one in segments if np.any(np.add(one["start"], one["count"]) > end - rows)]
+    rows = _read_rows(learner.replay.columns, (start[..., None] + np.arange(width)) % capacity)
+    segment_arrays = {name: np.asarray(values)[:, :, : count.max()] for name, values in rows.items()}
+    number = segments[-1].number + 1 if segments else 0
+    path = directory / f"rows-{number}.npz"
+    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **segment_arrays))
+    segments.append(_Segment(number, start.tolist(), count.tolist()))
+    in_use = [segment for segment in segments if np.any(np.add(segment.start, segment.count) > end - capacity)]
     state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner).items()} | dict(arrays)
-    state |= {"host": np.array(json.dumps(host)), "segments": np.array(json.dumps(alive))}
-    write_atomically(directory / STATE, lambda file: np.savez(file, allow_pickle=False, **state))
-    for one in old + segments:
-        if one not in alive:  # not always the oldest ones: a segment from before a drop may reach further
-            (directory / f"rows-{one['number']}.npz").unlink(missing_ok=True)
+    state["host"] = np.array(json.dumps(host))
+    state["segments"] = np.array(json.dumps([asdict(segment) for segment in in_use]))
+    write_atomically(directory / STATE_FILE, lambda file: np.savez(file, allow_pickle=False, **state))
+    for segment in segments:
+        if segment not in in_use:  # not always the oldest ones: a segment from before a drop may reach further
+            (directory / f"rows-{segment.number}.npz").unlink(missing_ok=True)
 
 
-def capacity(learner: WithReplay) -> int:
-    """Rows of each environment."""
-    return next(iter(learner.replay.columns.values())).shape[2]
+def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[str, np.ndarray]]:
+    """Read a checkpoint.
 
+    Args:
+        directory: the directory of the checkpoint.
+        template: a training state of the same structure, whose leaves may be shapes.
 
-def load(directory: Path, template: Some) -> tuple[Some, dict[str, Any], dict[str, np.ndarray]]:
-    """Read a checkpoint into a learner of the structure of `template` (whose leaves may be only shapes).
-
-    Returns the learner, and `host` and `arrays` as saved.
+    Returns:
+        The training state, and `host` and `arrays` as saved.
 
     Raises:
         LareError: there is no checkpoint, or it has another structure.
     """
-    path = directory / STATE
+    path = directory / STATE_FILE
     if not path.is_file():
         raise LareError(f"there is no checkpoint in {directory}")
     try:
-        with opened(path) as saved:
-            state = {name: saved[name] for name in saved.files}
-        host, segments = read_host(state.pop("host")), read_segments(state.pop("segments"))
-        learner = with_rows(fill(template, state), directory, segments)
-    except DAMAGED as error:
+        with open_npz(path) as saved:
+            state = {rename_fields(name): saved[name] for name in saved.files}
+        host, segments = _read_host(state.pop("host")), _read_segments(state.pop("segments"))
+        learner = _load_rows(fill_template(template, state), directory, segments)
+    except DAMAGED_FILE_ERRORS as error:
         raise LareError(f"the checkpoint {path} cannot be read: {error or type(error).__name__}") from error
     return learner, host, {name: array for name, array in state.items() if not name.startswith(".")}
 
 
-def saved_host(directory: Path) -> dict[str, Any] | None:
-    """The `host` of the last checkpoint; None if there is none that can be read."""
+def read_host_state(directory: Path) -> dict[str, Any] | None:
+    """Read the `host` of the last checkpoint. Return None if there is no checkpoint that can be read."""
     try:
-        with opened(directory / STATE) as saved:
-            return read_host(saved["host"])
-    except DAMAGED:
+        with open_npz(directory / STATE_FILE) as saved:
+            return _read_host(saved["host"])
+    except DAMAGED_FILE_ERRORS:
         return None
 
 
-def fill(template: Filled, state: Mapping[str, np.ndarray]) -> Filled:
-    """The template with the saved arrays for its leaves. A leaf that is a NumPy array stays one, and may have 64 bits.
+@contextlib.contextmanager
+def open_npz(path: Path) -> Iterator[Any]:
+    """Open the arrays of a file, which must not be compressed. A damaged file is closed too, unlike by `numpy.load` alone."""
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        if not isinstance(arrays, np.lib.npyio.NpzFile):
+            raise ValueError("it holds a single array")
+        with zipfile.ZipFile(file) as archive:
+            for entry in archive.infolist():
+                if entry.compress_type != zipfile.ZIP_STORED:  # a few bytes can unpack to gigabytes
+                    raise ValueError(f"{entry.filename} is packed, which no checkpoint is")
+        yield arrays
 
-    Raises `ValueError` where a shape or a type differs, `KeyError` where an array is missing.
+
+def named_leaves(state: Any) -> dict[str, Any]:
+    """Return every array of a state by its path, except the arrays that are saved by row."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
+    by_path = {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
+    return {name: leaf for name, leaf in by_path.items() if not name.startswith(SAVED_BY_ROW)}
+
+
+def fill_template(template: Template, arrays: Mapping[str, np.ndarray]) -> Template:
+    """Replace the leaves of a template by saved arrays. A leaf that is a NumPy array stays one, and may have 64 bits.
+
+    Raises:
+        ValueError: a shape or a type differs.
+        KeyError: an array is missing.
     """
-    known = named_leaves(template)
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     filled = []
     for path, leaf in leaves:
         name = jax.tree_util.keystr(path)
-        if name not in known:
+        if name.startswith(SAVED_BY_ROW):
             filled.append(leaf)
             continue
-        array = grown(state[name], leaf.shape) if name.startswith(REPLAY) else state[name]
+        array = _pad_rows(arrays[name], leaf.shape) if name.startswith(REPLAY) else arrays[name]
         if array.shape != leaf.shape:
             raise ValueError(f"{name} has shape {array.shape}, not {leaf.shape}")
         if array.dtype != leaf.dtype:
@@ -227,31 +201,69 @@ def fill(template: Filled, state: Mapping[str, np.ndarray]) -> Filled:
     return jax.tree.unflatten(structure, filled)
 
 
-def grown(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """An array of a smaller replay, padded with zeros at the end; any other array unchanged.
+def _pad_rows(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Pad an array of a smaller replay with zeros. Return any other array unchanged.
 
-    A run that was extended may have a larger replay. The smaller one had room for every step, so that its rows have the same
-    places in the larger one.
+    A run that was extended may have a larger replay. The smaller one had room for every step, so its rows keep their places.
     """
     seeds_envs, rows, rest = array.shape[:2], array.shape[2:3], array.shape[3:]
     if not rows or (seeds_envs, rest) != (shape[:2], shape[3:]) or rows > shape[2:3]:
         return array
-    behind = np.zeros((*seeds_envs, shape[2] - rows[0], *rest), array.dtype)
-    return np.concatenate([array, behind], axis=2)
+    padding = np.zeros((*seeds_envs, shape[2] - rows[0], *rest), array.dtype)
+    return np.concatenate([array, padding], axis=2)
 
 
-def with_rows(learner: Some, directory: Path, segments: list[dict[str, Any]]) -> Some:
-    rows, columns = capacity(learner), dict(learner.replay.columns)
+def _load_rows(learner: State, directory: Path, segments: list[_Segment]) -> State:
+    capacity, columns = _capacity(learner), dict(learner.replay.columns)
     for name, column in columns.items():  # one after the other, so that only one of them is in memory twice
         buffer = np.zeros(column.shape, column.dtype)
         for segment in segments:
-            with opened(directory / f"rows-{segment['number']}.npz") as saved:
+            with open_npz(directory / f"rows-{segment.number}.npz") as saved:
                 values = saved[name]
-            counts = np.asarray(segment["count"])
-            for place in np.ndindex(counts.shape):
-                # Of a segment longer than the buffer only the end is left, as in the buffer itself.
-                first, count = int(np.asarray(segment["start"])[place]), int(counts[place])
-                where = np.arange(first, first + count)[-rows:]
-                buffer[(*place, where % rows)] = values[place][:count][-rows:]
+            counts = np.asarray(segment.count)
+            for env in np.ndindex(counts.shape):
+                # Of a segment longer than the replay, only the end is in use, as in the replay itself.
+                start, count = int(np.asarray(segment.start)[env]), int(counts[env])
+                rows = np.arange(start, start + count)[-capacity:]
+                buffer[(*env, rows % capacity)] = values[env][:count][-capacity:]
         columns[name] = jax.device_put(buffer)
     return learner._replace(replay=learner.replay._replace(columns=columns))
+
+
+@jax.jit
+def _read_rows(columns: dict[str, jax.Array], rows: jax.Array) -> dict[str, jax.Array]:
+    """Return rows of every environment of every seed."""
+    read = jax.vmap(jax.vmap(lambda column, env_rows: column[env_rows]))
+    return {name: read(column, rows) for name, column in columns.items()}
+
+
+def _capacity(learner: WithReplay) -> int:
+    """Return the number of rows of each environment."""
+    return next(iter(learner.replay.columns.values())).shape[2]
+
+
+def _read_host(text: Any) -> dict[str, Any]:
+    """Read the data that are saved as JSON. Raise `ValueError` if they are not valid."""
+    host = read_json(str(text))
+    if not isinstance(host, dict):
+        raise ValueError("host is no object")
+    _check_counts([host[name] for name in ("step", "metrics_length") if name in host])
+    digests = host.get("function_sha256", [])
+    if not (isinstance(digests, list) and all(isinstance(digest, str) for digest in digests)):
+        raise ValueError("function_sha256 is no list of texts")
+    return host
+
+
+def _read_segments(text: Any) -> list[_Segment]:
+    """Read the list of the row files in use. Raise `ValueError` if it is not valid."""
+    names = ("number", "start", "count")
+    return [_Segment(**{name: _check_counts(values[name]) for name in names}) for values in read_json(str(text))]
+
+
+def _check_counts(value: Any) -> Any:
+    """Return a count, or nested lists of counts, unchanged. Raise `ValueError` for anything else."""
+    if isinstance(value, list):
+        return [_check_counts(element) for element in value]
+    if type(value) is not int or not 0 <= value <= MAX_COUNT:
+        raise ValueError(f"{short_repr(value)} is not a count")
+    return value

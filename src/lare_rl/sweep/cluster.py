@@ -3,17 +3,25 @@
 import logging
 from collections.abc import Generator, Sequence
 
-from lare_rl.errors import LareError, needs_extra
-from lare_rl.sweep.jobs import Job, as_json, train_one
+from lare_rl.errors import LareError, missing_extra_error
+from lare_rl.sweep.jobs import Job, job_to_json, train_job
+
+__all__ = ["train_on_ray"]
 
 
-def on_ray(jobs: Sequence[Job], cores: int, address: str) -> Generator[tuple[Job, str | None], None, None]:
-    """Train on a Ray cluster, each run on `cores` cores. All machines must share the directory of the runs."""
+def train_on_ray(jobs: Sequence[Job], cores: int, address: str) -> Generator[tuple[Job, str | None], None, None]:
+    """Train jobs on a Ray cluster, each on `cores` cores. Yield each job when it ends, and its error or None.
+
+    All machines must share the directory of the runs.
+
+    Raises:
+        LareError: Ray is not installed, or cannot be reached.
+    """
     try:
         import ray
         from ray.exceptions import RayError
     except ImportError:
-        raise needs_extra("a Ray cluster", "ray") from None
+        raise missing_extra_error("a Ray cluster", "ray") from None
     try:
         ray.init(
             None if address == "local" else address,
@@ -24,13 +32,13 @@ def on_ray(jobs: Sequence[Job], cores: int, address: str) -> Generator[tuple[Job
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise LareError(f"there is no Ray cluster at {address}: {error}") from error
     try:
-        remote = ray.remote(num_cpus=cores, max_calls=1)(train_one)
-        waiting = {remote.remote(as_json(job)): job for job in jobs}
-        while waiting:
-            (ended,), _ = ray.wait(list(waiting), num_returns=1)
-            job = waiting.pop(ended)
+        remote = ray.remote(num_cpus=cores, max_calls=1)(train_job)
+        pending = {remote.remote(job_to_json(job)): job for job in jobs}
+        while pending:
+            (task,), _ = ray.wait(list(pending), num_returns=1)
+            job = pending.pop(task)
             try:
-                ray.get(ended)
+                ray.get(task)
                 yield job, None
             except RayError as error:
                 yield job, str(error).strip().splitlines()[-1]

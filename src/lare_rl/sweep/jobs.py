@@ -1,4 +1,4 @@
-"""Planned runs (jobs): the directory of each, how far it is, and how it is trained."""
+"""Planned runs (jobs): their directories, their progress, and their training."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,17 +6,22 @@ from pathlib import Path
 from typing import Any
 
 import lare_rl
-from lare_rl.config.resolve import decide
+from lare_rl.config.effective import effective_settings
+from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.credit.methods import find_method
-from lare_rl.envs.families import env_spec
+from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError
-from lare_rl.latent.candidates import CANDIDATES
 from lare_rl.latent.design import check_recorded
-from lare_rl.runs.checkpoint import saved_host
-from lare_rl.runs.directory import CHECKPOINT, CONFIG, read_config, read_metrics
+from lare_rl.llm.prompts import N_CANDIDATES
+from lare_rl.runs.checkpoint import read_host_state
+from lare_rl.runs.config_file import CONFIG, read_config
+from lare_rl.runs.directory import CHECKPOINT
+from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training.train import chosen_functions
+from lare_rl.training.latent_functions import choose_functions
+
+__all__ = ["Job", "check_job", "job_to_json", "make_job", "train_job"]
 
 
 @dataclass(frozen=True)
@@ -29,85 +34,99 @@ class Job:
     """As the user gave them."""
     resolved: ResolvedSettings
     functions: tuple[Path, ...] = ()
-    """Files of latent functions to use instead of recorded ones: one for each team."""
+    """Files of latent functions instead of the recorded ones, one for each team."""
 
     @property
     def name(self) -> str:
+        """TASK/METHOD-ALGORITHM."""
         return f"{self.directory.parent.name}/{self.directory.name}"
 
+    @property
+    def started(self) -> bool:
+        """Whether the directory of the run exists."""
+        return (self.directory / CONFIG).is_file()
+
     def step(self) -> int:
-        """The step of the checkpoint; without one, of the last evaluation, or 0."""
-        if (saved := saved_host(self.directory / CHECKPOINT)) is not None:
-            return saved["step"]
+        """Return the step of the checkpoint or, without one, of the last evaluation. Raises `LareError` for a damaged run."""
+        if (checkpoint := read_host_state(self.directory / CHECKPOINT)) is not None:
+            return checkpoint["step"]
         lines = read_metrics(self.directory)
         return lines[-1]["step"] if lines else 0
 
     @property
     def done(self) -> bool:
-        """Whether every seed has reached the last step, and so has the checkpoint, if there is one."""
-        if not self.begun:
+        """Whether every seed has reached the last step. False for a damaged run, whose error is reported when it is trained."""
+        last_step = self.resolved.steps
+        try:
+            seeds = {line["seed"] for line in read_metrics(self.directory) if line["step"] == last_step}
+        except LareError:
             return False
-        ended = {line["seed"] for line in read_metrics(self.directory) if line["step"] == self.resolved.steps}
-        saved = saved_host(self.directory / CHECKPOINT)
-        return ended == set(self.resolved.all_seeds) and (saved is None or saved["step"] == self.resolved.steps)
+        checkpoint = read_host_state(self.directory / CHECKPOINT)
+        return (
+            self.started
+            and seeds == set(self.resolved.all_seeds)
+            and (checkpoint is None or checkpoint["step"] == last_step)
+        )
 
-    @property
-    def begun(self) -> bool:
-        return (self.directory / CONFIG).is_file()
 
+def make_job(root: Path, task: TaskSpec, settings: Settings, functions: Sequence[Path] = ()) -> Job:
+    """Plan a run in ROOT/TASK/METHOD-ALGORITHM[-drawK][-candidatesN]. Raises `LareError` if settings and task do not fit together.
 
-def job_of(root: Path, task: TaskSpec, settings: Settings, functions: Sequence[Path] = ()) -> Job:
-    """The job in ROOT/TASK/METHOD-ALGORITHM. The name of a recorded function's draw, and of an unusual number of candidates,
-    follows.
+    The endings name a recorded function, unless `functions` replace it.
     """
-    resolved = decide(settings, task)
-    ending = ""
-    latent = find_method(resolved.method).latent
-    if latent and not functions:
-        ending = f"-draw{resolved.draw}"
-        ending += f"-candidates{resolved.candidates}" if resolved.candidates != CANDIDATES else ""
-    name = f"{resolved.method}-{resolved.algorithm}{ending}"
-    return Job(root / task.name / name, task, settings, resolved, tuple(functions) if latent else ())
+    resolved = resolve(settings, task)
+    name = f"{resolved.method}-{resolved.algorithm}"
+    needs_phi = find_method(resolved.method).needs_phi
+    if needs_phi and not functions:
+        name += f"-draw{resolved.draw}"
+        name += f"-candidates{resolved.candidates}" if resolved.candidates != N_CANDIDATES else ""
+    return Job(
+        directory=root / task.name / name,
+        task=task,
+        settings=settings,
+        resolved=resolved,
+        functions=tuple(functions) if needs_phi else (),
+    )
 
 
-def check(job: Job) -> None:
-    """Raise `LareError` if a job could not be trained, or if its directory holds something else."""
+def check_job(job: Job) -> None:
+    """Raise `LareError` if a job could not be trained, or if its directory holds another run or other files."""
     method = find_method(job.resolved.method)
-    functions = chosen_functions(job.task, job.resolved, job.functions) if job.functions else ()
-    if job.begun:
-        config = read_config(job.directory)
-        if config.task.digest != job.task.digest:
-            raise LareError(f"{job.directory} holds a run of another task: choose another out")
-        theirs, ours = config.settings.in_force(config.task), job.resolved.in_force(job.task)
-        if differing := [name for name in ours if theirs.get(name) != ours[name]]:
-            name = differing[0]
+    functions = choose_functions(job.task, job.resolved, job.functions) if job.functions else ()
+    if not job.started:
+        if job.directory.exists():
+            raise LareError(f"{job.directory} exists, and is not a run: choose another out")
+        for role in job.task.roles if method.needs_phi and not functions else ():
+            check_recorded(role, method.phi_kind, job.resolved.draw, job.resolved.candidates)
+        return
+    config = read_config(job.directory)
+    if config.task.digest != job.task.digest:
+        raise LareError(f"{job.directory} holds a run of another task: choose another out")
+    old, new = effective_settings(config.settings, config.task), effective_settings(job.resolved, job.task)
+    for name, value in new.items():
+        if old.get(name) != value:
             raise LareError(
-                f"{job.directory} holds a run with {name} = {theirs.get(name)}, and {ours[name]} is asked for: choose another out"
+                f"{job.directory} holds a run with {name} = {old.get(name)}, not {value}: choose another out"
             )
-        if functions and config.function_sha256 != tuple(function.digest for function in functions):
-            raise LareError(f"{job.directory} holds a run with another latent function: choose another out")
-    elif job.directory.exists():
-        raise LareError(f"{job.directory} exists, and is not a run: choose another out")
-    else:
-        for role in job.task.roles if method.latent and not functions else ():
-            check_recorded(role, method.kind, job.resolved.draw, job.resolved.candidates)
+    if functions and config.function_sha256 != tuple(function.digest for function in functions):
+        raise LareError(f"{job.directory} holds a run with another latent function: choose another out")
 
 
-def as_json(job: Job) -> dict[str, Any]:
+def job_to_json(job: Job) -> dict[str, Any]:
+    """Describe a job for `train_job` in another process."""
     return {
         "directory": str(job.directory.absolute()),
         "task": job.task.model_dump(mode="json"),
-        "settings": job.settings.model_dump(mode="json"),
+        "settings": job.settings.model_dump(mode="json", exclude_unset=True),
         "functions": [str(path.absolute()) for path in job.functions],
     }
 
 
-def train_one(order: dict[str, Any]) -> None:
-    """Begin a run, or resume it."""
-    directory = Path(order["directory"])
+def train_job(job: dict[str, Any]) -> None:
+    """Train the run that `job_to_json` describes, or resume it."""
+    directory, task = Path(job["directory"]), TaskSpec(**job["task"])
     if (directory / CONFIG).is_file():
-        env_spec(TaskSpec(**order["task"]))  # imports the module of the user's task, so that the run may too
+        load_env_spec(task)  # imports the module of the user's environment, so that `resume` trusts it
         lare_rl.resume(directory)
     else:
-        settings = Settings(**order["settings"])
-        lare_rl.train(TaskSpec(**order["task"]), settings, function=order["functions"] or None, out=directory)
+        lare_rl.train(task, Settings(**job["settings"]), function=job["functions"] or None, out=directory)

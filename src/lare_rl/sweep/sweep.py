@@ -1,7 +1,7 @@
-"""Many runs from one file: tasks x methods x algorithms x draws, the seeds of each in lockstep, each run a process of its own.
+"""Sweeps: runs of tasks x methods x algorithms x draws from one file. All seeds of a run are trained in one process.
 
-Finished runs are left alone, runs that have begun continue from their checkpoints, and missing runs are trained. So the same
-command completes a sweep that was killed, and extends one whose file lists more runs than before.
+Finished runs are skipped, unfinished runs continue from their checkpoints. So the same command continues a sweep that was killed,
+and extends a sweep whose file lists more runs than before.
 """
 
 import contextlib
@@ -12,22 +12,24 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from lare_rl.algorithms.table import Name
-from lare_rl.config.settings import Settings, set_in_vain
+from lare_rl.config.effective import unused_settings
+from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.load import load_task
-from lare_rl.errors import Checked, LareError
-from lare_rl.sweep.cluster import on_ray
-from lare_rl.sweep.jobs import Job, check, job_of
-from lare_rl.sweep.processes import in_processes
-from lare_rl.training.train import Interrupted
-from lare_rl.util.safe_io import LARGEST_SETTINGS, read_text, read_toml
+from lare_rl.errors import CheckedModel, LareError
+from lare_rl.sweep.cluster import train_on_ray
+from lare_rl.sweep.jobs import Job, check_job, make_job
+from lare_rl.sweep.processes import train_in_processes
+from lare_rl.training.loop import RunInterruptedError
+from lare_rl.util.safe_io import MAX_SETTINGS_BYTES, read_text, read_toml
+
+__all__ = ["Resources", "Sweep", "read_sweep", "run_sweep"]
 
 Texts = Annotated[tuple[str, ...], Field(min_length=1)]
 Draws = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
-class Share(Checked):
+class Resources(CheckedModel):
     """The part of the machine that runs use."""
 
     processes: Annotated[int, Field(ge=1)] = 1
@@ -36,13 +38,13 @@ class Share(Checked):
     """Cores of each run."""
 
 
-class Sweep(Share):
+class Sweep(Resources):
     """The contents of the file. Paths are relative to it."""
 
     tasks: Texts
     """Shipped names, or paths of task files."""
     methods: Texts
-    algorithms: tuple[Name, ...] = ()
+    algorithms: tuple[str, ...] = ()
     """The default is each task's own."""
     draws: Draws = (0,)
     """Draws of the recorded replies. Methods without a latent function are trained once."""
@@ -51,109 +53,113 @@ class Sweep(Share):
     settings: dict[str, Any] = Field(default_factory=dict)
     """Other settings of `lare-rl train`, such as steps and seeds."""
     out: Path | None = None
-    """The directory for all runs. The default is `runs/NAME` beside the file NAME.toml."""
+    """The directory for all runs. The default is `runs/NAME` in the directory of the file NAME.toml."""
 
     @model_validator(mode="before")
     @classmethod
-    def settings_in_their_table(cls, values: Any) -> Any:
+    def _keys_are_in_their_tables(cls, values: Any) -> Any:
         if not isinstance(values, Mapping):
             return values
         for name in values.keys() - cls.model_fields.keys():
             if name in Settings.model_fields:
-                raise ValueError(f"{name} is a setting: put it into the table [settings]")
+                raise ValueError(f"{name} is a setting: write it into the table [settings]")
         settings = values.get("settings")
         for name in settings if isinstance(settings, Mapping) else ():
             if name in ("method", "algorithm", "draw"):
-                raise ValueError(f"{name} is not one of the settings: list {name}s above them")
+                raise ValueError(f"{name} does not belong into [settings]: write {name}s = [...] above it")
             if name in cls.model_fields:
-                raise ValueError(f"{name} is not one of the settings: write it above the table [settings]")
+                raise ValueError(f"{name} does not belong into [settings]: write it above")
         return values
 
 
 def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
-    """Read a file, and check every run that it asks for before any is begun.
+    """Read a file, and check all of its runs before any is trained.
 
     Raises:
-        LareError: it cannot be read, one of its runs could not be trained, or a setting makes no difference to any of them.
+        LareError: the file cannot be read, one of its runs could not be trained, or a setting affects none of them.
     """
-    text = read_text(path, LARGEST_SETTINGS)
+    text = read_text(path, MAX_SETTINGS_BYTES)
     try:
-        values = read_toml(text)
-        sweep = Sweep(**values)
-        jobs = list(jobs_of(sweep, path))
+        sweep = Sweep(**read_toml(text))
+        _check_functions(sweep)
+        jobs = list(_make_jobs(sweep, path))
+        directories: set[Path] = set()
+        for job in jobs:
+            if job.directory in directories:
+                raise LareError(f"{job.name} is listed twice: give two task files two names")
+            directories.add(job.directory)
+            check_job(job)
+        _check_settings(jobs)
     except (LareError, ValueError) as error:
         raise LareError(f"{path}: {error}") from error
-    places: dict[Path, Job] = {}
-    for job in jobs:
-        if places.setdefault(job.directory, job) is not job:
-            raise LareError(f"{path}: {job.name} is asked for twice; two task files need two names")
-        check(job)
-    in_vain = [set_in_vain(job.settings, job.resolved, job.task) for job in jobs]
-    for name in in_vain[0]:
-        if all(name in others for others in in_vain):
-            head = f"{name} makes no difference to "
-            whom = dict.fromkeys(others[name].removeprefix(head) for others in in_vain)
-            raise LareError(f"{path}: {head}{', nor to '.join(whom)}")
     return sweep, jobs
 
 
-def jobs_of(sweep: Sweep, path: Path) -> Iterator[Job]:
-    """Every run of a sweep, task by task."""
+def run_sweep(
+    resources: Resources, jobs: Sequence[Job], listener: Callable[[str], None], ray: str | None = None
+) -> list[Job]:
+    """Train the jobs that are not done, on this machine or on a Ray cluster. Return the jobs that failed.
+
+    Raises:
+        RunInterruptedError: the user stopped it.
+        LareError: there are not enough cores, or Ray is not available.
+    """
+    todo = [job for job in jobs if not job.done]
+    n_done = len(jobs) - len(todo)
+    listener(f"{len(jobs)} runs, {n_done} of them done")
+    if not todo:
+        return []
+    if ray is None:
+        results = train_in_processes(todo, resources.processes, resources.cores, listener)
+    else:
+        results = train_on_ray(todo, resources.cores, ray)
+    failed = []
+    try:
+        with contextlib.closing(results):
+            for number, (job, error) in enumerate(results, start=n_done + 1):
+                listener(f"{number} of {len(jobs)}: {job.name} {f'failed: {error}' if error else 'is done'}")
+                if error:
+                    failed.append(job)
+    except KeyboardInterrupt:
+        raise RunInterruptedError("stopped; all running runs were saved, and the same command continues them") from None
+    return failed
+
+
+def _check_functions(sweep: Sweep) -> None:
+    """Raise `LareError` if draws or functions affect no run."""
+    if any(find_method(method).needs_phi for method in sweep.methods):
+        return
+    for name, is_set in (("functions", bool(sweep.functions)), ("draws", sweep.draws != (0,))):
+        if is_set:
+            raise LareError(f"no method of the sweep has a latent function: leave out {name}")
+
+
+def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
+    """Plan every run of a sweep, task by task."""
     root = path.parent / (sweep.out or Path("runs") / path.stem)
     tasks = [load_task(path.parent / name if name.endswith(".toml") else name) for name in sweep.tasks]
-    if unknown := sorted(sweep.functions.keys() - {task.name for task in tasks}):
+    names = [task.name for task in tasks]
+    if unknown := sorted(sweep.functions.keys() - set(names)):
+        raise LareError(f"functions of {unknown[0]}, which is none of the tasks {', '.join(names)}")
+    if sweep.draws != (0,) and sweep.functions.keys() >= set(names):
         raise LareError(
-            f"functions of {unknown[0]}, which is none of the tasks {', '.join(task.name for task in tasks)}"
-        )
-    if not any(find_method(method).latent for method in sweep.methods):
-        for name, given in (("functions", bool(sweep.functions)), ("draws", sweep.draws != (0,))):
-            if given:
-                raise LareError(f"{name} are given, and none of the methods needs a latent function")
-    if sweep.draws != (0,) and all(task.name in sweep.functions for task in tasks):
-        raise LareError(
-            "draws choose recorded functions, and every task is given functions of its own: leave either out"
+            "draws choose recorded functions, and all tasks have functions in [functions]: leave out either"
         )
     for task, method, algorithm in product(tasks, sweep.methods, sweep.algorithms or (None,)):
         functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
-        draws = sweep.draws if find_method(method).latent and not functions else (0,)
-        for draw in draws:
+        for draw in sweep.draws if find_method(method).needs_phi and not functions else (0,):
             settings = Settings(**{**sweep.settings, "method": method, "algorithm": algorithm, "draw": draw})
             try:
-                yield job_of(root, task, settings, functions)
+                yield make_job(root, task, settings, functions)
             except LareError as error:
                 raise error if task.name in str(error) else LareError(f"on {task.name}, {error}") from error
 
 
-def is_done(job: Job) -> bool:
-    """Whether a job is done. A damaged run is not; its error is reported when it is trained."""
-    try:
-        return job.done
-    except LareError:
-        return False
-
-
-def run_sweep(share: Share, jobs: Sequence[Job], said: Callable[[str], None], ray: str | None = None) -> list[Job]:
-    """Train the jobs that are not done, on this machine or on a Ray cluster; returns the jobs that failed.
-
-    Raises:
-        Interrupted: the user stopped it.
-        LareError: there are not enough cores, or Ray is not available.
-    """
-    missing = [job for job in jobs if not is_done(job)]
-    done = len(jobs) - len(missing)
-    said(f"{len(jobs)} runs, {done} of them done")
-    if not missing:
-        return []
-    ended = (
-        in_processes(missing, share.processes, share.cores, said) if ray is None else on_ray(missing, share.cores, ray)
-    )
-    failed = []
-    try:
-        with contextlib.closing(ended):
-            for number, (job, error) in enumerate(ended, start=done + 1):
-                said(f"{number} of {len(jobs)}: {job.name} {'failed: ' + error if error else 'is done'}")
-                if error:
-                    failed.append(job)
-    except KeyboardInterrupt:
-        raise Interrupted("stopped; all running runs were saved, and the same command continues them") from None
-    return failed
+def _check_settings(jobs: Sequence[Job]) -> None:
+    """Raise `LareError` if a setting affects none of the jobs."""
+    unused = [unused_settings(job.settings, job.resolved, job.task) for job in jobs]
+    for name in unused[0]:
+        if all(name in messages for messages in unused):
+            prefix = f"{name} makes no difference to "
+            reasons = dict.fromkeys(messages[name].removeprefix(prefix) for messages in unused)
+            raise LareError(prefix + ", nor to ".join(reasons))

@@ -6,54 +6,65 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from lare_rl.errors import Checked, LareError
+from lare_rl.errors import CheckedModel, LareError
 
-Judges = Literal["before", "after", "both"]
-"""The observation by which a step is judged: the one before the action, the one after it, or both. For both, `phi` is called on
-each, and the factors are concatenated; so are the raw entries of closed-form decoders."""
+__all__ = [
+    "FILL_IN",
+    "NO_ENVIRONMENT",
+    "PETTINGZOO_PREFIX",
+    "SHARED_KEYS",
+    "CreditScope",
+    "FactorInputs",
+    "TaskSpec",
+    "require_role",
+    "select_states",
+]
+
+FactorInputs = Literal["before", "after", "both"]
+"""The observations of a step that `phi` reads: before the action, after it, or both. For both, `phi` is called on each, and the
+factors are concatenated. So are the raw features of closed-form decoders."""
 
 State = TypeVar("State")
 
 
-def judged_states(judges: Judges, before: State, after: State) -> list[State]:
-    """The states by which a step is judged, in the order in which they are concatenated."""
-    return {"before": [before], "after": [after], "both": [before, after]}[judges]
+def select_states(factor_inputs: FactorInputs, state: State, next_state: State) -> list[State]:
+    """Return the states of a step that `phi` reads, in the order in which factors are concatenated."""
+    return {"before": [state], "after": [next_state], "both": [state, next_state]}[factor_inputs]
 
 
-JudgedFrom = Literal["observation", "state"]
-"""The inputs by which a step is judged: each agent's own observation and action, or the global state and all actions, which
-are concatenated."""
+CreditScope = Literal["observation", "state"]
+"""The inputs of `phi`: each agent's observation and action, or the global state and the concatenated actions of the team."""
 
-PETTINGZOO = "pettingzoo/"
-"""The prefix of PettingZoo environments in a spec. The rest is MODULE:NAME."""
+PETTINGZOO_PREFIX = "pettingzoo/"
+"""The prefix of the names of PettingZoo environments. The rest is MODULE:NAME."""
 
-OF_THE_ENVIRONMENT = ("environment", "arguments", "max_episode_steps", "judged_from", "judges")
-"""Keys that a team inherits from its task. The team's own spec may repeat them, so that it can be used alone, but with no other
+SHARED_KEYS = ("environment", "arguments", "max_episode_steps", "judged_from", "judges")
+"""Keys that a team inherits from its task. The team's own file may repeat them, so that it can be used alone, but with the same
 values."""
 
 NO_ENVIRONMENT = "none"
-"""The value of `environment` in a spec for logs, whose environment is not available."""
+"""The value of `environment` for a task with logs only, whose environment is not available."""
 
 FILL_IN = "FILL IN"
-"""The placeholder in a new spec for texts that must still be written."""
+"""The placeholder in a draft for texts that must still be written."""
 
 
-class TaskSpec(Checked):
+class TaskSpec(CheckedModel):
     """A task: an environment and the texts that describe it."""
 
     model_config = ConfigDict(str_strip_whitespace=True)
 
     name: Annotated[str, Field(min_length=1, pattern=r"^[\w.\-]+$")]
-    """The name of the task in commands and in the names of runs."""
+    """The name of the task, in commands and in the names of runs."""
     environment: Annotated[str, Field(min_length=1)]
     """A Gymnasium id (`module:id` first imports the module that registers it), or the name of another family's environment, such as
-    `particles/CN-6`, or `none` if there are only logs: functions are then designed and logs relabelled, but nothing is trained."""
+    `particles/CN-6`, or `none` if there are only logs. Functions are then designed and logs relabelled, but nothing is trained."""
     observation_size: Annotated[int, Field(ge=1)]
     """The number of entries of an observation."""
     action_size: Annotated[int, Field(ge=1)]
-    """The number of entries of an action; if the action is a choice, the number of choices."""
-    judges: Judges = "after"
-    """By which observation a step is judged: the one before it, the one after it, or both."""
+    """The number of entries of a continuous action, or the number of discrete actions."""
+    judges: FactorInputs = "after"
+    """The observations of a step that `phi` reads: before the action, after it, or both."""
     description: Annotated[str, Field(min_length=1)]
     """The task and its goal, without a word about the reward."""
     observation: Annotated[str, Field(min_length=1)]
@@ -61,52 +72,52 @@ class TaskSpec(Checked):
     action: Annotated[str, Field(min_length=1)]
     """What each entry of the action means."""
     max_episode_steps: Annotated[int | None, Field(ge=1)] = None
-    """The time limit of an environment that has none of its own, or of the episodes of logs."""
+    """The time limit (steps) of an environment without its own limit, or of the episodes of logs."""
     score: Literal["sum", "average"] | None = None
-    """Whether the return of an episode is a sum over its steps, or an average or a grade, which does not grow with the number of
-    steps. If it is not set, training determines which of them predicts returns better."""
+    """Whether the return of an episode is a sum over its steps, or an average or grade that does not grow with its length. By
+    default, training determines which of them predicts returns better."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` whose values are averaged and reported in addition to the return."""
     arguments: dict[str, Any] = Field(default_factory=dict)
     """Keyword arguments of the environment. Only for environments that are made from a module (`pettingzoo/...`)."""
     agents: tuple[str, ...] = ()
-    """The names of the agents that this spec describes, or patterns of names such as `prey_*`; by default all agents. Only for
+    """The names of the agents that this file describes, or patterns of names such as `prey_*`. By default all agents. Only for
     environments whose agents have names (`pettingzoo/...`)."""
-    judged_from: JudgedFrom = "observation"
-    """Whether `phi` judges each agent's step by the agent's observation, or the whole team's step by the global state."""
+    judged_from: CreditScope = "observation"
+    """Whether `phi` reads each agent's observation and action, or the global state and all actions of the team."""
     teams: tuple["TaskSpec", ...] = ()
-    """If several teams learn separately: one spec for each team, with its own texts. In TOML, the names of these specs."""
+    """One task for each team, with its own texts, if several teams learn separately. In TOML, the names of their files."""
     team: str | None = None
-    """The team that this spec describes, if its environment has several teams."""
+    """The team that this file describes, if its environment has several teams."""
 
     @field_validator("arguments")
     @classmethod
-    def can_be_kept(cls, arguments: dict[str, Any]) -> dict[str, Any]:
+    def _check_arguments(cls, arguments: dict[str, Any]) -> dict[str, Any]:
         try:
             json.dumps(arguments, allow_nan=False)  # a run stores its task as JSON, which would change such values
         except (TypeError, ValueError):
-            raise ValueError("a run cannot store dates, inf or nan: use numbers, strings, lists and tables") from None
+            raise ValueError("a run cannot store dates, inf or nan. Use numbers, strings, lists and tables.") from None
         return arguments
 
     @model_validator(mode="after")
-    def is_filled_in(self) -> "TaskSpec":
+    def _check_texts(self) -> "TaskSpec":
         for key in ("description", "observation", "action"):
             if FILL_IN in getattr(self, key):
-                raise ValueError(f"{key} still says {FILL_IN!r}: replace it by what a language model must know")
+                raise ValueError(f"{key} still says {FILL_IN!r}. Replace it by what a language model must know.")
         return self
 
     @model_validator(mode="after")
-    def has_teams_of_its_environment(self) -> "TaskSpec":
+    def _check_teams(self) -> "TaskSpec":
         for role in self.teams:
             if role.environment != self.environment or role.team is None:
                 raise ValueError(
-                    f"{role.name} is not a team of {self.environment}: its spec needs the same environment, and the key team"
+                    f"{role.name} is not a team of {self.environment}. Its file needs the same environment, and the key team."
                 )
         return self
 
     @property
     def family(self) -> str:
-        """The part of `environment` before the first slash: see `table.py`."""
+        """The part of `environment` before the first slash, or "" without a slash."""
         return self.environment.partition("/")[0] if "/" in self.environment else ""
 
     @property
@@ -116,18 +127,18 @@ class TaskSpec(Checked):
 
     @property
     def roles(self) -> tuple["TaskSpec", ...]:
-        """The specs that latent functions are designed for: those of the teams, or this one."""
+        """The tasks that latent functions are designed for: those of the teams, or this one."""
         return self.teams or (self,)
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the whole spec."""
+        """SHA-256 of all values."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
 
-def the_role(spec: TaskSpec) -> TaskSpec:
-    """The spec, if it describes a single role. Raises `LareError` if its teams have their own specs."""
+def require_role(spec: TaskSpec) -> TaskSpec:
+    """Return a task without teams unchanged. Raise `LareError` for a task with teams, which has several latent functions."""
     if spec.teams:
         names = ", ".join(role.name for role in spec.roles)
-        raise LareError(f"{spec.name} has a latent function for each of its teams: name one of {names} instead")
+        raise LareError(f"{spec.name} has a latent function for each of its teams. Name one of {names} instead.")
     return spec

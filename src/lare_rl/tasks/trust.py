@@ -8,56 +8,56 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from lare_rl.errors import LareError
-from lare_rl.tasks.spec import PETTINGZOO, TaskSpec
+from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
-TRUSTED = "LARE_TRUST"
+__all__ = ["TRUST_VARIABLE", "check_trusted", "untrusted_module"]
+
+TRUST_VARIABLE = "LARE_TRUST"
 """The environment variable with the modules, separated by commas, that run directories and other files may import."""
 
 
-def module_of(task: TaskSpec) -> str | None:
-    """The module that is imported to make the task's environment, if its name contains one."""
-    module, colon, _ = task.environment.removeprefix(PETTINGZOO).partition(":")
-    return module if colon else None
+def untrusted_module(task: TaskSpec) -> str | None:
+    """Return the module that a task's environment would import.
 
-
-def is_trusted(module: str) -> bool:
-    """Whether this process has already imported the module, or the user has named it in `LARE_TRUST`."""
-    return module in sys.modules or module in [name.strip() for name in os.environ.get(TRUSTED, "").split(",")]
+    Return None without such a module, and for a module that this process has imported or that the user trusts.
+    """
+    module, colon, _ = task.environment.removeprefix(PETTINGZOO_PREFIX).partition(":")
+    trusted = [name.strip() for name in os.environ.get(TRUST_VARIABLE, "").split(",")]
+    return module if colon and module not in sys.modules and module not in trusted else None
 
 
 def check_trusted(task: TaskSpec, directory: Path) -> None:
-    """Raise `LareError` if a run's environment would import a file that belongs to no installed package and is not trusted."""
-    module = module_of(task)
-    if module is None or is_trusted(module):
-        return
-    place = place_of(module)
-    if place is not None and not any(place.is_relative_to(installed) for installed in installed_places()):
+    """Check that a run's environment imports nothing but installed packages and trusted modules.
+
+    Raises:
+        LareError: it would import another file.
+    """
+    module = untrusted_module(task)
+    path = None if module is None else _find_package(module)
+    if path is not None and not any(path.is_relative_to(folder) for folder in _package_folders()):
         raise LareError(
-            f"{directory}: its environment {task.environment!r} would run {place}, which belongs to no installed package; "
-            f"if you trust that file, set {TRUSTED}={module}"
+            f"{directory}: its environment {task.environment!r} would run {path}, which belongs to no installed package. "
+            f"If you trust that file, set {TRUST_VARIABLE}={module}."
         )
 
 
-def place_of(module: str) -> Path | None:
-    """The file of a module's outermost package, found without running it; None if there is none, or if it is built in."""
+def _find_package(module: str) -> Path | None:
+    """Return the file of a module's outermost package, without running it. Return None for built-in and missing modules."""
     try:
-        found = find_spec(module.partition(".")[0])
+        spec = find_spec(module.partition(".")[0])
     except (ImportError, ValueError):
         return None
-    if found is None or found.origin in ("built-in", "frozen"):
+    if spec is None or spec.origin in ("built-in", "frozen"):
         return None
-    places = [found.origin] if found.origin else list(found.submodule_search_locations or ())
-    return Path(places[0]).resolve() if places else None
+    paths = [spec.origin] if spec.origin else list(spec.submodule_search_locations or ())
+    return Path(paths[0]).resolve() if paths else None
 
 
-def installed_places() -> set[Path]:
-    """The folders in which packages and Python itself are installed."""
+def _package_folders() -> set[Path]:
+    """Return the folders in which packages and Python itself are installed."""
     paths = sysconfig.get_paths()
-    known = [*(paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")), *site.getsitepackages()]
-    return {Path(place).resolve() for place in (*known, site.getusersitepackages())}
-
-
-def unknown_module(task: TaskSpec) -> str | None:
-    """The module that a task's environment would import, unless this process has imported it, or the user trusts it."""
-    module = module_of(task)
-    return None if module is None or is_trusted(module) else module
+    names = ("stdlib", "platstdlib", "purelib", "platlib")
+    return {
+        Path(path).resolve()
+        for path in (*(paths[name] for name in names), *site.getsitepackages(), site.getusersitepackages())
+    }

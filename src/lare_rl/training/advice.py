@@ -1,105 +1,136 @@
-"""Advice about a training that may not get anywhere, in sentences."""
+"""Findings about a training that may not get anywhere."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.algorithms.settings import PPOSettings
-from lare_rl.credit.explanation_text import entry_names
+from lare_rl.algorithms.ppo import PPOSettings
+from lare_rl.config.effective import warmup_warning
+from lare_rl.credit.explanation_text import raw_feature_names
 from lare_rl.data.replay import Replay
 from lare_rl.runs.directory import Run
 from lare_rl.training.static_config import TrainConfig
+from lare_rl.util.findings import Finding, render
 
-LARGE = 10.0
-"""The largest root mean square of an entry of the observation that needs no remark."""
-ROWS = 1000
-"""So many stored observations of an environment are looked at."""
-SATURATION = "actor/saturation"
-"""The metric: see `saturation`."""
-BOUND = 0.99
-"""An entry of an action is at a bound if it is larger than this part of it."""
-SAME = 5
-"""So many evaluations with equal returns are reported."""
-EQUAL = 1e-3
-"""Returns are equal if they differ by less than this part of their size."""
+__all__ = [
+    "MESSAGES",
+    "N_PROBE_STATES",
+    "describe_untrained",
+    "find_constant_returns",
+    "find_large_observations",
+    "find_saturated_policies",
+    "find_untrained",
+    "saturation",
+]
+
+MAX_RMS = 10.0
+"""The largest root mean square of an observation's feature that needs no advice."""
+N_PROBE_STATES = 1000
+"""The number of stored observations of an environment that are inspected."""
+ACTION_BOUND = 0.99
+"""A component of a normalised action is at a bound if its size is larger."""
+N_EQUAL_EVALUATIONS = 5
+"""The number of evaluations with equal returns that is reported."""
+EQUAL_RTOL = 1e-3
+"""Returns are equal if they differ by less than this fraction of their size."""
+
+MESSAGES = {
+    "all steps random": "{reason}",
+    "steps so far random": "all {step:,} steps so far were random ({algorithm}.warmup is {warmup:,})",
+    "too few episodes": "the policy has not been updated in {step:,} steps: {algorithm} needs {batch_size} finished episodes for "
+    "its first update ({algorithm}.batch_size)",
+    "large observations": "Observations are large: the root mean square of {feature} is {rms:.3g} in the first steps, and "
+    "{algorithm} does not normalise observations. Its actions may stay at their bounds. Let the environment divide each entry by "
+    "its range, so that it is within about -1 and 1{alternative}.",
+    "normalise": ", or set --{algorithm}.normalise-observations True",
+    "use ppo": ", or use --algorithm ppo, which normalises observations",
+    "saturated policies": "{policies} chooses the same action in every state, with each entry at a bound. If the task needs more "
+    "than that, the policy is stuck, and more steps seldom help: see docs/bring-your-own-task.md, section 4.",
+    "one policy": "The policy",
+    "policies of seeds": "The policy of {noun} {seeds}",
+    "constant returns": "The last {n_evaluations} evaluations of every seed have the same return: the policy does not change what "
+    "it does. If this return is not a good one, the policy is stuck: see docs/bring-your-own-task.md, section 4.",
+}
 
 
-def of_observations(run: Run, held: Replay, config: TrainConfig) -> list[str]:
-    """A remark if an entry of the observations is large and the algorithm does not normalise observations; else nothing.
+def find_untrained(run: Run) -> Finding | None:
+    """Find out why the policy of a run has not been updated. Return None if it has been, or before the first evaluation."""
+    settings, lines = run.config.settings, run.metrics()
+    if (reason := warmup_warning(settings)) is not None:
+        return Finding("all steps random", {"reason": reason})
+    if not lines or any(key.startswith("critic/loss") and line[key] is not None for line in lines for key in line):
+        return None
+    step, algorithm = lines[-1]["step"], settings.algorithm
+    if step <= settings.warmup:
+        return Finding("steps so far random", {"step": step, "algorithm": algorithm, "warmup": settings.warmup})
+    batch_size = getattr(settings.hyperparameters, "batch_size", 1)
+    return Finding("too few episodes", {"step": step, "algorithm": algorithm, "batch_size": batch_size})
 
-    A large entry may drive a policy that ends in a tanh to a bound of the actions before its first update. Its gradient is then 0.
+
+def describe_untrained(run: Run) -> str | None:
+    """Return `find_untrained` as a sentence."""
+    finding = find_untrained(run)
+    return None if finding is None else render(finding, MESSAGES)
+
+
+def find_large_observations(run: Run, replay: Replay, config: TrainConfig) -> list[Finding]:
+    """Find a feature of the observations that is large, if the algorithm does not normalise observations.
+
+    A large feature may drive a policy that ends in a tanh to a bound of the actions before its first update. Its gradient is
+    then 0.
     """
-    algorithm, hyperparameters = run.config.settings.algorithm, run.config.settings.hyperparameters
+    settings, hyperparameters = run.config.settings, run.config.settings.hyperparameters
     can_normalise = isinstance(hyperparameters, PPOSettings)
-    if (can_normalise and hyperparameters.normalise_observations) or "observation" not in held.columns:
+    if (can_normalise and hyperparameters.normalise_observations) or "observation" not in replay.columns:
         return []
-    rows = min(ROWS, int(np.min(np.asarray(held.next_row)[0])))
-    seen = np.asarray(held.columns["observation"][0, :, :rows]).reshape(-1, config.env.observation_size)
-    sizes = np.sqrt(np.mean(np.square(seen), axis=0))
-    largest = int(np.argmax(sizes))
-    if not sizes[largest] > LARGE:
+    n_rows = min(N_PROBE_STATES, int(np.min(np.asarray(replay.next_row)[0])))
+    observation = np.asarray(replay.columns["observation"][0, :, :n_rows]).reshape(-1, config.env.observation_size)
+    rms = np.sqrt(np.mean(np.square(observation), axis=0))
+    largest = int(np.argmax(rms))
+    if not rms[largest] > MAX_RMS:
         return []
-    role = run.config.task.roles[0]
-    name = entry_names(role.observation, "", config.env.observation_size, 0, both=False)[largest]
-    other = f", or set --{algorithm}.normalise-observations True" if can_normalise else ""
-    if config.algorithm.one_agent and config.env.agents == 1:
-        other = ", or use --algorithm ppo, which normalises observations"
-    return [
-        f"Observations are large: the root mean square of {name} is {sizes[largest]:.3g} in the first steps, and {algorithm} does "
-        "not normalise observations. Its actions may stay at their bounds. Let the environment divide each entry by its range, so "
-        f"that it is within about -1 and 1{other}."
-    ]
+    alternative = Finding("normalise", {"algorithm": settings.algorithm}) if can_normalise else None
+    if config.algorithm.single_agent and config.env.n_agents == 1:
+        alternative = Finding("use ppo")
+    names = raw_feature_names(run.config.task.roles[0].observation, "", config.env.observation_size, 0, both=False)
+    values = {"feature": names[largest], "rms": float(rms[largest])}
+    return [Finding("large observations", values | {"algorithm": settings.algorithm, "alternative": alternative})]
 
 
-def saturation(actions: Float[np.ndarray, "seeds steps action"]) -> Float[np.ndarray, " seeds"]:
-    """The share of an action's entries that are at the same bound in all states.
+def saturation(action: Float[np.ndarray, "seeds steps action"]) -> Float[np.ndarray, " seeds"]:
+    """Return the fraction of an action's components that are at the same bound in all states.
 
     Args:
-        actions: those of each seed's policy, without noise, in some states; between -1 and 1.
+        action: actions of each seed's policy in some states, without noise, between -1 and 1.
     """
-    bound = np.where(np.abs(actions) > BOUND, np.sign(actions), 0)
+    bound = np.where(np.abs(action) > ACTION_BOUND, np.sign(action), 0)
     return np.mean((bound[:, 0] != 0) & np.all(bound == bound[:, :1], axis=1), axis=-1)
 
 
-def of_saturation(shares: Sequence[float], seeds: Sequence[int]) -> list[str]:
-    """A remark if a policy chooses the same bounds in all states; else nothing.
-
-    Args:
-        shares: the saturation of each seed's policy.
-        seeds: the numbers of the seeds.
-    """
-    stuck = [str(seed) for seed, share in zip(seeds, shares, strict=True) if share == 1]
+def find_saturated_policies(saturations: Sequence[float], seeds: Sequence[int]) -> list[Finding]:
+    """Find the seeds whose policy chooses the same bounds in all states, by the saturation of each seed's policy."""
+    stuck = tuple(seed for seed, fraction in zip(seeds, saturations, strict=True) if fraction == 1)
     if not stuck:
         return []
-    whose = (
-        "The policy"
-        if len(seeds) == 1
-        else f"The policy of {'seed' if len(stuck) == 1 else 'seeds'} {', '.join(stuck)}"
-    )
-    return [
-        f"{whose} chooses the same action in every state, with each entry at a bound. If the task needs more than that, the policy "
-        "is stuck, and more steps seldom help: see docs/bring-your-own-task.md, section 4."
-    ]
+    values = {"noun": "seed" if len(stuck) == 1 else "seeds", "seeds": stuck}
+    policies = Finding("one policy") if len(seeds) == 1 else Finding("policies of seeds", values)
+    return [Finding("saturated policies", {"policies": policies})]
 
 
-def of_returns(returns: Sequence[Float[np.ndarray, " seeds"]]) -> list[str]:
-    """A remark when the last evaluations of every seed have the same return, and did not have it before; else nothing.
+def find_constant_returns(returns: Sequence[Float[np.ndarray, " seeds"]]) -> list[Finding]:
+    """Find out whether the last evaluations of every seed have the same return. It is reported once.
 
     Args:
         returns: those of the evaluations since the policy was first updated.
     """
-    if not are_equal(returns[-SAME:]) or are_equal(returns[-SAME - 1 : -1]):
+    if not _are_equal(returns[-N_EQUAL_EVALUATIONS:]) or _are_equal(returns[-N_EQUAL_EVALUATIONS - 1 : -1]):
         return []
-    return [
-        f"The last {SAME} evaluations of every seed have the same return: the policy does not change what it does. If this return "
-        "is not a good one, the policy is stuck: see docs/bring-your-own-task.md, section 4."
-    ]
+    return [Finding("constant returns", {"n_evaluations": N_EQUAL_EVALUATIONS})]
 
 
-def are_equal(returns: Sequence[Float[np.ndarray, " seeds"]]) -> bool:
-    """Whether there are enough evaluations, and the returns of each seed differ by nothing or hardly anything."""
-    if len(returns) < SAME:
+def _are_equal(returns: Sequence[Float[np.ndarray, " seeds"]]) -> bool:
+    if len(returns) < N_EQUAL_EVALUATIONS:
         return False
-    each = np.array(returns)
-    return bool(np.all(np.ptp(each, axis=0) <= EQUAL * np.abs(each).max(axis=0)))
+    per_seed = np.array(returns)
+    return bool(np.all(np.ptp(per_seed, axis=0) <= EQUAL_RTOL * np.abs(per_seed).max(axis=0)))

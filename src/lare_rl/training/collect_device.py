@@ -1,4 +1,4 @@
-"""Collecting from an environment of pure functions: the policy and all environments of all seeds in one compiled call."""
+"""Collects from an environment of pure functions: the policy and all environments of all seeds in one compiled call."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -10,170 +10,173 @@ import numpy as np
 from jaxtyping import Array, Bool, Key
 
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.interface import JaxEnv, Timestep, env_action, team_mean
-from lare_rl.training.compiled import acting, new_memory
-from lare_rl.training.evaluation import Evaluation
+from lare_rl.envs.interface import JaxEnv, Timestep, team_mean, to_env_action
+from lare_rl.training.compile_cache import cache_by_value
+from lare_rl.training.compiled import init_memory, policy_function
+from lare_rl.training.evaluation import EpisodeBatch, Evaluation
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, device_noise, stream_keys
 
+__all__ = ["DeviceCollector", "unroll_on_device"]
 
-class Worlds(NamedTuple):
+Act = Callable[..., tuple[Array, Any]]
+"""From actor, memory, observation, available actions, noise and episode starts to the action and the new memory."""
+
+
+class VecEnvState(NamedTuple):
     """The state of every environment of every seed, between two steps."""
 
     state: Any
-    shown: Timestep
+    timestep: Timestep
     memory: Any
     """The memory of the actors."""
-    new: Bool[Array, "seeds envs"]
+    episode_start: Bool[Array, "seeds envs"]
     """Whether an episode has just begun."""
-
-
-class Played(NamedTuple):
-    """Whole episodes, each from its own initial state: [time seeds episodes ...]."""
-
-    steps: Trajectory
-    mask: Bool[Array, "time seeds episodes"]
-    """Whether the episode had not ended before the step."""
-    state: Any
-    """The environment's states, after each step."""
-
-
-def on_all(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, mapped over seeds and environments."""
-    return jax.vmap(jax.vmap(function))
-
-
-def spread(keys: Key[Array, " seeds"], count: int) -> Key[Array, "seeds {count}"]:
-    """Keys for the environments of each seed."""
-    return jax.vmap(lambda key: jax.random.split(key, count))(keys)
-
-
-def start(env: JaxEnv, keys: Key[Array, " seeds"], count: int, config: TrainConfig) -> Worlds:
-    """Environments at the start of an episode."""
-    state, shown = on_all(env.reset)(spread(keys, count))
-    new = jnp.ones((len(keys), count), bool)
-    return Worlds(state, shown, new_memory(config, *new.shape), new)
-
-
-def step(
-    env: JaxEnv,
-    worlds: Worlds,
-    actor: Any,
-    keys: Key[Array, " seeds"],
-    config: TrainConfig,
-    greedy: bool,
-    act: Callable[..., tuple[Array, Any]],
-) -> tuple[Worlds, Trajectory]:
-    """One step of all environments. An episode that has ended is not reset here."""
-    count = worlds.new.shape[1]
-    noise_keys, keys = jnp.unstack(spread(keys, 2), axis=1)
-    noise = None
-    if not greedy:
-        shape = count, config.env.agents, config.noise_size
-        noise = jax.vmap(lambda key: device_noise(key, config.noise, shape))(noise_keys)
-    before = worlds.shown
-    action, memory = act(actor, worlds.memory, before.observation, before.available, noise, worlds.new)
-    taken = action if config.env.discrete else env_action(action, config.env)
-    state, after = on_all(env.step)(worlds.state, taken, spread(keys, count))
-    return Worlds(state, after, memory, jnp.zeros_like(worlds.new)), Trajectory(before, action, taken, after)
-
-
-def collect(
-    env: JaxEnv, worlds: Worlds, actor: Any, keys: Key[Array, " seeds"], config: TrainConfig
-) -> tuple[Worlds, Trajectory]:
-    """`rollout_steps` steps of every environment. When an episode ends, the next one begins."""
-
-    def one(worlds: Worlds, keys: Key[Array, " seeds"]) -> tuple[Worlds, Trajectory]:
-        step_keys, reset_keys = jnp.unstack(spread(keys, 2), axis=1)
-        worlds, steps = step(env, worlds, actor, step_keys, config, greedy=False, act=acting(config, greedy=False))
-
-        def begin(worlds: Worlds) -> Worlds:
-            fresh = start(env, reset_keys, worlds.new.shape[1], config)
-
-            def choose(new: Array, old: Array) -> Array:
-                return jnp.where(steps.ended.reshape(*steps.ended.shape, *[1] * (old.ndim - 2)), new, old)
-
-            state, shown = jax.tree.map(choose, (fresh.state, fresh.shown), (worlds.state, worlds.shown))
-            return Worlds(state, shown, worlds.memory, steps.ended)
-
-        # A reset costs as much as a step, so it is skipped if no episode has ended.
-        return jax.lax.cond(jnp.any(steps.ended), begin, lambda worlds: worlds, worlds), steps
-
-    keys = jnp.swapaxes(spread(keys, config.rollout_steps), 0, 1)
-    worlds, steps = jax.lax.scan(one, worlds, keys)
-    return worlds, jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), steps)
-
-
-def play(
-    env: JaxEnv,
-    actor: Any,
-    keys: Key[Array, " seeds"],
-    count: int,
-    config: TrainConfig,
-    greedy: bool,
-    act: Callable[..., tuple[Array, Any]] | None = None,
-) -> Played:
-    """Whole episodes of a policy, each from its own initial state. `act`, if given, is called instead of training's `acting`."""
-    act = act or acting(config, greedy)
-    start_keys, step_keys = jnp.unstack(spread(keys, 2), axis=1)
-    worlds = start(env, start_keys, count, config)
-
-    def one(
-        carry: tuple[Worlds, Bool[Array, "seeds episodes"]], keys: Key[Array, " seeds"]
-    ) -> tuple[tuple[Worlds, Bool[Array, "seeds episodes"]], Played]:
-        worlds, running = carry
-        worlds, steps = step(env, worlds, actor, keys, config, greedy, act)
-        return (worlds, running & ~steps.ended), Played(steps, running, worlds.state)
-
-    keys = jnp.swapaxes(spread(step_keys, config.env.max_steps), 0, 1)
-    return jax.lax.scan(one, (worlds, jnp.ones_like(worlds.new)), keys)[1]
-
-
-def evaluate(env: JaxEnv, actor: Any, keys: Key[Array, " seeds"], count: int, config: TrainConfig) -> tuple[Any, ...]:
-    """The results of whole episodes of the policy: the parts of an `Evaluation`."""
-    played = play(env, actor, keys, count, config, config.greedy)
-    steps, mask = played.steps, played.mask
-    reward = steps.after.reward * mask[..., None]
-    returns = [team_mean(reward, steps.before.alive, team).sum(axis=0) for team in config.env.teams]
-    sums = [reward[..., team.agents].sum(axis=(0, -1)) for team in config.env.teams]
-    last = mask & steps.ended
-    return (
-        jnp.stack(returns, axis=-1),
-        jnp.stack(sums, axis=-1),
-        mask.sum(axis=0),
-        {name: (values * last).sum(axis=0) for name, values in steps.after.measures.items()},
-    )
 
 
 class DeviceCollector:
     """The environments of a run, if they are pure functions: one compiled call makes an iteration's steps."""
 
     def __init__(self, env: JaxEnv, config: TrainConfig, seeds: Sequence[int]):
-        self.seeds = seeds
-        self.collecting = jax.jit(partial(collect, env, config=config), donate_argnums=0)
-        self.evaluating = jax.jit(partial(evaluate, env, config=config), static_argnums=2)
-        begin = jax.jit(partial(start, env, count=config.environments, config=config))
-        self.worlds: Worlds = begin(stream_keys(seeds, Stream.TRAINING_EPISODES, 0))
+        self._seeds = seeds
+        self._reset, self._collect, self._evaluate = _jit_functions(env, config)
+        self._envs: VecEnvState = self._reset(stream_keys(seeds, Stream.TRAINING_EPISODES, 0))
 
     def collect(self, actor: Any, step: int) -> Trajectory:
-        """The steps of the iteration that begins at this step."""
-        self.worlds, steps = self.collecting(self.worlds, actor, stream_keys(self.seeds, Stream.EXPLORATION, step))
+        """Return the steps of the iteration that begins at `step`."""
+        keys = stream_keys(self._seeds, Stream.EXPLORATION, step)
+        self._envs, steps = self._collect(self._envs, actor, keys)
         return steps
 
-    def evaluate(self, actor: Any, episodes: int, number: int = 0) -> Evaluation:
+    def evaluate(self, actor: Any, n_episodes: int, number: int = 0) -> Evaluation:
         """Evaluate whole episodes. The same number gives the same initial states; the run's own evaluations use 0."""
-        keys = stream_keys(self.seeds, Stream.EVALUATION_EPISODES, number)
-        return Evaluation(*jax.device_get(tuple(self.evaluating(actor, keys, episodes))))
+        keys = stream_keys(self._seeds, Stream.EVALUATION_EPISODES, number)
+        return Evaluation(*jax.device_get(tuple(self._evaluate(actor, keys, n_episodes))))
 
-    def saved(self) -> dict[str, np.ndarray]:
-        """The current worlds."""
-        return {str(place): np.asarray(leaf) for place, leaf in enumerate(jax.tree.leaves(self.worlds))}
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Return the arrays that `restore` needs."""
+        return {str(i): np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self._envs))}
 
-    def restore(self, saved: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
-        """Restore saved worlds. No episode is dropped."""
-        leaves, structure = jax.tree.flatten(self.worlds)
-        self.worlds = jax.device_put(jax.tree.unflatten(structure, [saved[str(i)] for i in range(len(leaves))]))
-        return np.zeros(self.worlds.new.shape, bool), []
+    def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
+        """Restore the environments. Return which episodes were dropped, and messages: never any, as on the host."""
+        leaves, structure = jax.tree.flatten(self._envs)
+        self._envs = jax.device_put(jax.tree.unflatten(structure, [arrays[str(i)] for i in range(len(leaves))]))
+        return np.zeros(self._envs.episode_start.shape, bool), []
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """Do nothing: there is nothing to close."""
+
+
+def unroll_on_device(
+    env: JaxEnv,
+    actor: Any,
+    keys: Key[Array, " seeds"],
+    n_episodes: int,
+    config: TrainConfig,
+    greedy: bool,
+    act: Act | None = None,
+) -> EpisodeBatch:
+    """Play whole episodes of a policy, each from a different initial state. `act` replaces the policy of training."""
+    act = act or policy_function(config, greedy)
+    reset_keys, step_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
+    envs = _reset(env, reset_keys, n_episodes, config)
+
+    def body(
+        carry: tuple[VecEnvState, Bool[Array, "seeds episodes"]], keys: Key[Array, " seeds"]
+    ) -> tuple[tuple[VecEnvState, Bool[Array, "seeds episodes"]], EpisodeBatch]:
+        envs, running = carry
+        envs, steps = _step(env, envs, actor, keys, config, greedy, act)
+        return (envs, running & ~steps.ended), EpisodeBatch(steps, running, envs.state)
+
+    keys = jnp.swapaxes(_split_keys(step_keys, config.env.max_steps), 0, 1)
+    return jax.lax.scan(body, (envs, jnp.ones_like(envs.episode_start)), keys)[1]
+
+
+@cache_by_value
+def _jit_functions(env: JaxEnv, config: TrainConfig) -> tuple[Callable[..., Any], ...]:
+    return (
+        jax.jit(partial(_reset, env, n_envs=config.n_envs, config=config)),
+        jax.jit(partial(_collect, env, config=config), donate_argnums=0),
+        jax.jit(partial(_evaluate, env, config=config), static_argnums=2),
+    )
+
+
+def _reset(env: JaxEnv, keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig) -> VecEnvState:
+    state, timestep = _map_envs(env.reset)(_split_keys(keys, n_envs))
+    episode_start = jnp.ones((len(keys), n_envs), bool)
+    return VecEnvState(state, timestep, init_memory(config, *episode_start.shape), episode_start)
+
+
+def _step(
+    env: JaxEnv,
+    envs: VecEnvState,
+    actor: Any,
+    keys: Key[Array, " seeds"],
+    config: TrainConfig,
+    greedy: bool,
+    act: Act,
+) -> tuple[VecEnvState, Trajectory]:
+    """Step all environments. Episodes that have ended are not reset."""
+    n_envs = envs.episode_start.shape[1]
+    noise_keys, keys = jnp.unstack(_split_keys(keys, 2), axis=1)
+    noise = None
+    if not greedy:
+        shape = n_envs, config.env.n_agents, config.noise_size
+        noise = jax.vmap(lambda key: device_noise(key, config.noise, shape))(noise_keys)
+    timestep = envs.timestep
+    action, memory = act(actor, envs.memory, timestep.observation, timestep.available, noise, envs.episode_start)
+    env_action = action if config.env.discrete else to_env_action(action, config.env)
+    state, next_timestep = _map_envs(env.step)(envs.state, env_action, _split_keys(keys, n_envs))
+    steps = Trajectory(timestep=timestep, action=action, env_action=env_action, next_timestep=next_timestep)
+    return VecEnvState(state, next_timestep, memory, jnp.zeros_like(envs.episode_start)), steps
+
+
+def _collect(
+    env: JaxEnv, envs: VecEnvState, actor: Any, keys: Key[Array, " seeds"], config: TrainConfig
+) -> tuple[VecEnvState, Trajectory]:
+    """Make `rollout_steps` steps of every environment. When an episode ends, the next one begins."""
+
+    def body(envs: VecEnvState, keys: Key[Array, " seeds"]) -> tuple[VecEnvState, Trajectory]:
+        step_keys, reset_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
+        envs, steps = _step(
+            env, envs, actor, step_keys, config, greedy=False, act=policy_function(config, greedy=False)
+        )
+
+        def reset_ended(envs: VecEnvState) -> VecEnvState:
+            fresh = _reset(env, reset_keys, envs.episode_start.shape[1], config)
+
+            def choose(new: Array, old: Array) -> Array:
+                return jnp.where(steps.ended.reshape(*steps.ended.shape, *[1] * (old.ndim - 2)), new, old)
+
+            state, timestep = jax.tree.map(choose, (fresh.state, fresh.timestep), (envs.state, envs.timestep))
+            return VecEnvState(state, timestep, envs.memory, episode_start=steps.ended)
+
+        # A reset costs as much as a step, so it is skipped if no episode has ended.
+        return jax.lax.cond(jnp.any(steps.ended), reset_ended, lambda envs: envs, envs), steps
+
+    keys = jnp.swapaxes(_split_keys(keys, config.rollout_steps), 0, 1)
+    envs, steps = jax.lax.scan(body, envs, keys)
+    return envs, jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), steps)
+
+
+def _evaluate(
+    env: JaxEnv, actor: Any, keys: Key[Array, " seeds"], n_episodes: int, config: TrainConfig
+) -> tuple[Any, ...]:
+    """Return the fields of an `Evaluation`."""
+    steps, mask, _ = unroll_on_device(env, actor, keys, n_episodes, config, config.greedy)
+    reward = steps.next_timestep.reward * mask[..., None]
+    returns = [team_mean(reward, steps.timestep.alive, team).sum(axis=0) for team in config.env.teams]
+    summed_returns = [reward[..., team.agents].sum(axis=(0, -1)) for team in config.env.teams]
+    last = mask & steps.ended
+    measures = {name: (values * last).sum(axis=0) for name, values in steps.next_timestep.measures.items()}
+    return jnp.stack(returns, axis=-1), jnp.stack(summed_returns, axis=-1), mask.sum(axis=0), measures
+
+
+def _map_envs(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Map a function over seeds and environments."""
+    return jax.vmap(jax.vmap(function))
+
+
+def _split_keys(keys: Key[Array, " seeds"], n_envs: int) -> Key[Array, "seeds {n_envs}"]:
+    """Return keys for the environments of each seed."""
+    return jax.vmap(lambda key: jax.random.split(key, n_envs))(keys)

@@ -1,4 +1,4 @@
-"""Collecting from environments that step on the host: each step calls the policy once, for all environments of all seeds.
+"""Collects from environments that step on the host: each step calls the policy once, for all environments of all seeds.
 
 An episode is determined by its seed and its actions. So a run can be resumed in the middle of an episode, in any simulator: reset
 with the seed, play the actions, and compare the observation bit for bit.
@@ -13,330 +13,224 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lare_rl.data.trajectory import Trajectory
+from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.families import make_host_env
-from lare_rl.envs.guarded_gymnasium import EnvironmentFault
-from lare_rl.envs.interface import EnvSpec, Timestep, env_action, team_mean
-from lare_rl.envs.workers import LocalEnvs, WorkerEnvs
-from lare_rl.errors import LareError
+from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
+from lare_rl.envs.workers import LocalVecEnv, SubprocVecEnv, VecEnv
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training.compiled import Compiled, new_memory
+from lare_rl.training.compiled import CompiledFunctions, init_memory
 from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.static_config import TrainConfig
-from lare_rl.training.streams import Stream, episode_seed, generator, host_noise
+from lare_rl.training.streams import Stream, episode_seed, host_noise, numpy_generator
+from lare_rl.training.unroll_host import HostPolicy, add_seed_axis, check_finite, evaluate_on_host
 
-Envs = LocalEnvs | WorkerEnvs
-"""Environments in one list: those of the first seed, of the second, and so on."""
-
-Acting = Callable[[Timestep, Bool[np.ndarray, "seeds envs"]], Float[np.ndarray, "seeds envs agents action"]]
-"""From a time step, and which episodes are new, to actions."""
+__all__ = ["HostCollector", "HostVecEnv", "make_host_collector"]
 
 
-class Diverged(LareError):
-    """The policy is not finite any more."""
+class HostVecEnv:
+    """The training environments of a run, and the running episode of each.
 
+    Args:
+        envs: those of the first seed, of the second, and so on.
+        seeds: the seeds of the run.
+        n_envs: the number of environments of each seed.
+    """
 
-class HostEpisodes:
-    """The training environments of a run, and the running episode of each."""
-
-    def __init__(self, envs: Envs, seeds: Sequence[int], environments: int):
-        self.envs, self.seeds, self.environments = envs, list(seeds), environments
-        self.spec = envs.spec
-        count = len(self.seeds) * environments
-        self.episode = np.full(count, -1)
+    def __init__(self, envs: VecEnv, seeds: Sequence[int], n_envs: int):
+        self.shape = len(seeds), n_envs
+        self._envs, self._seeds, self._n_envs = envs, list(seeds), n_envs
+        self._spec = envs.spec
+        self._episode = np.full(len(seeds) * n_envs, -1)
         """The number of each environment's running episode."""
-        self.actions: list[list[np.ndarray]] = [[] for _ in range(count)]
+        self._actions: list[list[np.ndarray]] = [[] for _ in self._episode]
         """The actions of that episode, in the environment's units."""
-        self.shown = shaped(envs.batch, self.shape)
+        self._timestep = add_seed_axis(envs.batch, self.shape)
         """The current time step of each environment. The next step overwrites it."""
-        self.new = np.ones(self.shape, bool)
-        """Which episodes have not had a step yet."""
-        self.dropped = np.zeros(count, bool)
-        """Which episodes `restore` could not restore."""
+        self._episode_start = np.ones(self.shape, bool)
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        return len(self.seeds), self.environments
+    def reset(self, where: Bool[np.ndarray, " all"] | None = None) -> None:
+        """Start the next episode in the environments that `where` selects; in all by default."""
+        where = np.ones(len(self._episode), bool) if where is None else where
+        self._episode[where] += 1
+        for index in np.flatnonzero(where):
+            self._actions[index] = []
+        self._call(lambda: self._envs.reset(where, self._episode_seeds()))
+        self._episode_start = self._episode_start | where.reshape(self.shape)
 
-    def begin(self, where: Bool[np.ndarray, " all"] | None = None) -> None:
-        """Start the next episode in some of the environments, or in all."""
-        where = np.ones(len(self.episode), bool) if where is None else where
-        self.episode[where] += 1
-        for number in np.flatnonzero(where):
-            self.actions[number] = []
-        self.asked(lambda: self.envs.reset(where, self.episode_seeds()))
-        self.new = self.new | where.reshape(self.shape)
+    def collect(
+        self, policy: Callable[..., Any], noise: Float[np.ndarray, "time seeds envs agents noise"]
+    ) -> Trajectory:
+        """Let a policy act for as many steps as there is noise. When an episode ends, the next one begins.
 
-    def episode_seeds(self) -> Int[np.ndarray, " all"]:
-        """The random seed of each environment's running episode."""
-        return np.array(
-            [
-                episode_seed(self.seed_of(number), Stream.TRAINING_EPISODES, self.number_of(number))
-                for number in range(len(self.episode))
-            ]
-        )
-
-    def seed_of(self, place: int) -> int:
-        """The seed that an environment belongs to."""
-        return self.seeds[place // self.environments]
-
-    def number_of(self, place: int) -> int:
-        """The running episode's number among all episodes of the seed."""
-        return int(self.episode[place]) * self.environments + place % self.environments
-
-    def step(self, taken: Float[np.ndarray, "seeds envs agents action"]) -> None:
-        """One step of all environments, with actions in their units."""
-        rows = taken.reshape(-1, *taken.shape[2:])
-        for actions, row in zip(self.actions, rows, strict=True):
-            actions.append(row)
-        self.asked(lambda: self.envs.step(rows))
-
-    def collect(self, act: Callable[..., Any], noise: Float[np.ndarray, "time seeds envs agents noise"]) -> Trajectory:
-        """Let the policy act for as many steps as there is noise."""
-        steps = blank_trajectory(self.spec, self.shown, self.shape, len(noise))
-        for time, disturbance in enumerate(noise):
-            action = act(self.shown, disturbance, self.new)
-            check_finite(action, self.seeds)
-            taken = env_action(action, self.spec)
-            write(steps.before, self.shown, time)
-            steps.action[:, time], steps.taken[:, time] = action, taken
-            self.step(taken)
-            write(steps.after, self.shown, time)
-            self.new = np.zeros(self.shape, bool)
-            ended = np.logical_or(self.shown.terminated, self.shown.truncated)
+        Args:
+            policy: from a timestep, noise, and which episodes have just begun, to the action.
+            noise: the noise of each step.
+        """
+        steps = _empty_trajectory(self._spec, self._timestep, len(noise))
+        for t, noise_t in enumerate(noise):
+            action = policy(self._timestep, noise_t, self._episode_start)
+            check_finite(action, self._seeds)
+            env_action = to_env_action(action, self._spec)
+            _write_timestep(steps.timestep, t, self._timestep)
+            steps.action[:, t], steps.env_action[:, t] = action, env_action
+            rows = env_action.reshape(-1, *env_action.shape[2:])
+            for actions, row in zip(self._actions, rows, strict=True):
+                actions.append(row)
+            self._call(lambda rows=rows: self._envs.step(rows))
+            _write_timestep(steps.next_timestep, t, self._timestep)
+            self._episode_start = np.zeros(self.shape, bool)
+            ended = np.logical_or(self._timestep.terminated, self._timestep.truncated)
             if ended.any():
-                self.begin(ended.ravel())
+                self.reset(ended.ravel())
         return steps
 
-    def asked(self, answer: Callable[[], Timestep]) -> Timestep:
-        """Call the environments; an error names the place where it occurred."""
-        try:
-            return answer()
-        except EnvironmentFault as fault:
-            raise fault if fault.place is None else EnvironmentFault(f"{fault}, {self.where(fault.place)}") from None
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Return the arrays that `restore` needs to continue the running episodes."""
+        arrays = {"episode": self._episode.copy(), "new": self._episode_start}
+        for index, actions in enumerate(self._actions):
+            arrays[f"actions{index}"] = np.reshape(actions, (-1, self._spec.n_agents, self._spec.action_size))
+            arrays[f"observation{index}"] = self._envs.batch.observation[index].copy()
+        return arrays
 
-    def where(self, place: int) -> str:
-        """The step, episode and seed of an environment, for messages."""
-        among = f" in environment {place % self.environments}" if self.environments > 1 else ""
-        return (
-            f"at step {len(self.actions[place])} of episode {self.episode[place]} of seed {self.seed_of(place)}{among}"
-        )
-
-    def saved(self) -> dict[str, np.ndarray]:
-        """All that is needed to restore the running episodes."""
-        found = {"episode": self.episode.copy(), "new": self.new}
-        observation = self.envs.batch.observation
-        for number, actions in enumerate(self.actions):
-            size = self.spec.agents, self.spec.action_size
-            found[f"actions{number}"] = np.reshape(actions, (-1, *size))
-            found[f"observation{number}"] = observation[number].copy()
-        return found
-
-    def restore(self, saved: dict[str, np.ndarray]) -> list[str]:
+    def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
         """Restore the running episodes, by their seeds and actions.
 
-        If that does not lead to the same observation, bit for bit, the environment is not deterministic: the episode is dropped,
-        and a new one begins. Returns a message about each dropped episode, and sets `dropped`.
-        """
-        self.episode = saved["episode"].copy()
-        count = len(self.episode)
-        whole = [saved[f"actions{number}"] for number in range(count)]
-        self.asked(lambda: self.envs.reset(np.ones(count, bool), self.episode_seeds()))
-        lost = np.zeros(count, bool)
-        for step in range(max(map(len, whole))):
-            where = np.array([step < len(actions) for actions in whole]) & ~lost
-            rows = np.stack([actions[min(step, len(actions) - 1)] if len(actions) else self.idle for actions in whole])
-            shown = self.asked(lambda rows=rows, where=where: self.envs.step(rows, where))
-            lost |= where & (shown.terminated | shown.truncated)
-        self.actions, self.new = [list(actions) for actions in whole], saved["new"].copy()
-        now = self.envs.batch.observation
-        same = [np.array_equal(now[number], saved[f"observation{number}"]) for number in range(count)]
-        self.dropped = lost | ~np.array(same)
-        messages = [
-            f"episode {self.episode[number]} of seed {self.seed_of(number)} was dropped after {len(whole[number])} steps: "
-            "the same actions did not lead to the same observation again"
-            for number in np.flatnonzero(self.dropped).tolist()
-        ]
-        if self.dropped.any():
-            self.begin(self.dropped)
-        return messages
+        If that does not lead to the same observation, bit for bit, the environment is not deterministic. The episode is
+        dropped, and a new one begins.
 
-    @property
-    def idle(self) -> Float[np.ndarray, "agents action"]:
-        """A placeholder action for an environment that is not stepped."""
-        return np.zeros((self.spec.agents, self.spec.action_size), np.float32)
+        Returns:
+            Which episodes were dropped, and a message about each of them.
+        """
+        self._episode = arrays["episode"].copy()
+        indices = range(len(self._episode))
+        actions = [arrays[f"actions{index}"] for index in indices]
+        idle = np.zeros((self._spec.n_agents, self._spec.action_size), np.float32)  # of environments that do not step
+        self._call(lambda: self._envs.reset(np.ones(len(indices), bool), self._episode_seeds()))
+        ended_early = np.zeros(len(indices), bool)
+        for t in range(max(map(len, actions))):
+            where = np.array([t < len(rows) for rows in actions]) & ~ended_early
+            action_t = np.stack([rows[min(t, len(rows) - 1)] if len(rows) else idle for rows in actions])
+            timestep = self._call(lambda action=action_t, where=where: self._envs.step(action, where))
+            ended_early |= where & (timestep.terminated | timestep.truncated)
+        self._actions, self._episode_start = [list(rows) for rows in actions], arrays["new"].copy()
+        same = [np.array_equal(self._envs.batch.observation[index], arrays[f"observation{index}"]) for index in indices]
+        dropped = ended_early | ~np.array(same)
+        messages = [
+            f"episode {self._episode[index]} of seed {self._seed(index)} was dropped after {len(actions[index])} steps: "
+            "the same actions did not lead to the same observation again"
+            for index in np.flatnonzero(dropped).tolist()
+        ]
+        if dropped.any():
+            self.reset(dropped)
+        return dropped.reshape(self.shape), messages
+
+    def close(self) -> None:
+        """Close the environments."""
+        self._envs.close()
+
+    def _seed(self, env_index: int) -> int:
+        return self._seeds[env_index // self._n_envs]
+
+    def _episode_seeds(self) -> Int[np.ndarray, " all"]:
+        """Return the random seed of each environment's running episode."""
+        seeds = []
+        for index, episode in enumerate(self._episode):
+            number = int(episode) * self._n_envs + index % self._n_envs  # among all episodes of the seed
+            seeds.append(episode_seed(self._seed(index), Stream.TRAINING_EPISODES, number))
+        return np.array(seeds)
+
+    def _call(self, function: Callable[[], Timestep]) -> Timestep:
+        """Call the environments. An error names the step, episode and seed of the environment that raised it."""
+        try:
+            return function()
+        except EnvOutputError as error:
+            if (index := error.env_index) is None:
+                raise
+            env = f" in environment {index % self._n_envs}" if self._n_envs > 1 else ""
+            where = f"at step {len(self._actions[index])} of episode {self._episode[index]} of seed {self._seed(index)}{env}"
+            raise EnvOutputError(f"{error}, {where}") from None
 
 
 class HostCollector:
     """The training environments, the policy that acts in them, and environments to evaluate it in."""
 
-    def __init__(self, envs: Envs, evaluation: Envs, config: TrainConfig, functions: Compiled, seeds: Sequence[int]):
-        self.config, self.functions, self.seeds = config, functions, list(seeds)
-        self.episodes, self.evaluation = HostEpisodes(envs, seeds, config.environments), evaluation
-        self.memory = new_memory(config, *self.episodes.shape)
-        self.episodes.begin()
+    def __init__(
+        self,
+        envs: VecEnv,
+        evaluation_envs: VecEnv,
+        config: TrainConfig,
+        functions: CompiledFunctions,
+        seeds: Sequence[int],
+    ):
+        self._config, self._functions, self._seeds = config, functions, list(seeds)
+        self._envs, self._evaluation_envs = HostVecEnv(envs, seeds, config.n_envs), evaluation_envs
+        self._memory = init_memory(config, *self._envs.shape)
+        self._envs.reset()
 
     def collect(self, actor: Any, step: int) -> Trajectory:
-        """The steps of the iteration that begins at this step; during the warmup, with random actions."""
-        config, random = self.config, [generator(seed, Stream.EXPLORATION, step) for seed in self.seeds]
-        shape = config.rollout_steps, config.environments, config.env.agents
+        """Return the steps of the iteration that begins at `step`. During the warmup, actions are random."""
+        config, rngs = self._config, [numpy_generator(seed, Stream.EXPLORATION, step) for seed in self._seeds]
+        shape = config.rollout_steps, config.n_envs, config.env.n_agents
         if step < config.warmup:
-            uniform = [one.uniform(-1, 1, (*shape, config.env.action_size)) for one in random]
-            return self.episodes.collect(lambda shown, noise, new: noise, np.stack(uniform, 1).astype(np.float32))
-        noise = np.stack([host_noise(one, config.noise, (*shape, config.noise_size)) for one in random], 1)
+            uniform = [rng.uniform(-1, 1, (*shape, config.env.action_size)) for rng in rngs]
+            action = np.stack(uniform, axis=1).astype(np.float32)
+            return self._envs.collect(lambda timestep, action_t, episode_start: action_t, action)
+        noise = np.stack([host_noise(rng, config.noise, (*shape, config.noise_size)) for rng in rngs], axis=1)
 
-        def act(shown: Timestep, noise: np.ndarray, new: np.ndarray) -> np.ndarray:
-            given = self.memory, shown.observation, shown.available
-            action, self.memory = self.functions.explore(actor, *given, noise, new)
+        def explore(timestep: Timestep, noise_t: np.ndarray, episode_start: np.ndarray) -> np.ndarray:
+            action, self._memory = self._functions.explore(
+                actor, self._memory, timestep.observation, timestep.available, noise_t, episode_start
+            )
             return np.asarray(action)
 
-        return self.episodes.collect(act, noise)
+        return self._envs.collect(explore, noise)
 
-    def evaluate(self, actor: Any, episodes: int) -> Evaluation:
-        """Whole episodes of the policy, from the initial states of the run's evaluations."""
-        act = policy(self.functions, self.config, actor, self.seeds, episodes)
-        return evaluate(self.evaluation, act, self.seeds, episodes)
+    def evaluate(self, actor: Any, n_episodes: int) -> Evaluation:
+        """Evaluate whole episodes of the policy, always from the same initial states."""
+        policy = HostPolicy(self._functions, self._config, actor, self._seeds, n_episodes)
+        return evaluate_on_host(self._evaluation_envs, policy, self._seeds, n_episodes)
 
-    def saved(self) -> dict[str, np.ndarray]:
-        """Seeds and actions of the running episodes, and the actors' memory of them."""
-        memory = {f"memory{place}": np.asarray(leaf) for place, leaf in enumerate(jax.tree.leaves(self.memory))}
-        return self.episodes.saved() | memory
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Return the arrays that `restore` needs: seeds and actions of the running episodes, and the actors' memory."""
+        memory = {f"memory{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self._memory))}
+        return self._envs.state_dict() | memory
 
-    def restore(self, saved: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
-        """Restore the running episodes. Returns which of them were dropped, and messages about these."""
-        leaves, structure = jax.tree.flatten(self.memory)
-        self.memory = jax.device_put(jax.tree.unflatten(structure, [saved[f"memory{i}"] for i in range(len(leaves))]))
-        messages = self.episodes.restore(saved)
-        return self.episodes.dropped.reshape(self.episodes.shape), messages
+    def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
+        """Restore the running episodes. Return which of them were dropped, and messages about these."""
+        leaves, structure = jax.tree.flatten(self._memory)
+        self._memory = jax.device_put(jax.tree.unflatten(structure, [arrays[f"memory{i}"] for i in range(len(leaves))]))
+        return self._envs.restore(arrays)
 
     def close(self) -> None:
         """Close the environments."""
-        self.episodes.envs.close()
-        self.evaluation.close()
+        self._envs.close()
+        self._evaluation_envs.close()
 
 
-def host_collector(
-    task: TaskSpec, config: TrainConfig, functions: Compiled, seeds: Sequence[int], episodes: int
+def make_host_collector(
+    task: TaskSpec, config: TrainConfig, functions: CompiledFunctions, seeds: Sequence[int], n_evaluation_episodes: int
 ) -> HostCollector:
-    """A collector with a task's environments: in this process, or in worker processes if a seed has several."""
-    kind, maker = LocalEnvs if config.environments == 1 else WorkerEnvs, partial(make_host_env, task)
-    envs, evaluation = (kind([maker] * (len(seeds) * count)) for count in (config.environments, episodes))
-    return HostCollector(envs, evaluation, config, functions, seeds)
+    """Make a collector with a task's environments: in this process, or in worker processes if a seed has several."""
+    make_envs = LocalVecEnv if config.n_envs == 1 else SubprocVecEnv
+    make_env = partial(make_host_env, task)
+    envs, evaluation_envs = (make_envs([make_env] * (len(seeds) * n)) for n in (config.n_envs, n_evaluation_episodes))
+    return HostCollector(envs, evaluation_envs, config, functions, seeds)
 
 
-def policy(functions: Compiled, config: TrainConfig, actor: Any, seeds: Sequence[int], episodes: int) -> Acting:
-    """The policy of all seeds, as in evaluations, for the given number of episodes of each seed, from their beginning."""
-    memory = [new_memory(config, len(seeds), episodes)]
-    random = [generator(seed, Stream.EVALUATION_NOISE, 0) for seed in seeds]
+def _empty_trajectory(spec: EnvSpec, timestep: Timestep, n_steps: int) -> Trajectory:
+    n_seeds, n_envs = timestep.terminated.shape
 
-    def act(shown: Timestep, new: np.ndarray) -> np.ndarray:
-        given = memory[0], shown.observation, shown.available, new
-        action, memory[0] = evaluation_action(functions, config, actor, *given, random)
-        return action
+    def empty_timestep() -> Timestep:
+        return jax.tree.map(lambda leaf: np.zeros((n_seeds, n_steps, *leaf.shape[1:]), leaf.dtype), timestep)
 
-    return act
+    action = np.zeros((n_seeds, n_steps, n_envs, spec.n_agents, spec.action_size), np.float32)
+    env_action = action.astype(np.float32 if spec.discrete else spec.low.dtype)
+    return Trajectory(empty_timestep(), action, env_action, empty_timestep())
 
 
-def evaluation_action(
-    functions: Compiled,
-    config: TrainConfig,
-    actor: Any,
-    memory: Any,
-    observation: Float[np.ndarray, "seeds envs agents observation"],
-    available: Bool[np.ndarray, "seeds envs agents action"],
-    new: Bool[np.ndarray, "seeds envs"],
-    random: Sequence[np.random.Generator],
-) -> tuple[Float[np.ndarray, "seeds envs agents action"], Any]:
-    """The actions of a policy as in evaluations, where only PPO's are random; and the policy's new memory."""
-    given = actor, memory, observation, available
-    if config.greedy:
-        action, memory = functions.act(*given, None, new)
-    else:
-        shape = (*observation.shape[1:3], config.noise_size)
-        noise = np.stack([host_noise(one, config.noise, shape) for one in random])
-        action, memory = functions.explore(*given, noise, new)
-    return np.asarray(action), memory
-
-
-def shaped(rows: Timestep, shape: tuple[int, ...]) -> Timestep:
-    """Views of the same arrays, by seeds and environments."""
-
-    def view(leaf: np.ndarray) -> np.ndarray:
-        return leaf.reshape(*shape, *leaf.shape[1:])
-
-    *parts, measures = rows
-    return Timestep(*map(view, parts), measures={name: view(values) for name, values in measures.items()})  # pyright: ignore
-
-
-def blank_trajectory(spec: EnvSpec, shown: Timestep, shape: tuple[int, int], time: int) -> Trajectory:
-    """An empty trajectory for so many steps."""
-    seeds, environments = shape
-
-    def rows(like: np.ndarray) -> np.ndarray:
-        return np.zeros((seeds, time, environments, *like.shape[2:]), like.dtype)
-
-    def timestep() -> Timestep:
-        return jax.tree.map(rows, shown)
-
-    action = np.zeros((seeds, time, environments, spec.agents, spec.action_size), np.float32)
-    taken = action.astype(np.float32 if spec.discrete else spec.low.dtype)
-    return Trajectory(timestep(), action, taken, timestep())
-
-
-def write(rows: Timestep, shown: Timestep, time: int) -> None:
-    """Copy a time step to its place in a trajectory."""
-    *columns, measures = rows
-    for column, value in zip(columns, shown, strict=False):
-        column[:, time] = value
+def _write_timestep(columns: Timestep, t: int, timestep: Timestep) -> None:
+    *arrays, measures = columns
+    for column, value in zip(arrays, timestep, strict=False):
+        column[:, t] = value
     for name, column in measures.items():
-        column[:, time] = shown.measures[name]
-
-
-def check_finite(action: Float[np.ndarray, "seeds *rest"], seeds: Sequence[int]) -> None:
-    """Raise `Diverged` if the actions of a seed's policy are not finite."""
-    for seed, chosen in zip(seeds, action, strict=True):
-        if not np.isfinite(chosen).all():
-            raise Diverged(
-                f"training diverged: the policy of seed {seed} is not finite any more; the last checkpoint is whole"
-            )
-
-
-def evaluate(envs: Envs, act: Acting, seeds: Sequence[int], episodes: int, first: int = 0) -> Evaluation:
-    """One episode in each environment, all in lockstep, each from its own initial state.
-
-    The initial states depend only on the seed and on the episode's number, which counts from `first`. So every evaluation of a
-    run begins from the same ones, and no training episode does.
-    """
-    spec, shape = envs.spec, (len(seeds), episodes)
-
-    starts = [
-        episode_seed(seed, Stream.EVALUATION_EPISODES, place)
-        for seed in seeds
-        for place in range(first, first + episodes)
-    ]
-    running, new = np.ones(len(starts), bool), np.ones(shape, bool)
-    teams = len(spec.teams)
-    returns, sums = np.zeros((*shape, teams)), np.zeros((*shape, teams))
-    lengths = np.zeros(shape, int)
-    measures = {name: np.full(shape, np.nan) for name in spec.measures}
-    try:
-        envs.reset(running, np.array(starts))
-        shown = shaped(envs.batch, shape)
-        while running.any():
-            actions = act(shown, new)
-            alive = shown.alive.copy()
-            check_finite(actions, seeds)
-            rows = env_action(actions, spec)
-            envs.step(rows.reshape(-1, *rows.shape[2:]), running)
-            now = running.reshape(shape)
-            earned = shown.reward.astype(np.float64) * now[..., None]
-            returns += np.stack([team_mean(earned, alive, team) for team in spec.teams], axis=-1)
-            sums += np.stack([earned[..., team.agents].sum(axis=-1) for team in spec.teams], axis=-1)
-            lengths += now
-            ended = now & (shown.terminated | shown.truncated)
-            for name, values in measures.items():
-                values[ended] = shown.measures[name][ended]
-            running, new = running & ~ended.ravel(), np.zeros_like(new)
-    except EnvironmentFault as fault:
-        where = "" if fault.place is None else f", in an evaluation of seed {seeds[fault.place // episodes]}"
-        raise EnvironmentFault(f"{fault}{where}") from None
-    return Evaluation(returns, sums, lengths, measures)
+        column[:, t] = timestep.measures[name]

@@ -1,10 +1,9 @@
-"""How the decoders learn from finished episodes: predict their returns, add them to sums, fit the decoders to the sums.
+"""How the decoders learn from finished episodes: predict their returns, add them to sufficient statistics, fit.
 
-Every method that predicts returns has this order: predict, then learn. So `credit/return_r2` is measured on returns that nothing
-had been fitted to.
+Every method that predicts returns has this order, so that `credit/return_r2` is measured on returns before anything is fitted to them.
 
 The functions are written for all seeds: steps are read in lockstep, and closed-form fits are made one seed after the other, when
-they are due. The functions must be called within `float64()`, because `closed_form.py` needs float64.
+they are due. Call them within `float64()`, because `closed_form.py` needs float64.
 """
 
 from collections.abc import Callable
@@ -15,123 +14,113 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from lare_rl.credit import closed_form, decomposition, returns
-from lare_rl.credit import prequential as prediction
-from lare_rl.credit.decomposition import Decomposition, Episodes
+from lare_rl.credit import closed_form, prequential, returns
+from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.methods import Fit
 from lare_rl.data import replay
 from lare_rl.data.replay import Replay
-from lare_rl.data.sampling import episodes_since, in_order
-from lare_rl.training.learner import episodes_of
+from lare_rl.data.sampling import count_episodes_since, episodes_in_order
+from lare_rl.training.decoder_inputs import episode_batch
 from lare_rl.training.static_config import TrainConfig
 
-ROWS = 8000
-"""The most judged rows that are read at a time, unless a single episode has more."""
-PLACES = prediction.LAST
-"""The most episodes that are read at a time."""
+__all__ = ["Decoders", "fold_episodes", "learn_returns"]
 
-Credit = tuple[Decomposition, ...]
-Carried = TypeVar("Carried")
+MAX_ROWS = 8000
+"""The most rows of decoder inputs that are read at a time, unless a single episode has more."""
+
+Decoders = tuple[Decomposition, ...]
+State = TypeVar("State")
 
 
 def learn_returns(
-    credit: Credit, buffer: Replay, counted: Int[Array, "seeds envs"], config: TrainConfig
-) -> tuple[Credit, Int[Array, "seeds envs"]]:
-    """Let the decoders learn from episodes that have finished. Everything has a leading seed axis.
+    decoders: Decoders, buffer: Replay, n_learned: Int[Array, "seeds envs"], config: TrainConfig
+) -> tuple[Decoders, Int[Array, "seeds envs"]]:
+    """Let the decoders learn from episodes that have finished. Every array has a leading seed axis.
 
-    Returns the decoders of each team, and how many episodes they have learned from.
+    Returns:
+        The decoders of each team, and how many episodes they have learned from.
     """
-    before = jnp.sum(counted, axis=1)
-    new = jnp.sum(buffer.episodes, axis=1) - before
-    due = new >= jnp.maximum(returns.GROWTH * before, 1)
-    learn = partial(learn_those_due, buffer=buffer, counted=counted, due=due, config=config)
-    credit = jax.lax.cond(jnp.any(due), learn, lambda same: same, credit)
-    return credit, jnp.where(due[:, None], buffer.episodes, counted).astype(counted.dtype)
+    n_before = jnp.sum(n_learned, axis=1)
+    n_new = jnp.sum(buffer.episodes, axis=1) - n_before
+    is_due = n_new >= jnp.maximum(returns.MIN_GROWTH * n_before, 1)
+    learn = partial(_learn_if_due, buffer=buffer, n_learned=n_learned, is_due=is_due, config=config)
+    decoders = jax.lax.cond(jnp.any(is_due), learn, lambda unchanged: unchanged, decoders)
+    return decoders, jnp.where(is_due[:, None], buffer.episodes, n_learned).astype(n_learned.dtype)
 
 
-def learn_those_due(
-    credit: Credit,
+def _learn_if_due(
+    decoders: Decoders,
     buffer: Replay,
-    counted: Int[Array, "seeds envs"],
-    due: Bool[Array, " seeds"],
+    n_learned: Int[Array, "seeds envs"],
+    is_due: Bool[Array, " seeds"],
     config: TrainConfig,
-) -> Credit:
-    """`learn_returns`, if at least one seed is due."""
-    since = jnp.where(due[:, None], counted, buffer.episodes)
-    learned = jax.vmap(partial(tell, config=config))(credit, buffer, since)
-    if learned[0].closed is None:
-        return learned
+) -> Decoders:
+    since = jnp.where(is_due[:, None], n_learned, buffer.episodes)
+    decoders = jax.vmap(partial(_predict_then_update, config=config))(decoders, buffer, since)
+    if decoders[0].closed_form is None:
+        return decoders
     if config.method.fit is not Fit.SIGNS:  # signs need no standardised factors
-        again = due & jax.vmap(returns.is_stale)(learned[0])
-        everything = jax.vmap(partial(sum_again, config=config))
-        learned = jax.lax.cond(jnp.any(again), everything, lambda same, *_: same, learned, buffer, again)
-    return tuple(fit_those_due(one, due, config) for one in learned)
+        is_stale = is_due & jax.vmap(returns.is_stale)(decoders[0])
+        rebuild = jax.vmap(partial(_rebuild_statistics, config=config))
+        decoders = jax.lax.cond(jnp.any(is_stale), rebuild, lambda unchanged, *_: unchanged, decoders, buffer, is_stale)
+    return tuple(_fit_closed_forms(decoder, is_due, config) for decoder in decoders)
 
 
-def pieces(
-    carried: tuple[Carried, ...],
+def fold_episodes(
+    states: tuple[State, ...],
     buffer: Replay,
     since: Int[Array, " envs"],
-    take: Callable[[Carried, Episodes, Bool[Array, " episodes"]], Carried],
+    body: Callable[[State, CreditBatch], State],
     config: TrainConfig,
-    expected: int = PLACES,
-) -> tuple[Carried, ...]:
-    """Apply `take` to what each team carries, such as its decoder, and to all finished episodes from number `since` on, about
-    `expected` at a time.
+    expected: int = prequential.WINDOW,
+) -> tuple[State, ...]:
+    """Apply `body` to the state of each team and to batches of the finished episodes from number `since` on, of one seed.
+
+    Args:
+        states: one state for each team, such as its decoder.
+        buffer: the replay.
+        since: the number of the first episode, in each environment.
+        body: the function from a state and a batch of whole episodes to the next state.
+        config: the configuration of the run.
+        expected: about how many episodes there are.
     """
-    longest = config.env.max_steps
-    rows = max(1, min(expected, PLACES, ROWS // (config.judged_rows * longest))) * longest
-    total = jnp.sum(episodes_since(buffer, since))
+    longest, n_episodes = config.env.max_steps, prequential.WINDOW
+    rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.credit_rows * longest))) * longest
+    total = jnp.sum(count_episodes_since(buffer, since))
 
-    def piece(carry: tuple[Int[Array, ""], tuple[Carried, ...]]) -> tuple[Int[Array, ""], tuple[Carried, ...]]:
-        start, carried = carry
-        sample = in_order(buffer, since, start, PLACES, rows)
-        steps, there = replay.read(buffer, sample.steps), sample.episodes.mask > 0
-        carried = tuple(
-            take(one, episodes_of(steps, sample, config, place), there) for place, one in enumerate(carried)
-        )
-        return start + jnp.sum(there), carried
+    def read_batch(carry: tuple[Int[Array, ""], tuple[State, ...]]) -> tuple[Int[Array, ""], tuple[State, ...]]:
+        start, states = carry
+        sample = episodes_in_order(buffer, since, start, n_episodes, rows)
+        steps = replay.read(buffer, sample.steps)
+        states = tuple(body(state, episode_batch(steps, sample, config, i)) for i, state in enumerate(states))
+        return start + jnp.sum(sample.episodes.mask > 0), states
 
-    return jax.lax.while_loop(lambda carry: carry[0] < total, piece, (jnp.zeros_like(total), carried))[1]
+    return jax.lax.while_loop(lambda carry: carry[0] < total, read_batch, (jnp.zeros_like(total), states))[1]
 
 
-def tell(credit: Credit, buffer: Replay, since: Int[Array, " envs"], config: TrainConfig) -> Credit:
-    """One seed: predict the returns of new episodes, and add them to the sums."""
-
-    def take(one: Decomposition, episodes: Episodes, there: Bool[Array, " episodes"]) -> Decomposition:
-        one = returns.predict(one, episodes, there, config.credit)
-        return one if one.closed is None else returns.add_episodes(one, episodes, there)
-
-    return pieces(
-        credit, buffer, since, take, config, config.environments * config.rollout_steps // config.env.max_steps
-    )
+def _predict_then_update(
+    decoders: Decoders, buffer: Replay, since: Int[Array, " envs"], config: TrainConfig
+) -> Decoders:
+    body = partial(returns.predict_then_update, settings=config.credit)
+    expected = config.n_envs * config.rollout_steps // config.env.max_steps
+    return fold_episodes(decoders, buffer, since, body, config, expected)
 
 
-def sum_again(credit: Credit, buffer: Replay, again: Bool[Array, ""], config: TrainConfig) -> Credit:
-    """One seed: if `again` is true, new sums over all stored episodes, with features standardised by the current statistics."""
-    empty = tuple(returns.begin_again(one) for one in credit)
-    since = jnp.where(again, buffer.oldest, buffer.episodes)
-    summed = pieces(empty, buffer, since, returns.add_episodes, config)
-    return jax.tree.map(lambda new, old: jnp.where(again, new, old), summed, credit)
+def _rebuild_statistics(decoders: Decoders, buffer: Replay, is_stale: Bool[Array, ""], config: TrainConfig) -> Decoders:
+    """Add all stored episodes to new sums if `is_stale` is true, with features standardised by the current statistics."""
+    empty = tuple(map(returns.reset_statistics, decoders))
+    since = jnp.where(is_stale, buffer.oldest, buffer.episodes)
+    rebuilt = fold_episodes(empty, buffer, since, returns.add_episodes, config)
+    return jax.tree.map(lambda new, old: jnp.where(is_stale, new, old), rebuilt, decoders)
 
 
-def from_stored(credit: Credit, buffer: Replay, config: TrainConfig) -> Credit:
-    """One seed: decoders with all finished episodes of a replay in their statistics and sums, but not fitted yet."""
+def _fit_closed_forms(decoder: Decomposition, is_due: Bool[Array, " seeds"], config: TrainConfig) -> Decomposition:
+    """Make the closed-form fits of a team's decoder for the seeds that are due, one after the other."""
+    fit = partial(returns.fit_closed_form, method=config.method, score_types=config.score_types)
 
-    def observe(one: Decomposition, episodes: Episodes, there: Bool[Array, " episodes"]) -> Decomposition:
-        return decomposition.observe_steps(one, episodes.features, decomposition.counted_rows(episodes, there))
+    def fit_seed(seed: tuple[Decomposition, Bool[Array, ""]]) -> Decomposition:
+        decoder, is_due = seed
+        assert decoder.closed_form is not None
+        return jax.lax.cond(is_due & closed_form.is_due(decoder.closed_form), fit, lambda unchanged: unchanged, decoder)
 
-    credit = pieces(credit, buffer, buffer.oldest, observe, config)
-    return sum_again(credit, buffer, jnp.array(True), config)
-
-
-def fit_those_due(credit: Decomposition, due: Bool[Array, " seeds"], config: TrainConfig) -> Decomposition:
-    """Make the closed-form fits of the seeds that are due."""
-
-    def one(of_seed: tuple[Decomposition, Bool[Array, ""]]) -> Decomposition:
-        credit, due = of_seed
-        assert credit.closed is not None
-        fit = partial(returns.fit_in_closed_form, method=config.method, forms=config.forms)
-        return jax.lax.cond(due & closed_form.is_due(credit.closed), fit, lambda same: same, credit)
-
-    return jax.lax.map(one, (credit, due))
+    return jax.lax.map(fit_seed, (decoder, is_due))

@@ -1,4 +1,4 @@
-"""What the stored returns of a run say about its factors, whatever decoder it trains with."""
+"""Explain a run's stored returns by its factors, whatever decoder the run trains with."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,101 +8,105 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool
 
-from lare_rl.credit import closed_form, decomposition, returns
-from lare_rl.credit.closed_form import LinearDecoder
-from lare_rl.credit.decomposition import Episodes
-from lare_rl.credit.explanation import Explanation, Steps, add_steps, explain, no_steps
-from lare_rl.credit.explanation_text import FEWEST, entry_names, words
-from lare_rl.credit.methods import METHODS, Decoder
+from lare_rl.credit import returns
+from lare_rl.credit.decomposition import CreditBatch, valid_rows
+from lare_rl.credit.engine import add_to_explanation, explain_returns, init_explanation
+from lare_rl.credit.explanation import Explanation
+from lare_rl.credit.explanation_text import MIN_EPISODES, explanation_lines, raw_feature_names
+from lare_rl.credit.methods import METHODS
 from lare_rl.data.replay import Replay
+from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
 from lare_rl.runs.directory import Run
-from lare_rl.training.episodes import from_stored, pieces
-from lare_rl.training.learner import Learner, init_credit
-from lare_rl.training.seed_axis import of_seed
-from lare_rl.training.session import load_learner
+from lare_rl.training.compile_cache import cache_by_value
+from lare_rl.training.episodes import fold_episodes
+from lare_rl.training.learner import Learner
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import float64
 
-
-def judging(config: TrainConfig) -> TrainConfig:
-    """The run's configuration, with a closed-form fit that explains its returns from the columns of its replay."""
-    shown = "state" if config.of_state else "observation"
-    raw = {shown, "action"} <= set(config.columns)
-    if not config.method.latent:
-        method = METHODS["bayes"]
-        return replace(config, method=method if raw else replace(method, encoder=config.method.encoder))
-    method = METHODS["lare-bayes"] if raw else replace(METHODS["lare-linear"], decoder=Decoder.ADDITIVE)
-    return replace(config, method=method)
+__all__ = ["describe_returns", "explain_run", "explain_stored_returns"]
 
 
-def explanations(learner: Learner, config: TrainConfig) -> list[Explanation]:
-    """Explanations of the first seed's stored episodes, one for each team.
-
-    Empty for a method that fits nothing to returns, and for too few episodes.
-    """
-    chosen, held = judging(config), learner.replay
-    known = learner.credit and all(basis.size for basis in chosen.bases)
-    if not known or np.sum(np.asarray(held.episodes)[0] - np.asarray(held.oldest)[0]) < FEWEST:
-        return []
-    with float64():
-        found = explaining(chosen)(held, tuple(credit.average for credit in learner.credit))
-        return [jax.tree.map(np.asarray, each) for each in found]
+def explain_run(run: Run) -> list[str]:
+    """Return the explanation of the returns in a run's last checkpoint, in sentences."""
+    config, learner, _, _ = load_learner(run)
+    return describe_returns(run, learner, config)
 
 
-def explaining(config: TrainConfig) -> Callable[..., list[Explanation]]:
-    """`explain_stored`, compiled."""
-    return jax.jit(partial(explain_stored, config=config))
-
-
-def explain_stored(
-    replay: Replay, averages: tuple[Bool[Array, " seeds"], ...], config: TrainConfig
-) -> list[Explanation]:
-    """Explanations from all finished episodes of the first seed."""
-    buffer, average = of_seed((replay, averages))
-    credit = from_stored(init_credit([jax.random.key(0)] * len(average), config), buffer, config)
-    closed = [one.closed for one in credit if one.closed is not None]
-
-    def take(
-        carried: tuple[LinearDecoder, Steps], episodes: Episodes, there: Bool[Array, " episodes"]
-    ) -> tuple[LinearDecoder, Steps]:
-        decoder, steps = carried
-        rows = decomposition.counted_rows(episodes, there)
-        return decoder, add_steps(steps, decoder.features(episodes.features), rows, decoder.basis)
-
-    empty = tuple((one.decoder, no_steps(one.decoder.basis)) for one in closed)
-    summed = pieces(empty, buffer, buffer.oldest, take, config)
-    return [
-        explain(closed_form.whole(one.summed), steps, form.astype(int), one.decoder.basis)
-        for one, (_, steps), form in zip(closed, summed, average, strict=True)
-    ]
-
-
-def described(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
-    """The explanations of the returns of a run's first seed, in sentences."""
+def describe_returns(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
+    """Return the explanation of the returns of a run's first seed, in sentences."""
     lines: list[str] = []
     roles = run.config.task.roles
-    for place, found in enumerate(explanations(learner, config)):
-        function = run.functions[place] if run.functions else None
-        factors = [] if function is None else function.columns_by(run.judges)
-        form = returns.form_found(of_seed(learner.credit[place]))
-        role = roles[place]
-        entries = (
+    for i, explanation in enumerate(explain_stored_returns(learner, config)):
+        role, function = roles[i], run.functions[i] if run.functions else None
+        factor_names = [] if function is None else function.factor_columns(run.factor_inputs)
+        n_raw, has_both = len(explanation.residual_correlation), config.factor_inputs == "both"
+        raw_names = (
             []
-            if config.of_state
-            else entry_names(role.observation, role.action, len(found.left), role.action_size, config.judges == "both")
+            if config.team_level
+            else raw_feature_names(role.observation, role.action, n_raw, role.action_size, has_both)
         )
-        team = f"{config.env.teams[place].name}: " if len(roles) > 1 else ""
-        lines += [team + line for line in words(found, form, factors, entries)]
-    about = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
-    if config.method.descends:
-        about.append(f"by a closed-form fit to the stored returns, which is not the decoder of {config.method.name}")
-    if lines and about:
-        head = ", ".join(about)
-        lines.insert(0, f"{head[0].upper()}{head[1:]}:")
+        score_type = returns.estimate_score_type(select_seed(learner.credit[i]))
+        prefix = f"{config.env.teams[i].name}: " if len(roles) > 1 else ""
+        lines += [prefix + line for line in explanation_lines(explanation, score_type, factor_names, raw_names)]
+    remarks = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
+    if config.method.uses_gradient:
+        remarks.append(f"by a closed-form fit to the stored returns, which is not the decoder of {config.method.name}")
+    if lines and remarks:
+        heading = ", ".join(remarks)
+        lines.insert(0, f"{heading[0].upper()}{heading[1:]}:")
     return lines
 
 
-def explanation_of(run: Run) -> list[str]:
-    """`described` for a run's last checkpoint."""
-    config, learner, _, _ = load_learner(run)
-    return described(run, learner, config)
+def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explanation]:
+    """Explain the returns of the first seed's stored episodes, for each team.
+
+    The list is empty for a method that fits nothing to returns, and for fewer than `MIN_EPISODES` episodes.
+    """
+    config, replay = _explanation_config(config), learner.replay
+    n_stored = np.sum(np.asarray(replay.episodes)[0] - np.asarray(replay.oldest)[0])
+    has_features = all(spec.basis.n_features for spec in config.credit_specs)
+    if not learner.credit or not has_features or n_stored < MIN_EPISODES:
+        return []
+    with float64():
+        explanations = _compile(config)(replay, tuple(decoder.is_mean for decoder in learner.credit))
+        return jax.tree.map(np.asarray, explanations)
+
+
+def _explanation_config(config: TrainConfig) -> TrainConfig:
+    """Return the run's configuration with a closed-form method, whose inputs are in the columns of the run's replay."""
+    observed = "state" if config.team_level else "observation"
+    has_raw_features = {observed, "action"} <= set(config.columns)
+    if config.method.needs_phi:
+        method = METHODS["lare-bayes"]
+        if not has_raw_features:
+            method = replace(METHODS["lare-linear"], decoder="additive")
+    else:
+        method = METHODS["bayes"]
+        if not has_raw_features:
+            method = replace(method, encoder=config.method.encoder)
+    return replace(config, method=method)
+
+
+@cache_by_value
+def _compile(config: TrainConfig) -> Callable[..., list[Explanation]]:
+    return jax.jit(partial(_explain_first_seed, config=config))
+
+
+def _explain_first_seed(
+    replay: Replay, is_mean: tuple[Bool[Array, " seeds"], ...], config: TrainConfig
+) -> list[Explanation]:
+    buffer, is_mean = select_seed((replay, is_mean))
+    bases = [spec.basis for spec in config.credit_specs]
+    empty = tuple(empty_mean_std(basis.n_inputs) for basis in bases)
+    # The features are standardised first, because the run's decoder may have other inputs, or statistics of earlier steps.
+    statistics = fold_episodes(empty, buffer, buffer.oldest, _observe, config)
+    states = tuple(init_explanation(team, basis) for team, basis in zip(statistics, bases, strict=True))
+    states = fold_episodes(states, buffer, buffer.oldest, add_to_explanation, config)
+    return [explain_returns(state, mean.astype(int)) for state, mean in zip(states, is_mean, strict=True)]
+
+
+def _observe(statistics: RunningMeanStd, episodes: CreditBatch) -> RunningMeanStd:
+    rows = episodes.features.reshape(-1, episodes.features.shape[-1])
+    return update_mean_std(statistics, rows, valid_rows(episodes).ravel())

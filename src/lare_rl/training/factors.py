@@ -9,67 +9,78 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.play import rows_of
+from lare_rl.envs.play import phi_inputs
+from lare_rl.errors import LareError
+from lare_rl.latent.factors import LatentRewardError
 from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.graph import Graph
 from lare_rl.runs.directory import Run
-from lare_rl.tasks.spec import judged_states
+from lare_rl.tasks.spec import select_states
 from lare_rl.training.static_config import TrainConfig
+from lare_rl.util.files import write_atomically
 
-MOST_COMPILED, DEEPEST_COMPILED = 400, 200
+__all__ = ["compute_factors", "compute_host_factors", "is_compilable"]
+
+MAX_COMPILED_OPERATIONS, MAX_COMPILED_DEPTH = 400, 200
 """Graphs with more operations, or with a longer chain of them, are computed by NumPy: XLA would compile for too long."""
 
-
-def compiles(graph: Graph) -> bool:
-    """Whether a graph becomes part of a compiled function."""
-    return len(graph.operations) <= MOST_COMPILED and graph.depth <= DEEPEST_COMPILED
+FAILED_BATCH = "failed_batch.npz"
 
 
-def step_factors(graphs: Sequence[Graph], steps: Trajectory, config: TrainConfig) -> Float[Array, "*lead rows factors"]:
-    """The factors z of steps, inside a compiled function: each team's phi on its agents' observations, or on the state.
+def is_compilable(graph: Graph) -> bool:
+    """Return whether a graph becomes part of a compiled function."""
+    return len(graph.operations) <= MAX_COMPILED_OPERATIONS and graph.depth <= MAX_COMPILED_DEPTH
+
+
+def compute_factors(
+    graphs: Sequence[Graph], steps: Trajectory, config: TrainConfig
+) -> Float[Array, "*lead rows factors"]:
+    """Compute the factors z of steps inside a compiled function, by each team's phi.
 
     They are padded to the largest number of factors.
     """
-    lead = steps.after.terminated.shape
-    factors = jnp.zeros((*lead, config.judged_rows, max(config.factors, default=0)), jnp.float32)
-    for i, graph in enumerate(graphs):
-        columns = [_factors(graph, observation, action) for observation, action in _judged_inputs(steps, config, i)]
-        columns = jnp.concatenate(columns, axis=-1)
-        factors = factors.at[..., config.judged(i), : columns.shape[-1]].set(columns)
+    lead = steps.next_timestep.terminated.shape
+    factors = jnp.zeros((*lead, config.credit_rows, max(config.n_factors, default=0)), jnp.float32)
+    for i, (graph, team) in enumerate(zip(graphs, config.env.teams, strict=False)):
+        timesteps = select_states(config.factor_inputs, steps.timestep, steps.next_timestep)
+        inputs = [phi_inputs(config.credit_scope, team, timestep, steps.env_action) for timestep in timesteps]
+        columns = jnp.concatenate([_evaluate_graph(graph, *arrays) for arrays in inputs], axis=-1)
+        factors = factors.at[..., config.team_rows(i), : columns.shape[-1]].set(columns)
     return factors
 
 
-def _factors(graph: Graph, observation: Array, action: Array) -> Float[Array, "*batch factors"]:
-    if compiles(graph):
+def _evaluate_graph(graph: Graph, observation: Array, action: Array) -> Float[Array, "*batch factors"]:
+    if is_compilable(graph):
         return evaluate(graph, {"observation": observation, "action": action}, jnp)["factors"]
 
-    def on_host(observation: Any, action: Any) -> np.ndarray:
+    def evaluate_on_host(observation: Any, action: Any) -> np.ndarray:
         inputs = {"observation": np.asarray(observation), "action": np.asarray(action)}
         return np.ascontiguousarray(evaluate(graph, inputs)["factors"])
 
-    shape = jax.ShapeDtypeStruct((*observation.shape[:-1], graph.factor_count), jnp.float32)
-    return jax.pure_callback(on_host, shape, observation, action, vmap_method="broadcast_all")
+    shape = jax.ShapeDtypeStruct((*observation.shape[:-1], graph.n_factors), jnp.float32)
+    return jax.pure_callback(evaluate_on_host, shape, observation, action, vmap_method="broadcast_all")
 
 
-def host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Float[np.ndarray, "*lead rows factors"]:
-    """The factors z of steps, computed on the host; none for a method without phi.
+def compute_host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Float[np.ndarray, "*lead rows factors"]:
+    """Compute the factors z of steps on the host. They are empty for a method without phi.
 
     Raises:
-        LareError: a factor is not finite; the input is saved in the run directory.
+        LareError: a factor is not finite. Its batch is saved in the run directory, so that the user can inspect it.
     """
     steps = jax.tree.map(np.asarray, steps)
-    lead = steps.taken.shape[:-2]
-    factors = np.zeros((*lead, config.judged_rows, max(config.factors, default=0)), np.float32)
+    lead = steps.env_action.shape[:-2]
+    factors = np.zeros((*lead, config.credit_rows, max(config.n_factors, default=0)), np.float32)
     for i, (function, team) in enumerate(zip(run.functions, config.env.teams, strict=False)):
-        before, action = rows_of(config.judged_from, team, steps.before, steps.taken)
-        after, _ = rows_of(config.judged_from, team, steps.after, steps.taken)
-        columns = run.factors(function, *(rows.reshape(-1, rows.shape[-1]) for rows in (before, action, after)))
-        factors[..., config.judged(i), : columns.shape[1]] = columns.reshape(*action.shape[:-1], -1)
+        before, action = phi_inputs(config.credit_scope, team, steps.timestep, steps.env_action)
+        after, _ = phi_inputs(config.credit_scope, team, steps.next_timestep, steps.env_action)
+        observation, env_action, next_observation = (
+            array.reshape(-1, array.shape[-1]) for array in (before, action, after)
+        )
+        try:
+            columns = function.step_factors(observation, env_action, next_observation, run.factor_inputs)
+        except LatentRewardError as error:
+            path, batch = run.directory / FAILED_BATCH, {"observation": error.observation, "action": error.action}
+            write_atomically(path, lambda file, batch=batch: np.savez(file, allow_pickle=False, **batch))
+            raise LareError(f"{error}; it was given the batch in {path}; the last checkpoint is whole") from error
+        factors[..., config.team_rows(i), : columns.shape[1]] = columns.reshape(*action.shape[:-1], -1)
     return factors
-
-
-def _judged_inputs(steps: Trajectory, config: TrainConfig, team_index: int) -> list[tuple[Any, Any]]:
-    """Observations (*lead, rows, size) and actions (*lead, rows, size) for each observation of a step that phi judges."""
-    team = config.env.teams[team_index]
-    sides = judged_states(config.judges, steps.before, steps.after)
-    return [rows_of(config.judged_from, team, timestep, steps.taken) for timestep in sides]

@@ -14,102 +14,106 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from lare_rl.credit import returns
-from lare_rl.credit.decomposition import Decomposition, Episodes
-from lare_rl.credit.prequential import LAST, no_predictions, squared_errors
-from lare_rl.data.replay import Replay, finished
-from lare_rl.nn.normalise import magnitude
-from lare_rl.training.episodes import Credit, pieces
+from lare_rl.credit.prequential import WINDOW, empty_predictions, squared_errors
+from lare_rl.data.replay import Replay, hide_newest, n_finished
+from lare_rl.nn.normalise import root_mean_square
+from lare_rl.training.episodes import Decoders, fold_episodes
 from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
 
-FEWEST = 10
-"""If a seed has fewer finished episodes, none are held out."""
+__all__ = ["FirstFitStoppedError", "config_of_first_fit", "fit_until_converged", "has_enough_episodes"]
+
+MIN_EPISODES = 10
+"""With fewer finished episodes of a seed, none are held out."""
 PATIENCE = 2
-"""The fitting of a seed stops after so many fits in a row without improvement."""
-MOST = 40
-"""The most fits."""
-SMALLER = 8
-"""An update draws one in so many of the steps of a later update. There are few episodes yet, and large updates would see each of
-them several times. The decoder becomes as accurate in an eighth of the time (benchmarks/first_fit.py)."""
+"""A seed's fit ends after this many rounds in a row without improvement."""
+MAX_ROUNDS = 40
+BATCH_DIVISOR = 8
+"""Updates of the first fit read this fraction of the steps of later updates. There are few episodes yet, and large updates would read
+each of them several times. The decoder becomes as accurate in an eighth of the time (benchmarks/first_fit.py)."""
+
+FitFunction = Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, dict[str, Float[Array, " seeds"]]]]
 
 
-class Stopped(Exception):
+class FirstFitStoppedError(Exception):
     """The user asked the run to stop during the first fit. Nothing of this iteration is kept."""
 
 
-Fit = Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, dict[str, Float[Array, " seeds"]]]]
+def has_enough_episodes(learner: Learner) -> bool:
+    """Return whether every seed has episodes to hold out."""
+    return int(jnp.min(jnp.sum(jax.vmap(n_finished)(learner.replay), axis=1))) >= MIN_EPISODES
 
 
-def has_enough(learner: Learner) -> bool:
-    """Whether every seed has episodes to hold out."""
-    return int(jnp.min(jnp.sum(jax.vmap(finished)(learner.replay), axis=1))) >= FEWEST
-
-
-def with_smaller_updates(config: TrainConfig) -> TrainConfig:
-    """The configuration of the first fit: updates draw fewer episodes, and at least one."""
-    steps = max(config.credit.steps // SMALLER, config.env.max_steps)
+def config_of_first_fit(config: TrainConfig) -> TrainConfig:
+    """Return the configuration of the first fit: updates read fewer steps, and at least an episode."""
+    steps = max(config.credit.steps // BATCH_DIVISOR, config.env.max_steps)
     return replace(config, credit=config.credit.model_copy(update={"steps": min(steps, config.credit.steps)}))
 
 
-def fit_until_it_stops_helping(
-    learner: Learner, fit: Fit, keys: Key[Array, " seeds"], config: TrainConfig, stopped: Callable[[], bool]
+def fit_until_converged(
+    learner: Learner,
+    fit: FitFunction,
+    keys: Key[Array, " seeds"],
+    config: TrainConfig,
+    stop_requested: Callable[[], bool],
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
-    """Fit repeatedly; for each seed, the decoders with the least error on held-out episodes are kept.
+    """Fit the decoders repeatedly, and keep those with the least error on held-out episodes, for each seed.
 
     Args:
         learner: the learner of all seeds, with enough episodes.
-        fit: one fit, which consumes the learner that it is given.
-        keys: the random keys of the first fit; those of the others are derived from them.
+        fit: one round of updates. It consumes its learner.
+        keys: the random keys of the first round. Those of later rounds are derived from them.
         config: the configuration of the run.
-        stopped: whether the user has asked the run to stop.
+        stop_requested: whether the user has asked the run to stop.
 
     Raises:
-        Stopped: the user has asked the run to stop.
+        FirstFitStoppedError: the user has asked the run to stop.
     """
     episodes, running = jnp.copy(learner.replay.episodes), jnp.copy(learner.replay.running)
-    held = jax.vmap(held_out)(learner.replay)
-    assess = jax.jit(jax.vmap(partial(error_of, config=config)))
-    best, least = jax.tree.map(jnp.copy, learner.credit), np.full(len(episodes), np.inf)
-    waited = np.zeros(len(episodes), int)
-    measured: dict[str, Float[Array, " seeds"]] = {}
-    for number in range(MOST):
-        if stopped():
-            raise Stopped
-        hidden = learner.replay._replace(episodes=episodes - held, running=running | (held > 0))
-        again = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
-        learner, measured = fit(learner._replace(replay=hidden), again)
-        whole = learner.replay._replace(episodes=jnp.copy(episodes), running=jnp.copy(running))
-        learner = learner._replace(replay=whole)
-        error = np.asarray(assess(learner.credit, whole, held))
-        better = (error < least) & (waited < PATIENCE)  # how long a seed is fitted does not depend on the others
-        best = jax.tree.map(partial(of_those, jnp.asarray(better)), learner.credit, best)
-        least, waited = np.where(better, error, least), np.where(better, 0, waited + 1)
-        if (waited >= PATIENCE).all():
+    n_hidden = jax.vmap(_count_held_out)(learner.replay)
+    compute_error = jax.jit(jax.vmap(partial(_held_out_error, config=config)))
+    best_decoders, best_error = jax.tree.map(jnp.copy, learner.credit), np.full(len(episodes), np.inf)
+    rounds_without_gain = np.zeros(len(episodes), int)
+    metrics: dict[str, Float[Array, " seeds"]] = {}
+    for number in range(MAX_ROUNDS):
+        if stop_requested():
+            raise FirstFitStoppedError
+        round_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
+        learner, metrics = fit(learner._replace(replay=hide_newest(learner.replay, n_hidden)), round_keys)
+        # Copies, because the next round consumes its learner.
+        full = learner.replay._replace(episodes=jnp.copy(episodes), running=jnp.copy(running))
+        learner = learner._replace(replay=full)
+        error = np.asarray(compute_error(learner.credit, full, n_hidden))
+        # How long a seed is fitted does not depend on the other seeds.
+        is_better = (error < best_error) & (rounds_without_gain < PATIENCE)
+        best_decoders = jax.tree.map(partial(_select_seeds, jnp.asarray(is_better)), learner.credit, best_decoders)
+        best_error = np.where(is_better, error, best_error)
+        rounds_without_gain = np.where(is_better, 0, rounds_without_gain + 1)
+        if (rounds_without_gain >= PATIENCE).all():
             break
-    return learner._replace(credit=best), measured
+    return learner._replace(credit=best_decoders), metrics
 
 
-def of_those(better: Bool[Array, " seeds"], new: Array, old: Array) -> Array:
-    """The new values of the seeds that are better, and the old values of the others."""
-    return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+def _select_seeds(mask: Bool[Array, " seeds"], new: Array, old: Array) -> Array:
+    return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
-def held_out(buffer: Replay) -> Int[Array, " envs"]:
-    """How many of the newest episodes of each environment are held out: a fifth of all, from the last environments first."""
-    there = finished(buffer)
-    wanted = jnp.minimum(jnp.sum(there) // 5, LAST)
-    behind = jnp.cumsum(there[::-1])[::-1] - there
-    return jnp.clip(wanted - behind, 0, there)
+def _count_held_out(replay: Replay) -> Int[Array, " envs"]:
+    """Return how many of each environment's newest episodes are held out: a fifth of all, from the last environments first."""
+    available = n_finished(replay)
+    count = jnp.minimum(jnp.sum(available) // 5, WINDOW)
+    in_later_envs = jnp.cumsum(available[::-1])[::-1] - available
+    return jnp.clip(count - in_later_envs, 0, available)
 
 
-def error_of(credit: Credit, buffer: Replay, held: Int[Array, " envs"], config: TrainConfig) -> Float[Array, ""]:
-    """Squared error of the returns of held-out episodes, of one seed; summed over the teams, each in units of its returns."""
-
-    def take(one: Decomposition, new: Episodes, there: Bool[Array, " episodes"]) -> Decomposition:
-        return returns.predict(one, new, there, config.credit)
-
-    asked = tuple(one._replace(predictions=no_predictions(1)) for one in credit)
-    told = pieces(asked, buffer, buffer.episodes - held, take, config)
-    return sum(
-        (squared_errors(one.predictions)[0] / magnitude(one.return_scale) ** 2 for one in told), start=jnp.zeros(())
-    )
+def _held_out_error(
+    decoders: Decoders, replay: Replay, n_hidden: Int[Array, " envs"], config: TrainConfig
+) -> Float[Array, ""]:
+    """Return the squared error of the returns of held-out episodes, summed over the teams, each in units of its returns."""
+    decoders = tuple(decoder._replace(predictions=empty_predictions(1)) for decoder in decoders)
+    predict = partial(returns.predict, settings=config.credit)
+    decoders = fold_episodes(decoders, replay, replay.episodes - n_hidden, predict, config)
+    errors = [
+        squared_errors(decoder.predictions)[0] / root_mean_square(decoder.return_scale) ** 2 for decoder in decoders
+    ]
+    return sum(errors, start=jnp.zeros(()))

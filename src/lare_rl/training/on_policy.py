@@ -1,119 +1,121 @@
-"""Algorithms that consume rollouts: relabel the newest steps by the current decoder, update the policy on them.
+"""Algorithms that consume rollouts: relabel the newest steps by the current decoder, and update the policy on them.
 
 Algorithm 1 of the LaRe paper, lines 6 to 8, for PPO and IPPO. The decoder was fitted to all stored episodes before.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar, Shaped
 
-from lare_rl.algorithms import ppo
-from lare_rl.algorithms.settings import PPOSettings
+from lare_rl.algorithms.batches import Rollout
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.training import learner as common
-from lare_rl.training.learner import Learner, Paid
+from lare_rl.training.learner import Learner
+from lare_rl.training.rewards import RewardState, rewards
 from lare_rl.training.static_config import TrainConfig
 
-
-def settings_of(config: TrainConfig) -> PPOSettings:
-    """The algorithm's hyperparameters."""
-    assert isinstance(config.hyperparameters, PPOSettings)
-    return config.hyperparameters
+__all__ = ["act", "get_actor", "init", "init_memory", "policy_input", "train_step"]
 
 
-def init(key: PRNGKeyArray, config: TrainConfig) -> ppo.PPO:
-    """The untrained algorithm."""
+def init(key: PRNGKeyArray, config: TrainConfig) -> Any:
+    """Return the untrained algorithm."""
     env = config.env
-    return ppo.init(key, policy_input_size(config), env.action_size, env.discrete, settings_of(config))
-
-
-def policy_input_size(config: TrainConfig) -> int:
-    """Size of the rows that actor and critic see."""
-    return config.env.observation_size + (config.env.agents if len(config.env.teams) > 1 else 0)
+    # Several teams have different policies, in one network that sees the agent's number.
+    input_size = env.observation_size + (env.n_agents if len(env.teams) > 1 else 0)
+    return config.algorithm.load().init(key, input_size, env.action_size, env.discrete, config.hyperparameters)
 
 
 def policy_input(
     observation: Float[Array, "*batch agents observation"], config: TrainConfig
 ) -> Float[Array, "*batch agents policy_input"]:
-    """The input of actor and critic: the observation and, if there are several teams, the agent's one-hot number."""
+    """Return the input of actor and critic: the observation and, with several teams, the agent's one-hot number."""
     if len(config.env.teams) == 1:
         return observation
-    agents = config.env.agents
-    number = jnp.broadcast_to(jnp.eye(agents), (*observation.shape[:-1], agents))
-    return jnp.concatenate([observation, number], axis=-1)
+    n_agents = config.env.n_agents
+    one_hot = jnp.broadcast_to(jnp.eye(n_agents), (*observation.shape[:-1], n_agents))
+    return jnp.concatenate([observation, one_hot], axis=-1)
 
 
-def actor(learner: Learner, done: int, config: TrainConfig) -> ppo.Actor:
-    """The parts of the learner that are needed to act, for all seeds."""
-    return ppo.actor_of(learner.algorithm)
+def get_actor(learner: Learner, env_steps: int, config: TrainConfig) -> Any:
+    """Return the parts of the learner that are needed to act, for all seeds."""
+    return config.algorithm.load().get_actor(learner.algorithm)
 
 
-def memory(config: TrainConfig) -> tuple[()]:
-    """The memory of an actor: none."""
+def init_memory(config: TrainConfig) -> tuple[()]:
+    """Return the memory of an actor: none."""
     return ()
 
 
 def act(
-    actor: ppo.Actor,
+    actor: Any,
     memory: tuple[()],
     observation: Float[Array, "*batch agents observation"],
     available: Array,
     noise: Float[Array, "*batch agents action"] | None,
     config: TrainConfig,
 ) -> tuple[Float[Array, "*batch agents action"], tuple[()]]:
-    """The likeliest action or, with noise, an action of the policy."""
-    shown, choices = policy_input(observation, config), available if config.env.masks_actions else None
+    """Return the likeliest actions or, with noise, actions that the policy draws."""
+    algorithm = config.algorithm.load()
+    inputs, choices = policy_input(observation, config), available if config.env.masks_actions else None
     if noise is None:
-        return ppo.act(actor, shown, choices), memory
-    return ppo.explore(actor, shown, choices, noise), memory
+        return algorithm.act(actor, inputs, choices), memory
+    return algorithm.explore(actor, inputs, choices, noise), memory
 
 
-def rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> ppo.Rollout:
-    """The newest steps with the method's rewards. A lane is an agent in an environment."""
-    stored = replay.read(learner.replay, replay.newest(learner.replay, config.rollout_steps))
-    reward = common.rewards(stored, Paid(learner.credit, learner.scale), config)  # [envs time agents]
-    agents, leave = config.env.agents, config.env.agents_leave
+def train_step(
+    learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
+) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
+    """Update the policy on the steps that have just been stored.
 
-    def each(values: Array) -> Float[Array, "time envs agents"]:
-        return jnp.broadcast_to(values[..., None], (*values.shape, agents)).astype(jnp.float32)
+    Args:
+        learner: the learner of all seeds, which has stored the new steps.
+        steps: the new steps.
+        keys: the random keys.
+        env_steps: the number of environment steps before.
+        config: the configuration of the run.
+    """
+    return jax.vmap(partial(_train_seed, config=config), in_axes=(0, 0, 0, None))(learner, steps, keys, env_steps)
+
+
+def _train_seed(
+    learner: Learner, steps: Trajectory, key: PRNGKeyArray, env_steps: Int[Scalar, ""], config: TrainConfig
+) -> tuple[Learner, dict[str, Float[Array, ""]]]:
+    remaining = 1 - env_steps / config.steps
+    rollout = _rollout(learner, jax.tree.map(jnp.asarray, steps), config)
+    state, metrics = config.algorithm.load().update(learner.algorithm, rollout, key, remaining, config.hyperparameters)
+    return learner._replace(algorithm=state), metrics
+
+
+def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollout:
+    """Return the newest steps with the method's rewards. Each agent of each environment is one actor of the rollout."""
+    stored = replay.read(learner.replay, replay.newest_steps(learner.replay, config.rollout_steps))
+    reward = rewards(stored, RewardState(learner.credit, learner.scale), config)  # [envs time agents]
+    n_agents, agents_leave = config.env.n_agents, config.env.agents_leave
+
+    def for_each_agent(values: Array) -> Float[Array, "time envs agents"]:
+        return jnp.broadcast_to(values[..., None], (*values.shape, n_agents)).astype(jnp.float32)
 
     # Without a discount, the value after a time limit is not finite. The episode's value is then its return up to the limit.
-    over = steps.after.terminated if settings_of(config).gamma < 1 else steps.ended
-    continues, ended = each(~jnp.asarray(over)), each(jnp.asarray(steps.ended))
-    if leave:
-        stays = jnp.asarray(steps.after.alive)
-        continues, ended = continues * stays, jnp.maximum(ended, ~stays)
+    gamma = getattr(config.hyperparameters, "gamma", 1)
+    terminated = for_each_agent(jnp.asarray(steps.next_timestep.terminated if gamma < 1 else steps.ended))
+    done = for_each_agent(jnp.asarray(steps.ended))
+    if agents_leave:
+        left = ~jnp.asarray(steps.next_timestep.alive)
+        terminated, done = jnp.maximum(terminated, left), jnp.maximum(done, left)
 
-    def lanes(rows: Shaped[Array, "time envs agents *rest"]) -> Shaped[Array, "time lanes *rest"]:
+    def merge_actors(rows: Shaped[Array, "time envs agents *rest"]) -> Shaped[Array, "time actors *rest"]:
         return rows.reshape(len(rows), -1, *rows.shape[3:])
 
-    return ppo.Rollout(
-        observation=lanes(policy_input(steps.before.observation, config)),
-        action=lanes(steps.action),
-        reward=lanes(jnp.swapaxes(reward, 0, 1)),
-        next_observation=lanes(policy_input(steps.after.observation, config)),
-        continues=lanes(continues),
-        ended=lanes(ended),
-        available=lanes(steps.before.available) if config.env.masks_actions else None,
-        mask=lanes(jnp.asarray(steps.before.alive).astype(jnp.float32)) if leave else None,
+    return Rollout(
+        observation=merge_actors(policy_input(steps.timestep.observation, config)),
+        action=merge_actors(steps.action),
+        reward=merge_actors(jnp.swapaxes(reward, 0, 1)),
+        next_observation=merge_actors(policy_input(steps.next_timestep.observation, config)),
+        terminated=merge_actors(terminated),
+        done=merge_actors(done),
+        available=merge_actors(steps.timestep.available) if config.env.masks_actions else None,
+        mask=merge_actors(jnp.asarray(steps.timestep.alive).astype(jnp.float32)) if agents_leave else None,
     )
-
-
-def improve_one(
-    learner: Learner, steps: Trajectory, key: PRNGKeyArray, done: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, dict[str, Float[Array, ""]]]:
-    """Update the policy on the steps that have just been stored."""
-    remaining = 1 - done / config.steps
-    newest = rollout(learner, jax.tree.map(jnp.asarray, steps), config)
-    algorithm, measured = ppo.update(learner.algorithm, newest, key, remaining, settings_of(config))
-    return learner._replace(algorithm=algorithm), measured
-
-
-def improve(
-    learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], done: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
-    """`improve_one` for all seeds."""
-    return jax.vmap(partial(improve_one, config=config), in_axes=(0, 0, 0, None))(learner, steps, keys, done)

@@ -1,4 +1,4 @@
-"""The progress of a run: a live line on a terminal, plain lines elsewhere; TensorBoard events if asked for."""
+"""Listeners of a run: a live line on a terminal, plain lines elsewhere, and TensorBoard events."""
 
 import math
 import time
@@ -9,8 +9,10 @@ from typing import Any, Protocol, runtime_checkable
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from lare_rl.errors import needs_extra
-from lare_rl.util.sanitize import legible
+from lare_rl.errors import missing_extra_error
+from lare_rl.util.sanitize import sanitize
+
+__all__ = ["Clock", "Listener", "Metrics", "TensorBoard", "Terminal", "import_summary_writer"]
 
 Metrics = Sequence[Mapping[str, Any]]
 """One mapping for each seed, as in metrics.jsonl."""
@@ -18,139 +20,136 @@ Metrics = Sequence[Mapping[str, Any]]
 
 @runtime_checkable
 class Listener(Protocol):
-    """An object that is told the progress of a run. Steps are environment steps of each seed."""
+    """Receives callbacks about the progress of a run. Steps are environment steps of each seed."""
 
-    def started(self, name: str, step: int, steps: int) -> None:
+    def on_start(self, name: str, step: int, steps: int) -> None:
         """Training begins at `step` (above 0 if a run is resumed), and will end at `steps`."""
 
-    def stepped(self, step: int) -> None:
+    def on_step(self, step: int) -> None:
         """An iteration has been made: some steps, and their updates."""
 
-    def evaluated(self, metrics: Metrics) -> None:
-        """New lines of metrics.jsonl, one for each seed; they and the checkpoint have been written."""
+    def on_evaluation(self, metrics: Metrics) -> None:
+        """An evaluation has been made. Its lines of metrics.jsonl and the checkpoint have been written."""
 
-    def said(self, message: str) -> None:
-        """Something that the user should read, in a line."""
+    def on_message(self, message: str) -> None:
+        """The user should read this line."""
 
-    def stopped(self) -> None:
-        """The run has ended, for whatever reason. This is always called, exactly once."""
-
-
-def mean(metrics: Metrics, key: str) -> float | None:
-    values = [line[key] for line in metrics if line.get(key) is not None]
-    return sum(values) / len(values) if values else None
+    def on_stop(self) -> None:
+        """The run has ended, also after an error. This is called exactly once."""
 
 
-def summary(metrics: Metrics) -> str:
-    """The main metrics in one line, as means over the seeds."""
-    parts = [f"{mean(metrics, 'time/steps_per_second') or 0:.0f} steps/s"]
-    for key, label, form in (
-        ("evaluation/return", "return", ".1f"),
-        ("evaluation/won", "won", ".2f"),
-        ("credit/error", "credit error", ".3g"),
-        ("credit/correlation", "correlation", ".2f"),
-        ("credit/return_r2", "R² of returns", ".2f"),
-    ):
-        if (value := mean(metrics, key)) is not None:
-            parts.append(f"{label} {value:{form}}")
-    return ", ".join(parts)
-
-
-class Terminal:
+class Terminal(Listener):
     """A live line if the console is a terminal, else a plain line for each evaluation."""
 
     def __init__(self, console: Console | None = None):
-        self.console = console or Console(stderr=True)
-        self.progress: Progress | None = None
-        self.steps = 0
+        self._console = console or Console(stderr=True)
+        self._progress: Progress | None = None
+        self._steps = 0
 
-    def started(self, name: str, step: int, steps: int) -> None:
-        self.steps = steps
-        if self.console.is_terminal:
+    def on_start(self, name: str, step: int, steps: int) -> None:
+        self._steps = steps
+        if self._console.is_terminal:
             columns = (
                 TextColumn(name),
                 BarColumn(bar_width=20),
                 MofNCompleteColumn(),
                 TextColumn("{task.fields[figures]}"),
             )
-            self.progress = Progress(*columns, TimeRemainingColumn(), console=self.console)
-            self.progress.add_task(name, total=steps, completed=step, figures="compiling")
-            self.progress.start()
+            self._progress = Progress(*columns, TimeRemainingColumn(), console=self._console)
+            self._progress.add_task(name, total=steps, completed=step, figures="compiling")
+            self._progress.start()
         else:
-            self.said(f"{name}: step {step} of {steps}")
+            self.on_message(f"{name}: step {step} of {steps}")
 
-    def stepped(self, step: int) -> None:
-        if self.progress:
-            self.progress.update(self.progress.task_ids[0], completed=step)
+    def on_step(self, step: int) -> None:
+        if self._progress:
+            self._progress.update(self._progress.task_ids[0], completed=step)
 
-    def evaluated(self, metrics: Metrics) -> None:
-        if self.progress:
-            self.progress.update(self.progress.task_ids[0], figures=summary(metrics))
+    def on_evaluation(self, metrics: Metrics) -> None:
+        if self._progress:
+            self._progress.update(self._progress.task_ids[0], figures=_summarise(metrics))
         else:
-            step = metrics[0]["step"]
-            self.said(
-                f"step {step:>{len(str(self.steps))}} of {self.steps}: {summary(metrics)}{self.left(step, metrics)}"
+            step, steps = metrics[0]["step"], self._steps
+            self.on_message(
+                f"step {step:>{len(str(steps))}} of {steps}: {_summarise(metrics)}{self._time_left(step, metrics)}"
             )
 
-    def left(self, step: int, metrics: Metrics) -> str:
-        """The remaining time at the pace of the last steps; empty before the first update, as updates take most of the time."""
-        rate = mean(metrics, "time/steps_per_second")
-        if not rate or mean(metrics, "critic/loss") is None or step >= self.steps:
+    def on_message(self, message: str) -> None:
+        self._console.print(sanitize(message), highlight=False, markup=False, soft_wrap=True)
+
+    def on_stop(self) -> None:
+        if self._progress:
+            self._progress.stop()
+
+    def _time_left(self, step: int, metrics: Metrics) -> str:
+        rate = _mean(metrics, "time/steps_per_second")
+        # Updates take most of the time, so the rate before the first one is no estimate.
+        if not rate or _mean(metrics, "critic/loss") is None or step >= self._steps:
             return ""
-        seconds = (self.steps - step) / rate
+        seconds = (self._steps - step) / rate
         return f", {seconds:.0f} s left" if seconds < 60 else f", {math.ceil(seconds / 60)} min left"
 
-    def said(self, message: str) -> None:
-        self.console.print(legible(message), highlight=False, markup=False, soft_wrap=True)
 
-    def stopped(self) -> None:
-        if self.progress:
-            self.progress.stop()
+_SUMMARY = {
+    "evaluation/return": "return {:.1f}",
+    "evaluation/won": "won {:.2f}",
+    "credit/error": "credit error {:.3g}",
+    "credit/correlation": "correlation {:.2f}",
+    "credit/return_r2": "R² of returns {:.2f}",
+}
 
 
-def summary_writer() -> Any:
-    """The class that writes TensorBoard events. Raises `LareError` if the extra is not installed."""
+def _summarise(metrics: Metrics) -> str:
+    """Return the main metrics in one line, as means over the seeds."""
+    means = {template: _mean(metrics, key) for key, template in _SUMMARY.items()}
+    texts = [template.format(mean) for template, mean in means.items() if mean is not None]
+    return ", ".join([f"{_mean(metrics, 'time/steps_per_second') or 0:.0f} steps/s", *texts])
+
+
+def _mean(metrics: Metrics, key: str) -> float | None:
+    values = [line[key] for line in metrics if line.get(key) is not None]
+    return sum(values) / len(values) if values else None
+
+
+def import_summary_writer() -> Any:
+    """Return the class that writes TensorBoard events. Raises `LareError` if the extra is not installed."""
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
-        raise needs_extra("TensorBoard", "tensorboard") from None
+        raise missing_extra_error("TensorBoard", "tensorboard") from None
     return SummaryWriter
 
 
-class TensorBoard:
+class TensorBoard(Listener):
     """Every number of metrics.jsonl as TensorBoard events, with one writer for each seed."""
 
     def __init__(self, directory: Path, step: int, seeds: Sequence[int]):
-        writer = summary_writer()
+        writer = import_summary_writer()
         # Events that an earlier process wrote after the checkpoint are purged, because they are written again.
         purge = step + 1 if step else None
         # Files are named by the second: a run that is resumed within the same second must not overwrite its own events.
         options = {"purge_step": purge, "flush_secs": 10, "filename_suffix": f".{step}"}
-        self.writers = {seed: writer(str(directory / f"seed-{seed}"), **options) for seed in seeds}
+        self._writers = {seed: writer(str(directory / f"seed-{seed}"), **options) for seed in seeds}
 
-    def started(self, name: str, step: int, steps: int) -> None: ...
-    def stepped(self, step: int) -> None: ...
-    def said(self, message: str) -> None: ...
-
-    def evaluated(self, metrics: Metrics) -> None:
+    def on_evaluation(self, metrics: Metrics) -> None:
         for line in metrics:
             for key, value in line.items():
                 if key not in ("step", "seed") and value is not None:
-                    self.writers[line["seed"]].add_scalar(key, value, line["step"])
+                    self._writers[line["seed"]].add_scalar(key, value, line["step"])
 
-    def stopped(self) -> None:
-        for writer in self.writers.values():
+    def on_stop(self) -> None:
+        for writer in self._writers.values():
             writer.close()
 
 
 class Clock:
-    """Measures steps per second since the last call of `rate`."""
+    """Measures steps per second since the last call of `measure_rate`."""
 
     def __init__(self, step: int):
-        self.step, self.time = step, time.perf_counter()
+        self._step, self._time = step, time.perf_counter()
 
-    def rate(self, step: int) -> float:
+    def measure_rate(self, step: int) -> float:
         now = time.perf_counter()
-        rate = (step - self.step) / max(now - self.time, 1e-9)
-        self.step, self.time = step, now
+        rate = (step - self._step) / max(now - self._time, 1e-9)
+        self._step, self._time = step, now
         return rate

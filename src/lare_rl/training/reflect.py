@@ -1,6 +1,6 @@
 """Reflection: a model sees how well its function explains the returns of some episodes, and tries to improve it.
 
-The episodes are played for this purpose before training, or are those that a run has stored.
+The episodes are played for this purpose, or are those that a finished run has stored.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,18 +12,25 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.explanation_text import FEWEST, entry_names, words
-from lare_rl.credit.factor_fit import Judgement
-from lare_rl.credit.factor_fit import judge as judge_rows
-from lare_rl.envs.load import as_task
-from lare_rl.envs.play import Episode, Policy, episodes_of
+from lare_rl.credit.explanation_text import MIN_EPISODES, explanation_lines, raw_feature_names
+from lare_rl.credit.factor_fit import assess_factors
+from lare_rl.envs.load import resolve_task
+from lare_rl.envs.play import Episode, Policy, play_episodes
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
-from lare_rl.latent.improve import Evidence, Model, improve
-from lare_rl.tasks.spec import TaskSpec, judged_states, the_role
+from lare_rl.latent.improve import Assessment, improve
+from lare_rl.llm.model import Model
+from lare_rl.runs.directory import Run
+from lare_rl.tasks.spec import TaskSpec, require_role, select_states
+from lare_rl.training.stored_episodes import stored_role_episodes
 
-EPISODES = 40
-"""The number of episodes to play, if none are given."""
+__all__ = ["FunctionAssessment", "assess_function", "reflect"]
+
+N_EPISODES = 40
+"""The default number of episodes to play."""
+
+N_CORRELATED = 3
+"""The number of other factors whose correlation with a factor is named."""
 
 
 def reflect(
@@ -32,121 +39,117 @@ def reflect(
     model: Model,
     rounds: int = 1,
     *,
-    episodes: Sequence[Episode] | None = None,
+    episodes: Sequence[Episode] | Run | None = None,
     policy: Policy | None = None,
     record: Path | None = None,
-    said: Callable[[str], None] = lambda _: None,
+    on_message: Callable[[str], None] = lambda _: None,
 ) -> LatentFunction:
-    """Show a model how well its function explains returns; keep the function whose factors explain them best. Not in the paper.
+    """Show a model how well its function explains returns, and keep the function whose factors explain them best.
 
-    A function is judged by R^2 of the returns of the same episodes, each predicted before it was seen (`credit/judging.py`).
-    If anything fails, the best function so far is returned.
+    This is not in the paper. A function is judged by R^2 of the returns of the same episodes, each predicted before it was
+    seen (`credit/factor_fit.py`). If anything fails, the best function so far is returned.
 
     Args:
         function: a function from `lare_rl.design`, or written by hand.
         task: the task of the function: a name, a path, or a spec.
         model: the model to ask.
         rounds: number of rounds.
-        episodes: whole episodes; by default, 40 are played.
+        episodes: whole episodes, or a run whose stored episodes are used; by default, 40 are played.
         policy: from one observation of a single agent to one action: plays the episodes instead of random actions.
         record: a file to record every exchange in; if the design was recorded, the same file.
-        said: called with messages about the progress.
+        on_message: called with messages about the progress.
 
     Raises:
         LareError: `rounds` is less than 1, or each team of the task has its own function.
     """
-    role = the_role(as_task(task))
+    role = require_role(resolve_task(task))
     if rounds < 1:
         raise LareError(f"rounds = {rounds}: at least one is needed")
 
     @cache
-    def played() -> Sequence[Episode]:
-        return episodes_of(role, EPISODES, policy) if episodes is None else episodes
+    def load_episodes() -> Sequence[Episode]:
+        if episodes is None:
+            return play_episodes(role, N_EPISODES, policy)
+        return stored_role_episodes(episodes, role) if isinstance(episodes, Run) else episodes
 
-    def judge(one: LatentFunction) -> Evidence:
-        return evidence_of(one, role, played())
+    def judge(function: LatentFunction) -> Assessment:
+        assessment = assess_function(function, role, load_episodes())
+        return Assessment(assessment.r2, "\n".join([*assessment.ranges, *assessment.sentences]))
 
-    return improve(function, role, model, judge, rounds, record, said)
+    return improve(function, role, model, judge, rounds, record, on_message)
 
 
-class Told(NamedTuple):
+class FunctionAssessment(NamedTuple):
     """What the returns of some episodes say about a function."""
 
     r2: float
     """R^2 of the returns, each predicted by the factors before it was seen; NaN if the returns are all the same."""
     r2_error: float
     """Its standard error over the episodes."""
-    r2_of_lengths: float | None
-    """The same, predicted by the lengths of the episodes alone; None if these do not matter."""
+    length_r2: float | None
+    """R^2 of predictions by the lengths of the episodes alone; None if all lengths are equal."""
     sentences: list[str]
     """Sentences for the user; empty if the returns are all the same."""
     ranges: list[str]
     """A line on the values of each factor."""
 
 
-def evidence_of(function: LatentFunction, role: TaskSpec, episodes: Sequence[Episode]) -> Evidence:
-    """`told_by_returns` as a text for a language model. Raises `LareError` like it."""
-    found = told_by_returns(function, role, episodes)
-    return Evidence(found.r2, "\n".join([*found.ranges, *found.sentences]))
-
-
-def told_by_returns(function: LatentFunction, role: TaskSpec, episodes: Sequence[Episode]) -> Told:
-    """What the returns of some episodes say about a function.
+def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence[Episode]) -> FunctionAssessment:
+    """Assess a function by the returns of some episodes.
 
     Raises:
         LareError: there are too few episodes, or the function failed on one of them.
     """
-    if len(episodes) < FEWEST:
-        raise LareError(f"{len(episodes)} episodes say too little of a function: {FEWEST} are needed")
-    factors = [factors_of(function, role, episode) for episode in episodes]
-    rows = [
-        np.concatenate([z, *judged_states(role.judges, episode.before, episode.after), episode.action], axis=-1)
+    if len(episodes) < MIN_EPISODES:
+        raise LareError(f"{len(episodes)} episodes say too little of a function: {MIN_EPISODES} are needed")
+    factors = [_compute_factors(function, role, episode) for episode in episodes]
+    inputs = [
+        np.concatenate(
+            [z, *select_states(role.judges, episode.observation, episode.next_observation), episode.env_action], axis=-1
+        )
         for z, episode in zip(factors, episodes, strict=True)
     ]
-    size = factors[0].shape[-1]
-    basis = Basis(size, rows[0].shape[-1] - size, extended=True)
-    alive, returns = [one.alive for one in episodes], np.array([one.total for one in episodes])
-    found = judge_rows(rows, alive, returns, basis, role.score)
-    names = function.columns_by(role.judges)
-    every = np.concatenate([z[there] for z, there in zip(factors, alive, strict=True)])
-    return Told(found.r2, found.r2_error, found.r2_of_lengths, said_of(found, names, role, basis), ranges(names, every))
-
-
-def factors_of(function: LatentFunction, role: TaskSpec, episode: Episode) -> Float[np.ndarray, "steps rows factors"]:
-    """The factors of an episode's steps, by the observations that the task says are judged; 0 for agents that have left."""
-    there = episode.alive
-    z = function.of_steps(episode.before[there], episode.action[there], episode.after[there], role.judges)
-    found = np.zeros((*there.shape, z.shape[1]), np.float32)
-    found[there] = z
-    return found
-
-
-def said_of(found: Judgement, names: list[str], role: TaskSpec, basis: Basis) -> list[str]:
-    """The explanation in sentences, which the user reads, too."""
-    return words(
-        found.explanation,
-        found.form,
-        names,
-        entry_names(role.observation, role.action, basis.used_entries, role.action_size, role.judges == "both"),
+    n_factors = factors[0].shape[-1]
+    basis = Basis(n_factors, inputs[0].shape[-1] - n_factors, extended=True)
+    alive, returns = [episode.alive for episode in episodes], np.array([episode.return_ for episode in episodes])
+    fit = assess_factors(inputs, alive, returns, basis, role.score)
+    names = function.factor_columns(role.judges)
+    both = role.judges == "both"
+    raw_names = raw_feature_names(role.observation, role.action, basis.n_raw_used, role.action_size, both)
+    valid_factors = np.concatenate([z[mask] for z, mask in zip(factors, alive, strict=True)])
+    return FunctionAssessment(
+        r2=fit.r2,
+        r2_error=fit.r2_error,
+        length_r2=fit.length_r2,
+        sentences=explanation_lines(fit.explanation, fit.score_type, names, raw_names),
+        ranges=_describe_ranges(names, valid_factors),
     )
 
 
-def ranges(names: Sequence[str], factors: Float[np.ndarray, "rows factors"]) -> list[str]:
-    """A line on each factor: the range of its values, and the factors with which it correlates most."""
-    among = correlations(factors)
+def _compute_factors(
+    function: LatentFunction, role: TaskSpec, episode: Episode
+) -> Float[np.ndarray, "steps rows factors"]:
+    """Compute the factors of an episode's steps. They are 0 for agents that have left."""
+    mask = episode.alive
+    z = function.step_factors(
+        episode.observation[mask], episode.env_action[mask], episode.next_observation[mask], role.judges
+    )
+    factors = np.zeros((*mask.shape, z.shape[1]), np.float32)
+    factors[mask] = z
+    return factors
+
+
+def _describe_ranges(names: Sequence[str], factors: Float[np.ndarray, "rows factors"]) -> list[str]:
+    """Return a line on each factor: the range of its values, and the factors with which it correlates most."""
+    with np.errstate(all="ignore"):  # a factor that does not vary has no correlation
+        correlation = np.atleast_2d(np.nan_to_num(np.corrcoef(factors, rowvar=False)))
     lines = []
-    for place, name in enumerate(names):
-        column = factors[:, place]
-        others = [f"{among[place, other]:+.2f} with {names[other]}" for other in range(len(names)) if other != place]
-        strongest = sorted(others, key=lambda said: -abs(float(said.split()[0])))[:3]
+    for i, name in enumerate(names):
+        column, row = factors[:, i], correlation[i].tolist()
+        order = sorted((j for j in range(len(names)) if j != i), key=lambda j, row=row: -round(abs(row[j]), 2))
+        strongest = ", ".join(f"{row[j]:+.2f} with {names[j]}" for j in order[:N_CORRELATED])
         lines.append(
             f"- {name}: from {column.min():.4g} to {column.max():.4g}, mean {column.mean():.4g}, standard deviation "
-            f"{column.std():.4g}; among the factors it correlates most {', '.join(strongest) or 'with none'}"
+            f"{column.std():.4g}; among the factors it correlates most {strongest or 'with none'}"
         )
     return lines
-
-
-def correlations(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
-    """Pearson's correlations; 0 for a column that does not vary."""
-    with np.errstate(all="ignore"):
-        return np.atleast_2d(np.nan_to_num(np.corrcoef(columns, rowvar=False)))

@@ -1,8 +1,8 @@
-"""Algorithms that consume whole episodes: sample them, relabel them by the newest decoder, update; once for so many new episodes.
+"""Algorithms that consume whole episodes: sample episodes, relabel them by the newest decoder, and update.
 
-QMIX and VDN. The team has one reward for each step: the mean over its agents that are alive. The mixer's input is the global state,
-standardised by its running mean and deviation (PyMARL2 does not standardise it; its environments scale it). If there is no global
-state, the input is all observations side by side.
+There is one update for every `update_every` finished episodes. QMIX and VDN work like this. The team has one reward for each step: the
+mean over its agents that are alive. The mixer's input is the global state, standardised by its running mean and deviation (PyMARL2
+does not standardise it; its environments scale it). If there is no global state, the input is all observations side by side.
 """
 
 from functools import partial
@@ -12,33 +12,37 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
 
-from lare_rl.algorithms import qmix
-from lare_rl.algorithms.settings import QMIXSettings
+from lare_rl.algorithms.batches import Sequences
+from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.credit.decomposition import Decomposition
 from lare_rl.data import replay
+from lare_rl.data.layouts import lay_out_padded
 from lare_rl.data.replay import Index, Replay
 from lare_rl.data.sampling import EpisodeSample, sample_distinct_episodes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import team_mean
-from lare_rl.nn.normalise import RunningMeanStd, new_mean_std, observe, standardise_if_known
-from lare_rl.nn.recurrent import Recurrent
-from lare_rl.training import learner as common
-from lare_rl.training.learner import Learner, Paid, sample_credit
+from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, standardise_if_observed, update_mean_std
+from lare_rl.training.decoder_fits import fit_decoders, sample_credit
+from lare_rl.training.decoder_inputs import alive_agents
+from lare_rl.training.learner import Learner
+from lare_rl.training.rewards import RewardState, rewards, team_metrics
 from lare_rl.training.static_config import TrainConfig
 
-Measured = dict[str, Float[Array, "*seeds"]]
-Updated = tuple[qmix.QMIX, tuple[Decomposition, ...]]
+__all__ = ["SequenceState", "act", "get_actor", "init", "init_memory", "train_step"]
 
+Metrics = dict[str, Float[Array, "*seeds"]]
+Updated = tuple[Any, tuple[Decomposition, ...]]
+"""The state of the algorithm, and the decoders."""
 
-WORTH_CUTTING = 32
-"""Batches are cut to shorter lengths only if the longest episode has so many steps: each length is compiled by itself, and little
-is saved for shorter episodes."""
+MIN_CUT_LENGTH = 32
+"""Batches are cut to shorter lengths only if the longest episode has at least this many steps. Each length compiles separately, and
+short episodes save little."""
 
 
 class SequenceState(NamedTuple):
-    """The state of QMIX, and what its training needs beside it."""
+    """The state of the algorithm, and of its training."""
 
-    qmix: qmix.QMIX
+    qmix: Any
     states: RunningMeanStd
     """Running statistics of the mixer's input."""
     done: Int[Array, ""]
@@ -48,173 +52,174 @@ class SequenceState(NamedTuple):
 class Actor(NamedTuple):
     """The parts of the state that are needed to act."""
 
-    agent: Recurrent
+    agent: Any
     epsilon: Float[Array, ""]
 
 
-def settings_of(config: TrainConfig) -> QMIXSettings:
-    """The algorithm's hyperparameters."""
+def _settings(config: TrainConfig) -> QMIXSettings:
     assert isinstance(config.hyperparameters, QMIXSettings)
     return config.hyperparameters
 
 
-def mixer_input_size(config: TrainConfig) -> int:
-    """Size of the mixer's input."""
-    return config.env.state_size or config.env.agents * config.env.observation_size
-
-
-def mixer_input(shown: Any, config: TrainConfig) -> Float[Array, "*batch state"]:
-    """The global state, or all observations side by side."""
-    if config.env.state_size:
-        return shown["state"]
-    observation = shown["observation"]
-    return observation.reshape(*observation.shape[:-2], -1)
+def _mixer_input(
+    observation: Float[Array, "*batch agents observation"], state: Float[Array, "*batch state"], config: TrainConfig
+) -> Float[Array, "*batch mixer_input"]:
+    """Return the global state or, if there is none, all observations side by side."""
+    return state if config.env.state_size else observation.reshape(*observation.shape[:-2], -1)
 
 
 def init(key: PRNGKeyArray, config: TrainConfig) -> SequenceState:
-    """The untrained algorithm."""
-    env, size = config.env, mixer_input_size(config)
-    made = qmix.init(key, env.agents, env.observation_size, env.action_size, size, settings_of(config))
-    return SequenceState(made, new_mean_std(size), jnp.zeros((), jnp.int32))
+    """Return the untrained algorithm."""
+    env = config.env
+    input_size = env.state_size or env.n_agents * env.observation_size
+    algorithm = config.algorithm.load()
+    state = algorithm.init(key, env.n_agents, env.observation_size, env.action_size, input_size, _settings(config))
+    return SequenceState(state, empty_mean_std(input_size), jnp.zeros((), jnp.int32))
 
 
-def actor(learner: Learner, done: int, config: TrainConfig) -> Actor:
-    """The parts of the learner that are needed to act, for all seeds."""
-    state = learner.algorithm
-    return Actor(state.qmix.online.agent, jnp.full(state.done.shape, qmix.epsilon(done, settings_of(config))))
+def get_actor(learner: Learner, env_steps: int, config: TrainConfig) -> Actor:
+    """Return the parts of the learner that are needed to act, for all seeds."""
+    state, algorithm = learner.algorithm, config.algorithm.load()
+    epsilon = algorithm.epsilon(env_steps, _settings(config))
+    return Actor(algorithm.get_actor(state.qmix), jnp.full(state.done.shape, epsilon))
 
 
-def memory(config: TrainConfig) -> qmix.Memory:
-    """The memory of the agents before the first step of an episode."""
-    return qmix.no_memory((config.env.agents,), config.env.action_size, settings_of(config))
+def init_memory(config: TrainConfig) -> Any:
+    """Return the memory of the agents before the first step of an episode."""
+    env = config.env
+    return config.algorithm.load().init_memory((env.n_agents,), env.action_size, _settings(config))
 
 
 def act(
     actor: Actor,
-    memory: qmix.Memory,
+    memory: Any,
     observation: Float[Array, "*batch agents observation"],
     available: Bool[Array, "*batch agents action"],
     noise: Float[Array, "*batch agents 1+action"] | None,
     config: TrainConfig,
-) -> tuple[Float[Array, "*batch agents action"], qmix.Memory]:
-    """The available actions of largest value; with noise, sometimes random available ones."""
-    return qmix.act(actor.agent, memory, observation, available, noise, actor.epsilon)
+) -> tuple[Float[Array, "*batch agents action"], Any]:
+    """Return the available actions of largest value; with noise, sometimes random available ones."""
+    return config.algorithm.load().act(actor.agent, memory, observation, available, noise, actor.epsilon)
 
 
-def sequences(
-    buffer: Replay, episodes: EpisodeSample, steps: int, paid: Paid, states: RunningMeanStd, config: TrainConfig
-) -> qmix.Sequences:
-    """Drawn episodes with the method's rewards, each padded with its last step to `steps` steps."""
-    number = jnp.minimum(jnp.arange(steps), episodes.length[:, None] - 1)
-    env = jnp.broadcast_to(episodes.first.env[:, None], number.shape)
-    drawn = replay.read(buffer, Index(env, episodes.first.number[:, None] + number))
-    here = (jnp.arange(steps) < episodes.length[:, None]) * episodes.mask[:, None]
-    reward = common.rewards(drawn, paid, config)
+def train_step(
+    learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
+) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
+    """Make the updates that are due, once there are enough episodes for a batch. Return the mean of each metric.
 
-    def at_all_times(name: str) -> Array:
-        return jnp.concatenate([drawn.before[name][:, :1], drawn.after[name]], axis=1)
+    The function is written for all seeds, so that all of them use the same length of a batch: the smallest that fits the longest
+    episode of any seed.
 
-    observation = at_all_times("observation")
-    shown = {"observation": observation, "state": at_all_times("state") if config.env.state_size else None}
-    shape = (*observation.shape[:-1], config.env.action_size)
-    return qmix.Sequences(
-        observation=observation,
-        state=standardise_if_known(states, mixer_input(shown, config)),
-        available=at_all_times("available") if config.env.masks_actions else jnp.ones(shape, bool),
-        action=drawn.before["action"],
-        reward=here * team_mean(reward, common.alive(drawn, config), config.env.teams[0]),
-        terminated=here * (jnp.arange(steps) == episodes.length[:, None] - 1),
-        mask=here,
-    )
+    Args:
+        learner: the learner of all seeds, which has stored the new steps.
+        steps: the new steps.
+        keys: the random keys.
+        env_steps: the number of environment steps before; not needed.
+        config: the configuration of the run.
+    """
+    settings, n_before = _settings(config), learner.algorithm.done
+    n_due = jnp.sum(learner.replay.episodes, axis=1) // settings.update_every
+    has_batch = jnp.sum(jax.vmap(replay.n_finished)(learner.replay), axis=1) >= settings.batch_size
+    n_updates = jnp.where(has_batch, n_due - n_before, 0)
+    states = jax.vmap(partial(_observe_states, config=config))(learner.algorithm.states, steps)
+    learner = learner._replace(algorithm=learner.algorithm._replace(states=states, done=n_due))
+    lengths = jnp.asarray(_cut_lengths(config))
+    branches = [jax.vmap(partial(_update_seed, config=config, n_steps=length)) for length in _cut_lengths(config)]
+
+    def update(number: Int[Scalar, ""], carry: tuple[Updated, Metrics]) -> tuple[Updated, Metrics]:
+        (algorithm, decoders), sums = carry
+        current = learner._replace(algorithm=learner.algorithm._replace(qmix=algorithm), credit=decoders)
+        number_keys = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, number)))(keys)
+        sample_keys, update_keys = jnp.unstack(number_keys, axis=1)
+        sample = partial(sample_distinct_episodes, count=settings.batch_size)
+        episodes = jax.vmap(sample)(current.replay, sample_keys)
+        longest = jnp.max(episodes.length * (episodes.mask > 0))
+        branch = jnp.searchsorted(lengths, longest)
+        updated, metrics = jax.lax.switch(branch, branches, current, episodes, update_keys, n_before + number + 1)
+        is_due = number < n_updates
+
+        def select(new: Array, old: Array) -> Array:
+            return jnp.where(is_due.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        sums = {name: sums[name] + jnp.where(is_due, values, 0) for name, values in metrics.items()}
+        return jax.tree.map(select, updated, (algorithm, decoders)), sums
+
+    names = ["critic/loss", "critic/value"]
+    if config.joint_fit:
+        names += team_metrics([{"credit/loss": jnp.zeros(())} for _ in config.env.teams], config)
+    zeros = {name: jnp.zeros(len(n_updates)) for name in names}
+    start = ((learner.algorithm.qmix, learner.credit), zeros)
+    (algorithm, decoders), sums = jax.lax.fori_loop(0, jnp.max(n_updates), update, start)
+    learner = learner._replace(algorithm=learner.algorithm._replace(qmix=algorithm), credit=decoders)
+    metrics = {name: total / n_updates for name, total in sums.items()}  # NaN where there was no update
+    return learner, metrics | {"algorithm/updates": n_updates.astype(jnp.float32)}
 
 
-def lengths(config: TrainConfig) -> list[int]:
-    """The lengths to which a batch may be cut. The shortest one that holds its longest episode is taken."""
+def _cut_lengths(config: TrainConfig) -> list[int]:
+    """Return the allowed lengths of a batch."""
     longest = config.env.max_steps
-    if config.env.fixed_length or longest < WORTH_CUTTING:
+    if config.env.fixed_length or longest < MIN_CUT_LENGTH:
         return [longest]
     return sorted({-(-longest // 4), -(-longest // 2), longest})
 
 
-def one_update(
+def _observe_states(states: RunningMeanStd, steps: Trajectory, config: TrainConfig) -> RunningMeanStd:
+    """Add the mixer's inputs of new steps to the statistics."""
+    timestep = steps.next_timestep
+    rows = jnp.asarray(_mixer_input(timestep.observation, timestep.state, config))
+    return update_mean_std(states, rows.reshape(-1, rows.shape[-1]))
+
+
+def _update_seed(
     learner: Learner,
     episodes: EpisodeSample,
     key: PRNGKeyArray,
     number: Int[Scalar, ""],
     config: TrainConfig,
-    steps: int,
-) -> tuple[Updated, Measured]:
-    """Update the decoder and then the algorithm of one seed. Returns only the parts that change; the learner holds much more."""
+    n_steps: int,
+) -> tuple[Updated, Metrics]:
+    """Update the decoder and then the algorithm of one seed. Return only what changes: the learner holds much more."""
     sample_key, fit_key = jax.random.split(key)
-    credit, measured = learner.credit, {}
-    chosen = sample_credit(learner.replay, sample_key, 1, config)
-    if chosen is not None:
-        credit, measured = common.fit(
-            credit, learner.replay, jax.tree.map(lambda leaf: leaf[0], chosen), fit_key, config
-        )
-    state, settings = learner.algorithm, settings_of(config)
-    paid = Paid(credit, learner.scale)
-    batch = sequences(learner.replay, episodes, steps, paid, state.states, config)
-    played = number * settings.update_every
-    moves = played // settings.target_every > (played - settings.update_every) // settings.target_every
-    made, learned = qmix.update(state.qmix, batch, moves, settings)
-    return (made, credit), measured | learned
+    decoders, metrics = learner.credit, {}
+    samples = sample_credit(learner.replay, sample_key, 1, config)
+    if samples is not None:
+        sample = jax.tree.map(lambda leaf: leaf[0], samples)
+        decoders, metrics = fit_decoders(decoders, learner.replay, sample, fit_key, config)
+    state, settings = learner.algorithm, _settings(config)
+    batch = _sequences(learner.replay, episodes, n_steps, RewardState(decoders, learner.scale), state.states, config)
+    n_episodes = number * settings.update_every
+    copy_target = n_episodes // settings.target_every > (n_episodes - settings.update_every) // settings.target_every
+    algorithm, algorithm_metrics = config.algorithm.load().update(state.qmix, batch, copy_target, settings)
+    return (algorithm, decoders), metrics | algorithm_metrics
 
 
-def improve(
-    learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], done: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
-    """One update for every `update_every` episodes that have ended, once there are enough for a batch; the mean of each metric.
+def _sequences(
+    buffer: Replay,
+    episodes: EpisodeSample,
+    n_steps: int,
+    reward_state: RewardState,
+    states: RunningMeanStd,
+    config: TrainConfig,
+) -> Sequences:
+    """Return episodes with the method's rewards, each padded with its last step to `n_steps` steps."""
+    number = lay_out_padded(episodes.length, n_steps).number
+    env = jnp.broadcast_to(episodes.first.env[:, None], number.shape)
+    steps = replay.read(buffer, Index(env, episodes.first.number[:, None] + number))
+    mask = (jnp.arange(n_steps) < episodes.length[:, None]) * episodes.mask[:, None]
+    reward = rewards(steps, reward_state, config)
 
-    This function is for all seeds, so that the length of a batch is one number for all of them, and no longer than needed.
-    """
-    settings, before = settings_of(config), learner.algorithm.done
-    worth = jnp.sum(learner.replay.episodes, axis=1) // settings.update_every
-    ready = jnp.sum(jax.vmap(replay.finished)(learner.replay), axis=1) >= settings.batch_size
-    owed = jnp.where(ready, worth - before, 0)
-    states = jax.vmap(partial(with_states, config=config))(learner.algorithm.states, steps)
-    learner = learner._replace(algorithm=learner.algorithm._replace(states=states, done=worth))
-    cuts = lengths(config)
+    def with_last_timestep(name: str) -> Array:
+        return jnp.concatenate([steps.columns[name][:, :1], steps.next_columns[name]], axis=1)
 
-    def update(turn: Int[Scalar, ""], carry: tuple[Updated, Measured]) -> tuple[Updated, Measured]:
-        (made, credit), total = carry
-        now = learner._replace(algorithm=learner.algorithm._replace(qmix=made), credit=credit)
-        sample_keys, update_keys = jnp.unstack(
-            jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, turn)))(keys), axis=1
-        )
-        sample = partial(sample_distinct_episodes, count=settings.batch_size)
-        episodes = jax.vmap(sample)(now.replay, sample_keys)
-        longest = jnp.max(episodes.length * (episodes.mask > 0))
-        branches = [jax.vmap(partial(one_update, config=config, steps=cut)) for cut in cuts]
-        place = jnp.searchsorted(jnp.asarray(cuts), longest)
-        updated, measured = jax.lax.switch(place, branches, now, episodes, update_keys, before + turn + 1)
-        mask = turn < owed
-
-        def choose(new: Array, old: Array) -> Array:
-            return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-        sums = {name: total[name] + jnp.where(mask, values, 0) for name, values in measured.items()}
-        return jax.tree.map(choose, updated, (made, credit)), sums
-
-    names = ["critic/loss", "critic/value"]
-    if config.interleaved:
-        names += loss_names(config)
-    nothing = {name: jnp.zeros(len(owed)) for name in names}
-    (made, credit), total = jax.lax.fori_loop(
-        0, jnp.max(owed), update, ((learner.algorithm.qmix, learner.credit), nothing)
+    observation = with_last_timestep("observation")
+    state = with_last_timestep("state") if config.env.state_size else jnp.zeros((*observation.shape[:2], 0))
+    n_choices = (*observation.shape[:-1], config.env.action_size)
+    return Sequences(
+        observation=observation,
+        state=standardise_if_observed(states, _mixer_input(observation, state, config)),
+        available=with_last_timestep("available") if config.env.masks_actions else jnp.ones(n_choices, bool),
+        action=steps.columns["action"],
+        reward=mask * team_mean(reward, alive_agents(steps, config), config.env.teams[0]),
+        terminated=mask * (jnp.arange(n_steps) == episodes.length[:, None] - 1),
+        mask=mask,
     )
-    learner = learner._replace(algorithm=learner.algorithm._replace(qmix=made), credit=credit)
-    measured = {name: values / owed for name, values in total.items()}  # NaN where there was no update
-    return learner, measured | {"algorithm/updates": owed.astype(jnp.float32)}
-
-
-def loss_names(config: TrainConfig) -> list[str]:
-    """The metrics of the decoders' updates."""
-    some = [{"credit/loss": jnp.zeros(())} for _ in config.env.teams]
-    return list(common.by_team(some, config))
-
-
-def with_states(states: RunningMeanStd, steps: Trajectory, config: TrainConfig) -> RunningMeanStd:
-    """The statistics with the mixer's inputs for new steps."""
-    rows = mixer_input({"state": steps.after.state, "observation": steps.after.observation}, config)
-    return observe(states, jnp.asarray(rows).reshape(-1, rows.shape[-1]))

@@ -1,17 +1,18 @@
 """The static configuration of a run's compiled functions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import jax
 import numpy as np
 
-from lare_rl.algorithms.table import Algorithm, AlgorithmSettings, Consumes, Noise
-from lare_rl.credit.basis import Basis
+from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, Noise
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import SUM, forms_of
-from lare_rl.credit.methods import Decoder, Encoder, Method
+from lare_rl.credit.engine import CreditSpec, credit_spec
+from lare_rl.credit.methods import Method
+from lare_rl.credit.score_type import ScoreType
 from lare_rl.envs.interface import EnvSpec
-from lare_rl.tasks.spec import JudgedFrom, Judges, judged_states
+from lare_rl.tasks.spec import CreditScope, FactorInputs
 
 
 @dataclass(frozen=True)
@@ -19,17 +20,17 @@ class TrainConfig:
     """What is trained, and how."""
 
     env: EnvSpec
-    judged_from: JudgedFrom
-    judges: Judges
+    credit_scope: CreditScope
+    factor_inputs: FactorInputs
     method: Method
     algorithm: Algorithm
     hyperparameters: AlgorithmSettings
     credit: CreditSettings
     scale_rewards: bool
     """Divide the rewards that the algorithm sees by the running root mean square of R/T."""
-    factors: tuple[int, ...]
+    n_factors: tuple[int, ...]
     """The number of factors of each team's latent function; empty for a method that needs none."""
-    environments: int
+    n_envs: int
     """The number of environments that each seed collects from."""
     rollout_steps: int
     """Steps of each environment in an iteration."""
@@ -58,18 +59,18 @@ class TrainConfig:
         return self.env.action_size + (self.noise is Noise.UNIFORM)
 
     @property
-    def of_state(self) -> bool:
-        """Whether credit is judged from the global state: one row for each step and team."""
-        return self.judged_from == "state"
+    def team_level(self) -> bool:
+        """Whether credit goes to whole teams, by the global state: one proxy reward for each step and team."""
+        return self.credit_scope == "state"
 
     @property
-    def judged_rows(self) -> int:
-        """Rows of a step that are judged: one for each agent, or one for each team."""
-        return len(self.env.teams) if self.of_state else self.env.agents
+    def credit_rows(self) -> int:
+        """Proxy rewards of a step: one for each agent, or one for each team."""
+        return len(self.env.teams) if self.team_level else self.env.n_agents
 
-    def judged(self, place: int) -> slice:
-        """The rows of a team."""
-        return slice(place, place + 1) if self.of_state else self.env.teams[place].agents
+    def team_rows(self, team_index: int) -> slice:
+        """Return the rows of `credit_rows` that belong to a team."""
+        return slice(team_index, team_index + 1) if self.team_level else self.env.teams[team_index].agents
 
     @property
     def warmup(self) -> int:
@@ -77,77 +78,76 @@ class TrainConfig:
         return getattr(self.hyperparameters, "warmup", 0)
 
     @property
-    def interleaved(self) -> bool:
+    def joint_fit(self) -> bool:
         """Whether the decoder is updated with every update of the algorithm."""
         return (
             self.algorithm.consumes is not Consumes.ROLLOUTS
-            and self.method.descends
+            and self.method.uses_gradient
             and self.method.fit is not None
-            and not self.method.fit.apart
+            and not self.method.fit.separate
         )
 
     @property
-    def shown(self) -> int:
-        """Size of the observation or of the global state that is judged."""
-        return self.env.state_size if self.of_state else self.env.observation_size
+    def observed_size(self) -> int:
+        """Size of the observation or of the global state that credit is assigned by."""
+        return self.env.state_size if self.team_level else self.env.observation_size
+
+    @cached_property
+    def credit_specs(self) -> tuple[CreditSpec, ...]:
+        """What is fitted to the returns of each team."""
+        env = self.env
+        specs = tuple(
+            credit_spec(
+                self.method,
+                self.credit,
+                {
+                    "factors": n_factors,
+                    "observation": self.observed_size,
+                    "action": env.action_size * (env.n_agents if self.team_level else 1),
+                },
+                judges=self.factor_inputs,
+                single_agent=env.n_agents == 1 and not self.team_level,
+                agents=1 if self.team_level else team.n_agents,
+                max_steps=env.max_steps,
+                fixed_length=env.fixed_length,
+                scale_rewards=self.scale_rewards,
+            )
+            for team, n_factors in zip(env.teams, self.n_factors or (0,) * len(env.teams), strict=True)
+        )
+        if all(spec.basis.n_features for spec in specs):
+            return specs
+        return tuple(replace(spec, score_types=(ScoreType.SUM,)) for spec in specs)
 
     @property
-    def entries(self) -> int:
-        """The number of raw entries in a team's decoder's input for a judged row."""
-        action = self.env.action_size * (self.env.agents if self.of_state else 1)
-        match self.method.encoder:
-            case None | Encoder.LATENT:
-                return 0
-            case Encoder.RAW:
-                return 2 * self.shown + action if self.raw_differences else self.shown
-            case Encoder.JUDGED | Encoder.LATENT_AND_JUDGED:
-                return self.shown * len(judged_states(self.judges, 0, 1)) + action
-            case _:
-                return self.shown + action
-
-    @property
-    def bases(self) -> tuple[Basis, ...]:
-        """The input of each team's decoder for a judged row, and the features that a closed-form decoder computes from it."""
-        extended = self.method.decoder is Decoder.ADDITIVE
-        factors = self.factors if self.method.latent else (0,) * len(self.env.teams)
-        return tuple(Basis(size, self.entries, extended) for size in factors)
-
-    @property
-    def forms(self) -> tuple[int, ...]:
-        """Which forms of the score are fitted."""
-        looked_for = "score" in self.method.settings and all(basis.size for basis in self.bases)
-        return forms_of(self.credit, self.env.fixed_length) if looked_for else (SUM,)
-
-    @property
-    def raw_differences(self) -> bool:
-        """Whether raw features are [s, a, s - s'], as published for a single agent."""
-        return self.method.encoder is Encoder.RAW and self.env.agents == 1 and not self.of_state
+    def score_types(self) -> tuple[int, ...]:
+        """The score types that are fitted."""
+        return self.credit_specs[0].score_types
 
     @property
     def columns(self) -> dict[str, jax.ShapeDtypeStruct]:
         """The columns of a row of the replay: those that the algorithm and the decoder read, and no others."""
         env, consumes = self.env, self.algorithm.consumes
-        stored = consumes is not Consumes.ROLLOUTS
-        encoder = self.method.encoder
-        raw = encoder not in (None, Encoder.LATENT)
-        wanted = {
-            "observation": stored or (raw and not self.of_state),
-            "action": stored or (raw and encoder is not Encoder.RAW) or self.raw_differences,
-            "factors": self.method.latent,
+        is_replayed = consumes is not Consumes.ROLLOUTS
+        inputs = self.credit_specs[0].inputs
+        has_raw_features = any(name != "factors" for name in inputs)
+        is_stored = {
+            "observation": is_replayed or (has_raw_features and not self.team_level),
+            "action": is_replayed or "action" in inputs,
+            "factors": self.method.needs_phi,
             "reward": True,
-            "state": env.state_size > 0 and ((raw and self.of_state) or consumes is Consumes.SEQUENCES),
+            "state": env.state_size > 0 and ((has_raw_features and self.team_level) or consumes is Consumes.SEQUENCES),
             "available": env.masks_actions and consumes is Consumes.SEQUENCES,
             "alive": env.agents_leave,
             "terminated": consumes is Consumes.TRANSITIONS,
         }
         shapes: dict[str, tuple[tuple[int, ...], type]] = {
-            "observation": ((env.agents, env.observation_size), np.float32),
-            "action": ((env.agents, env.action_size), np.float32),
-            "factors": ((self.judged_rows, max(self.factors, default=0)), np.float32),
-            "reward": ((env.agents,), np.float32),
+            "observation": ((env.n_agents, env.observation_size), np.float32),
+            "action": ((env.n_agents, env.action_size), np.float32),
+            "factors": ((self.credit_rows, max(self.n_factors, default=0)), np.float32),
+            "reward": ((env.n_agents,), np.float32),
             "state": ((env.state_size,), np.float32),
-            "available": ((env.agents, env.action_size), np.bool_),
-            "alive": ((env.agents,), np.bool_),
+            "available": ((env.n_agents, env.action_size), np.bool_),
+            "alive": ((env.n_agents,), np.bool_),
             "terminated": ((), np.bool_),
         }
-        return {name: jax.ShapeDtypeStruct(*shapes[name]) for name, there in wanted.items() if there}
+        return {name: jax.ShapeDtypeStruct(*shapes[name]) for name, stored in is_stored.items() if stored}

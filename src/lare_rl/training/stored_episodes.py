@@ -1,28 +1,32 @@
-"""The episodes that the replay of a run holds, as logs."""
+"""The episodes that the replay of a run holds: as logs, and for reflection."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from lare_rl.data.replay import Replay, end_of
-from lare_rl.envs.interface import EnvSpec, env_action
+from lare_rl.data.replay import Replay, end_of_episode
+from lare_rl.envs.interface import EnvSpec, Timestep, team_mean, to_env_action
+from lare_rl.envs.play import Episode, find_team, phi_inputs
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
-from lare_rl.training.seed_axis import of_seed
-from lare_rl.training.session import load_learner
+from lare_rl.tasks.spec import TaskSpec
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
 
-READ = ("observation", "action", "reward")
-"""The columns of the replay that are needed."""
+__all__ = ["stored_episodes", "stored_role_episodes"]
 
-Episode = Mapping[str, np.ndarray]
+MAX_ROLE_EPISODES = 200
+"""The largest number of episodes for reflection, over all seeds and environments."""
+
+Log = Mapping[str, np.ndarray]
 """The arrays of an episode, by name."""
 
 
-def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Episode]:
-    """The finished episodes in the replay of a run's last checkpoint, in the order of their environments and of time.
+def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Log]:
+    """Return the finished episodes in the replay of a run's last checkpoint, in the order of their environments and of time.
 
     Each is a mapping as `lare_rl.relabel` and `numpy.savez` take it, for an episode of T steps:
 
@@ -42,39 +46,104 @@ def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Epis
         LareError: there is no checkpoint, it does not hold such episodes, or the run has no such seed.
     """
     run = as_run(run)
-    place = run.place_of(seed)
+    seed_index = run.seed_index(seed)
     config, learner, _, _ = load_learner(run)
-    held: Replay = of_seed(learner.replay, place)
-    if missing := [name for name in READ if name not in held.columns]:
+    replay = select_seed(learner.replay, seed_index)
+    _check_columns(run, replay, "observation", "action", "reward")
+    return [
+        _make_log(_env_columns(replay, env_index), rows, config.env)
+        for env_index in range(len(replay.row))
+        for rows in _episode_rows(replay, env_index)
+    ]
+
+
+def stored_role_episodes(run: Run, role: TaskSpec) -> list[Episode]:
+    """Return the newest finished episodes of all seeds from the view of a role, in the order in which they were played.
+
+    Raises:
+        LareError: there is no checkpoint, it does not hold such episodes, or the run is of another environment.
+    """
+    if run.config.task.environment != role.environment:
+        raise LareError(
+            f"{run.directory} is a run of {run.config.task.name}: its episodes are not those of {role.name}"
+        )
+    config, learner, _, _ = load_learner(run)
+    n_newest = max(1, MAX_ROLE_EPISODES // (len(run.seeds) * config.n_envs))
+    episodes = []
+    for seed_index in range(len(run.seeds)):
+        replay = select_seed(learner.replay, seed_index)
+        _check_columns(run, replay, "state" if role.judged_from == "state" else "observation", "action", "reward")
+        for env_index in range(config.n_envs):
+            columns = _env_columns(replay, env_index)
+            newest = list(_episode_rows(replay, env_index))[-n_newest:]
+            # The last episodes of each environment were played at about the same time.
+            episodes += [
+                (i - len(newest), _make_episode(columns, rows, config.env, role)) for i, rows in enumerate(newest)
+            ]
+    return [episode for _, episode in sorted(episodes, key=lambda pair: pair[0])]
+
+
+def _check_columns(run: Run, replay: Replay, *names: str) -> None:
+    if missing := [name for name in names if name not in replay.columns]:
         raise LareError(
             f"{run.directory} does not store the column {missing[0]}: its algorithm and its method do not read it"
         )
-    found = []
-    for env in range(len(held.row)):
-        row, first = np.asarray(held.row[env]), np.asarray(held.first[env])
-        columns = {
-            name: np.asarray(values[env]) for name, values in held.columns.items() if name in (*READ, "terminated")
-        }
-        episode = jnp.arange(int(held.oldest[env]), int(held.episodes[env]))
-        ends = np.asarray(end_of(held, jnp.full_like(episode, env), episode))
-        for begin, end in zip(first[episode % len(first)], ends, strict=True):
-            found.append(episode_of(columns, row[np.arange(begin, end) % len(row)], config.env))
-    return found
 
 
-def episode_of(columns: Mapping[str, np.ndarray], rows: Int[np.ndarray, " steps"], env: EnvSpec) -> Episode:
-    """One episode, from the numbers of the rows of its steps."""
+def _env_columns(replay: Replay, env_index: int) -> dict[str, np.ndarray]:
+    return {name: np.asarray(column[env_index]) for name, column in replay.columns.items()}
+
+
+def _episode_rows(replay: Replay, env_index: int) -> Iterator[Int[np.ndarray, " steps"]]:
+    """Yield the rows of the steps of each finished episode. The row after the last one has the final observation."""
+    row, first = np.asarray(replay.row[env_index]), np.asarray(replay.first[env_index])
+    episode = jnp.arange(int(replay.oldest[env_index]), int(replay.episodes[env_index]))
+    ends = np.asarray(end_of_episode(replay, jnp.full_like(episode, env_index), episode))
+    for begin, end in zip(first[episode % len(first)], ends, strict=True):
+        yield row[np.arange(begin, end) % len(row)]
+
+
+def _make_log(columns: Log, rows: Int[np.ndarray, " steps"], env: EnvSpec) -> Log:
     size = len(columns["observation"])
-    action = env_action(columns["action"][rows % size], env)
-    action = np.argmax(action, axis=-1) if env.discrete else action
-    each = {
+    env_action = to_env_action(columns["action"][rows % size], env)
+    log = {
         "observations": columns["observation"][np.append(rows, rows[-1] + 1) % size],
-        "actions": action,
+        "actions": np.argmax(env_action, axis=-1) if env.discrete else env_action,
         "rewards": columns["reward"][rows % size],
     }
-    alone = {name: values[:, 0] if env.agents == 1 else values for name, values in each.items()}
+    if env.n_agents == 1:
+        log = {name: values[:, 0] for name, values in log.items()}
     if "terminated" not in columns:
-        return alone
+        return log
     terminated = columns["terminated"][rows % size]
-    last = np.arange(len(rows)) == len(rows) - 1
-    return alone | {"terminations": terminated, "truncations": last & ~terminated}
+    is_last = np.arange(len(rows)) == len(rows) - 1
+    return log | {"terminations": terminated, "truncations": is_last & ~terminated}
+
+
+def _make_episode(columns: Log, rows: Int[np.ndarray, " steps"], env: EnvSpec, role: TaskSpec) -> Episode:
+    size, team = len(columns["reward"]), find_team(role, env)
+
+    def read(name: str, rows: np.ndarray) -> np.ndarray:
+        return columns[name][rows % size] if name in columns else np.zeros(0, np.float32)
+
+    def read_timestep(rows: np.ndarray) -> Timestep:
+        arrays = {name: read(name, rows) for name in Timestep._fields if name != "measures"}
+        return Timestep(**arrays, measures={})
+
+    env_action = to_env_action(read("action", rows), env)
+    observation, action = phi_inputs(role.judged_from, team, read_timestep(rows), env_action)
+    next_observation, _ = phi_inputs(role.judged_from, team, read_timestep(rows + 1), env_action)
+    alive = read("alive", rows) if "alive" in columns else np.ones((len(rows), env.n_agents), bool)
+    reward = read("reward", rows)
+    team_reward = np.asarray(team_mean(reward, alive, team))
+    alive, reward = alive[:, team.agents], reward[:, team.agents]
+    if role.judged_from == "state":
+        alive, reward = np.ones((len(rows), 1), bool), team_reward[:, None]
+    return Episode(
+        observation=observation,
+        env_action=action,
+        next_observation=next_observation,
+        alive=alive,
+        reward=reward,
+        team_reward=team_reward,
+    )

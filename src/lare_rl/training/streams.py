@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from lare_rl.algorithms.table import Noise
+from lare_rl.algorithms.registry import Noise
+
+__all__ = ["Stream", "device_noise", "episode_seed", "host_noise", "numpy_generator", "seed_keys", "stream_keys"]
 
 
 class Stream(IntEnum):
-    """The purposes of random numbers. Each purpose has its own numbers, independent of the others."""
+    """The purposes of random numbers. The numbers of each purpose are independent of the others."""
 
     TRAINING_EPISODES = 0
     EXPLORATION = 1
@@ -21,40 +23,40 @@ class Stream(IntEnum):
     EVALUATION_NOISE = 4
 
 
-def generator(seed: int, stream: Stream, number: int) -> np.random.Generator:
-    """Random numbers for the host."""
+def numpy_generator(seed: int, stream: Stream, number: int) -> np.random.Generator:
+    """Return a generator for the host."""
     return np.random.default_rng([seed, stream, number])
 
 
 def episode_seed(seed: int, stream: Stream, episode: int) -> int:
-    """The seed with which an environment on the host is reset."""
-    return int(generator(seed, stream, episode).integers(2**31))
+    """Return the seed with which an environment on the host is reset."""
+    return int(numpy_generator(seed, stream, episode).integers(2**31))
 
 
 @jax.jit
 def seed_keys(seeds: Int[Array, " seeds"], number: int | Array) -> Key[Array, " seeds"]:
-    """A key for each seed."""
+    """Return a key for each seed."""
     return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), number))(seeds)
 
 
 def stream_keys(seeds: Sequence[int], stream: Stream, number: int) -> Key[Array, " seeds"]:
-    """A key for each seed, by a purpose and a number."""
+    """Return a key for each seed, by a purpose and a number."""
     streams = seed_keys(jnp.asarray(seeds), -1 - int(stream))
     return jax.vmap(lambda key: jax.random.fold_in(key, number))(streams)
 
 
-def host_noise(random: np.random.Generator, noise: Noise, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """Noise for a policy that collects on the host."""
+def host_noise(rng: np.random.Generator, noise: Noise, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    """Draw noise for a policy that collects on the host."""
     match noise:
         case Noise.NORMAL:
-            return random.standard_normal(shape).astype(np.float32)
+            return rng.standard_normal(shape).astype(np.float32)
         case Noise.GUMBEL:
-            return random.gumbel(size=shape).astype(np.float32)
+            return rng.gumbel(size=shape).astype(np.float32)
         case Noise.UNIFORM:
-            return random.random(shape, np.float32)
+            return rng.random(shape, np.float32)
 
 
 def device_noise(key: Array, noise: Noise, shape: tuple[int, ...]) -> Float[Array, "..."]:
-    """`host_noise` in compiled code."""
-    draw = {Noise.NORMAL: jax.random.normal, Noise.GUMBEL: jax.random.gumbel, Noise.UNIFORM: jax.random.uniform}
-    return draw[noise](key, shape)
+    """Draw the noise of `host_noise` in compiled code."""
+    sample = {Noise.NORMAL: jax.random.normal, Noise.GUMBEL: jax.random.gumbel, Noise.UNIFORM: jax.random.uniform}
+    return sample[noise](key, shape)

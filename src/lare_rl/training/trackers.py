@@ -10,43 +10,46 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from lare_rl.errors import LareError, needs_extra
-from lare_rl.training.progress import Metrics
+from lare_rl.errors import LareError, missing_extra_error
+from lare_rl.training.progress import Listener, Metrics
+
+__all__ = ["MLflow", "WeightsAndBiases"]
 
 
-class WeightsAndBiases:
+class WeightsAndBiases(Listener):
     """Sends every number to Weights & Biases, with the extra `lare-rl[wandb]`."""
 
     def __init__(self, **arguments: Any):
-        """Arguments are those of `wandb.init`: project, group, config, mode, dir, ... Raises `LareError` if wandb is missing."""
+        """Take the arguments of `wandb.init`: project, group, config, mode, dir, ...
+
+        Raises:
+            LareError: wandb is not installed.
+        """
         try:
             import wandb
         except ImportError:
-            raise needs_extra("Weights & Biases", "wandb") from None
+            raise missing_extra_error("Weights & Biases", "wandb") from None
         self.init, self.arguments, self.name = wandb.init, arguments, ""
         self.runs: dict[int, Any] = {}
         """The service's runs, by seed."""
 
-    def started(self, name: str, step: int, steps: int) -> None:
+    def on_start(self, name: str, step: int, steps: int) -> None:
         self.name = name
 
-    def stepped(self, step: int) -> None: ...
-    def said(self, message: str) -> None: ...
-
-    def evaluated(self, metrics: Metrics) -> None:
+    def on_evaluation(self, metrics: Metrics) -> None:
         for line in metrics:
             seed = line["seed"]
             if seed not in self.runs:
-                given: dict[str, Any] = {"name": f"{self.name} seed {seed}", "group": self.name} | self.arguments
-                self.runs[seed] = self.init(reinit="create_new", **given)
-            self.runs[seed].log(numbers(line), step=line["step"])
+                arguments: dict[str, Any] = {"name": f"{self.name} seed {seed}", "group": self.name} | self.arguments
+                self.runs[seed] = self.init(reinit="create_new", **arguments)
+            self.runs[seed].log(_numbers(line), step=line["step"])
 
-    def stopped(self) -> None:
+    def on_stop(self) -> None:
         for run in self.runs.values():
             run.finish()
 
 
-class MLflow:
+class MLflow(Listener):
     """Sends every number to MLflow, with the extra `lare-rl[mlflow]`."""
 
     def __init__(
@@ -60,48 +63,45 @@ class MLflow:
             parameters: parameters that are saved with every run.
 
         Raises:
-            LareError: mlflow is missing, or the tracking server or directory cannot be used.
+            LareError: mlflow is not installed, or the tracking server or directory cannot be used.
         """
         try:
             from mlflow import MlflowClient
             from mlflow.entities import Metric, Param
             from mlflow.exceptions import MlflowException
         except ImportError:
-            raise needs_extra("MLflow", "mlflow") from None
+            raise missing_extra_error("MLflow", "mlflow") from None
         self.metric = Metric
         self.parameters = [Param(key, str(value)) for key, value in (parameters or {}).items()]
         try:
             self.client = MlflowClient(tracking_uri)
-            known = self.client.get_experiment_by_name(experiment)
-            self.experiment = known.experiment_id if known else self.client.create_experiment(experiment)
+            existing = self.client.get_experiment_by_name(experiment)
+            self.experiment = existing.experiment_id if existing else self.client.create_experiment(experiment)
         except MlflowException as error:
             raise LareError(f"MLflow cannot be used: {error}") from error
         self.name = ""
         self.runs: dict[int, str] = {}
-        """The service's runs, by seed."""
+        """The ids of the service's runs, by seed."""
 
-    def started(self, name: str, step: int, steps: int) -> None:
+    def on_start(self, name: str, step: int, steps: int) -> None:
         self.name = name
 
-    def stepped(self, step: int) -> None: ...
-    def said(self, message: str) -> None: ...
-
-    def evaluated(self, metrics: Metrics) -> None:
-        now = int(1000 * time.time())
+    def on_evaluation(self, metrics: Metrics) -> None:
+        now_ms = int(1000 * time.time())
         for line in metrics:
             seed = line["seed"]
             if seed not in self.runs:
-                made = self.client.create_run(self.experiment, run_name=f"{self.name} seed {seed}")
-                self.runs[seed] = made.info.run_id
+                run = self.client.create_run(self.experiment, run_name=f"{self.name} seed {seed}")
+                self.runs[seed] = run.info.run_id
                 self.client.log_batch(self.runs[seed], params=self.parameters)
-            found = [self.metric(key, value, now, line["step"]) for key, value in numbers(line).items()]
-            self.client.log_batch(self.runs[seed], metrics=found)
+            numbers = [self.metric(key, value, now_ms, line["step"]) for key, value in _numbers(line).items()]
+            self.client.log_batch(self.runs[seed], metrics=numbers)
 
-    def stopped(self) -> None:
+    def on_stop(self) -> None:
         for run in self.runs.values():
             self.client.set_terminated(run)
 
 
-def numbers(line: Mapping[str, Any]) -> dict[str, float]:
-    """The measured numbers of a line of metrics.jsonl."""
+def _numbers(line: Mapping[str, Any]) -> dict[str, float]:
+    """Return the metrics of a line of metrics.jsonl, without those that are null."""
     return {key: value for key, value in line.items() if key not in ("step", "seed") and value is not None}

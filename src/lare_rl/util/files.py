@@ -1,4 +1,4 @@
-"""Files that are replaced as a whole: if the process is killed, or the disk is full, the old file stays."""
+"""Files that are replaced as a whole. If the process is killed, or the disk is full, the old file stays."""
 
 import os
 from collections.abc import Callable
@@ -8,19 +8,28 @@ from uuid import uuid4
 
 from lare_rl.errors import LareError
 
+__all__ = ["replace_file", "write_atomically"]
+
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
-    """Like `replace`, but a failure raises a `LareError` of one line."""
+    """Replace a file by what `write` writes.
+
+    Raises:
+        LareError: the file cannot be written.
+    """
     try:
-        replace(path, write)
+        replace_file(path, write)
     except OSError as error:
-        raise LareError(
-            f"{path} cannot be written ({error.strerror or error}); an existing file is unchanged"
-        ) from error
+        reason = error.strerror or error
+        raise LareError(f"{path} cannot be written ({reason}); an existing file is unchanged") from error
 
 
-def replace(path: Path, write: Callable[[Any], object]) -> None:
-    """Let `write` fill a new file, and move it to `path` when it is complete on the disk. Raises `OSError`."""
+def replace_file(path: Path, write: Callable[[Any], object]) -> None:
+    """Let `write` fill a new file, and move it to `path` when it is complete on the disk.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     new = path.with_name(f"{path.name}.{uuid4().hex}.new")  # unique: another process may write the same file
     try:
         with new.open("wb") as file:
@@ -28,6 +37,6 @@ def replace(path: Path, write: Callable[[Any], object]) -> None:
             file.flush()
             os.fsync(file.fileno())
         new.replace(path)
-    except BaseException:  # nothing else would remove it
+    except BaseException:  # an interruption must not leave the new file either
         new.unlink(missing_ok=True)
         raise

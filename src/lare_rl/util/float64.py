@@ -7,21 +7,22 @@ from functools import cache
 import jax
 from threadpoolctl import ThreadpoolController
 
+__all__ = ["float64"]
+
 
 @contextlib.contextmanager
 def float64() -> Iterator[None]:
-    """Within it, JAX calculates in float64, and libraries of linear algebra use one thread. Results must be waited for within it.
+    """Let JAX calculate in float64, and linear algebra use one thread. Wait for results before the block ends.
 
-    The matrices of a fit are small. With several threads, the libraries wait actively until each of them has run. On a machine
-    whose cores have other work, a fit then takes a hundred times as long.
+    The matrices of a fit are small. With several threads, the libraries of linear algebra wait actively until each thread has
+    run. On a machine whose cores have other work, a fit then takes a hundred times as long.
     """
-    with jax.enable_x64(True), libraries().limit(limits=1, user_api="blas"):
+    with jax.enable_x64(True), _linear_algebra_libraries().limit(limits=1, user_api="blas"):
         yield
 
 
 @cache
-def libraries() -> ThreadpoolController:
-    """The libraries that this process has loaded."""
+def _linear_algebra_libraries() -> ThreadpoolController:
     import scipy.linalg  # noqa: F401 - JAX calls the LAPACK that SciPy loads
 
     return ThreadpoolController()

@@ -6,24 +6,29 @@ from pathlib import Path
 
 from lare_rl._version import __version__
 
+__all__ = ["code_version"]
+
 
 @functools.cache
-def source(directory: Path = Path(__file__).parents[1]) -> str:
-    """Version of the package; in a checkout also the last commit that touched it, and whether it was changed since.
+def code_version(directory: Path = Path(__file__).parents[1]) -> str:
+    """Return the version of the package; in a checkout also its last commit, and whether the code was changed since.
 
-    If `directory` only lies within another repository, as a virtual environment may, that repository's commits do not count.
+    Only commits that touch `directory` count. A directory such as a virtual environment may lie within another repository, whose
+    commits say nothing about it.
     """
-    commit = git(directory, "log", "-1", "--format=%h", "--abbrev=10", "--", ".")
+    commit = _git(directory, "log", "-1", "--format=%h", "--abbrev=10", "--", ".")
     if not commit:
         return __version__
-    changed = git(directory, "status", "--porcelain", "--", ".")
+    changed = _git(directory, "status", "--porcelain", "--", ".")
     return f"{__version__} ({commit}{', changed' if changed else ''})"
 
 
-def git(directory: Path, *arguments: str) -> str:
-    """The output of git; empty if it fails."""
+def _git(directory: Path, *arguments: str) -> str:
+    """Return the output of git, or an empty text if it fails."""
     try:
-        done = subprocess.run(("git", *arguments), cwd=directory, capture_output=True, text=True, timeout=5, check=True)
+        process = subprocess.run(
+            ("git", *arguments), cwd=directory, capture_output=True, text=True, timeout=5, check=True
+        )
     except (OSError, subprocess.SubprocessError):
         return ""
-    return done.stdout.strip()
+    return process.stdout.strip()

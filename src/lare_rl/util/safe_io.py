@@ -1,6 +1,6 @@
-"""Reading files that somebody else may have written: texts of a bounded size, JSON and TOML of a bounded depth.
+"""Reading of untrusted files: texts of a bounded size, JSON and TOML of a bounded depth.
 
-Files that LaRe wrote are read by these functions too: they may be damaged, or come from somebody else.
+Files that LaRe wrote are read by these functions too: they may be damaged, or come from another person.
 """
 
 import json
@@ -11,31 +11,47 @@ from typing import Any
 
 from lare_rl.errors import LareError
 
-DEEPEST = 64
+__all__ = [
+    "MAX_DEPTH",
+    "MAX_SETTINGS_BYTES",
+    "MAX_TEXT_BYTES",
+    "check_depth",
+    "parse_integer",
+    "read_json",
+    "read_text",
+    "read_toml",
+]
+
+MAX_DEPTH = 64
 """The largest depth of objects within objects."""
 
-MOST_DIGITS = 1000
+MAX_TEXT_BYTES = 64 << 20
+"""The largest size of a file of texts, such as a recording of a hundred long replies."""
+
+MAX_SETTINGS_BYTES = 1 << 20
+"""The largest size of a file that is written by hand."""
+
+_MAX_DIGITS = 1000
 """The most digits of a whole number. Python's own limit is 4300, and its message is for programmers."""
 
-DOTS = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{DEEPEST}}}""")
-"""A name of deeply nested tables, for which the parser takes quadratic time."""
-
-LARGEST_TEXT = 64 << 20
-"""The largest size in bytes of a file of texts, such as a recording of a hundred long replies."""
-
-LARGEST_SETTINGS = 1 << 20
-"""The largest size in bytes of a file that is written by hand."""
+# A name of deeply nested tables, for which the parser takes quadratic time.
+_DEEP_NAME = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}""")
+_TOO_DEEP = f"it is nested more than {MAX_DEPTH} deep"
 
 
-def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
-    """A file's text. Raises `LareError` if it cannot be read, or is larger than `largest`."""
+def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    r"""Read a text file in UTF-8. Lines of the result end with \n.
+
+    Raises:
+        LareError: the file cannot be read, or is too large.
+    """
     try:
         if path.exists() and not path.is_file():
             raise LareError(f"{path} is not a file")
         with path.open("rb") as file:
-            content = file.read(largest + 1)
-        if len(content) > largest:
-            raise LareError(f"{path} is larger than {largest >> 20} MB")
+            content = file.read(max_bytes + 1)
+        if len(content) > max_bytes:
+            raise LareError(f"{path} is larger than {max_bytes >> 20} MB")
         return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
@@ -43,46 +59,60 @@ def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
 
 
 def read_json(text: str | bytes, strict: bool = True) -> Any:
-    """The value of a JSON text. Raises `ValueError` if it is not JSON, or is nested too deep.
+    """Parse a JSON text.
 
     Args:
-        strict: if false, a string may contain line breaks.
+        text: the text.
+        strict: if false, strings may contain line breaks.
+
+    Raises:
+        ValueError: the text is not JSON, or is nested too deep.
     """
     try:
-        return shallow(json.loads(text, strict=strict, parse_int=integer))
+        return check_depth(json.loads(text, strict=strict, parse_int=parse_integer))
     except RecursionError:
-        raise ValueError(TOO_DEEP) from None
+        raise ValueError(_TOO_DEEP) from None
 
 
 def read_toml(text: str) -> dict[str, Any]:
-    """The value of a TOML text. Raises `ValueError` like `read_json`."""
-    if DOTS.search(text):
-        raise ValueError(TOO_DEEP)
+    """Parse a TOML text.
+
+    Raises:
+        ValueError: the text is not TOML, or is nested too deep.
+    """
+    if _DEEP_NAME.search(text):
+        raise ValueError(_TOO_DEEP)
     try:
-        return shallow(tomllib.loads(text))
+        return check_depth(tomllib.loads(text))
     except RecursionError:
-        raise ValueError(TOO_DEEP) from None
+        raise ValueError(_TOO_DEEP) from None
 
 
-TOO_DEEP = f"it is nested more than {DEEPEST} deep"
+def check_depth(value: Any) -> Any:
+    """Return a value that is not nested too deep for recursive functions.
 
-
-def shallow(value: Any) -> Any:
-    """The value. Raises `ValueError` if it is nested too deep for recursive functions."""
+    Raises:
+        ValueError: it is nested too deep.
+    """
     level = [value]
-    for _ in range(DEEPEST):
+    for _ in range(MAX_DEPTH):
+        containers = [item for item in level if isinstance(item, dict | list)]
         level = [
-            inner
-            for one in level
-            if isinstance(one, dict | list)
-            for inner in (one.values() if isinstance(one, dict) else one)
+            item
+            for container in containers
+            for item in (container.values() if isinstance(container, dict) else container)
         ]
         if not level:
             return value
-    raise ValueError(TOO_DEEP)
+    raise ValueError(_TOO_DEEP)
 
 
-def integer(digits: str) -> int:
-    if len(digits) > MOST_DIGITS:
+def parse_integer(digits: str) -> int:
+    """Parse a whole number.
+
+    Raises:
+        ValueError: it has too many digits.
+    """
+    if len(digits) > _MAX_DIGITS:
         raise ValueError(f"a number of {len(digits)} digits")
     return int(digits)

@@ -3,32 +3,37 @@
 import re
 import unicodedata
 
-FILLERS = re.compile(
+__all__ = ["first_invisible", "one_line", "sanitize"]
+
+# Letters and marks by their category, but invisible (Default_Ignorable_Code_Point, and the empty Braille pattern).
+_FILLERS = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2065\u2800\u3164\ufe00-\ufe0f\uffa0\U0001bca0-\U0001bca3\U000e0000-\U000e0fff]"
 )
-"""Letters and marks by their category, but invisible (Default_Ignorable_Code_Point, and the empty Braille pattern)."""
-
-UNSEEN = frozenset({"Cc", "Cf", "Co", "Cs", "Cn", "Zl", "Zp"})
-"""Unicode categories: control, format, private use, surrogate, unassigned, line separator, paragraph separator."""
+# Control, format, private use, surrogate, unassigned, line separator, paragraph separator.
+_INVISIBLE_CATEGORIES = frozenset({"Cc", "Cf", "Co", "Cs", "Cn", "Zl", "Zp"})
 
 
-def is_seen(letter: str) -> bool:
-    """Whether a character is visible, or is common white space."""
-    return letter in "\n\t" or (unicodedata.category(letter) not in UNSEEN and not FILLERS.match(letter))
+def sanitize(text: str) -> str:
+    """Replace control and invisible characters by `?`, because some printed texts come from strangers."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(letter if _is_visible(letter) else "?" for letter in text)
 
 
-def unseen(text: str) -> int | None:
-    """The index of the first invisible character; None if there is none."""
+def one_line(text: object) -> str:
+    """Sanitize a text, and write it in one line."""
+    return sanitize(" ".join(str(text).split()))
+
+
+def first_invisible(text: str) -> int | None:
+    """Return the index of the first invisible character, or None."""
     if text.isascii() and text.replace("\n", "").replace("\t", "").isprintable():
         return None
-    return next((place for place, letter in enumerate(text) if not is_seen(letter)), None)
+    return next((index for index, letter in enumerate(text) if not _is_visible(letter)), None)
 
 
-def legible(text: str) -> str:
-    """The text with `?` for control and invisible characters, because some printed texts come from strangers."""
-    return text if text.isascii() and text.isprintable() else "".join(one if is_seen(one) else "?" for one in text)
-
-
-def in_a_line(text: object) -> str:
-    """The same, in one line."""
-    return legible(" ".join(str(text).split()))
+def _is_visible(letter: str) -> bool:
+    """Return whether a character is visible, or is common white space."""
+    return letter in "\n\t" or (
+        unicodedata.category(letter) not in _INVISIBLE_CATEGORIES and not _FILLERS.match(letter)
+    )

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from helpers.toys import toy_spec
+from helpers.toy_envs import toy_spec
 from lare_rl.envs.load import load_task
-from lare_rl.latent.design import DesignFailed
+from lare_rl.latent.design import DesignError
 from lare_rl.llm.recording import Recorder
 from paper import correlations
 from paper.exhibits import budgets
@@ -32,7 +32,7 @@ def test_steps_of_many_agents_have_the_rewards_of_each():
 def test_the_page(monkeypatch):
     monkeypatch.setattr(correlations, "PRINTED", {"Reacher-v4": ("1", "2", "3", "4")})
     budget = budgets()["smoke"].model_copy(update={"functions": 2})
-    page = correlations.page_of(budget, "lare-rl reproduce table-1")
+    page = correlations.make_page(budget, "lare-rl reproduce table-1")
     row = next(line for line in page.text.splitlines() if line.startswith("| Reacher-v4 |"))
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert cells[1].split()[1] == "(11),"
@@ -44,11 +44,11 @@ def test_the_page(monkeypatch):
 def test_a_draw_of_which_nothing_passes_is_counted(phi, monkeypatch):
     def design(task, draw):
         if draw == 1:
-            raise DesignFailed("no attempt passed", Recorder(task.name, "factors", None), "recorded")
+            raise DesignError("no attempt passed", Recorder(task.name, "factors", None), "recorded")
         return phi
 
     monkeypatch.setattr(correlations, "design", design)
     assert correlations.designed(toy_spec(), 3) == [phi, None, phi]
-    states, factors = correlations.of_entries(correlations.random_steps(toy_spec(), 1), "before", [])
+    states, factors = correlations.entries_cells(correlations.random_steps(toy_spec(), 1), "before", [])
     assert states.split()[1] == "(2),"
     assert factors == "-"

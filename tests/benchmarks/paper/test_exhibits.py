@@ -7,32 +7,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.toys import At
+from helpers.listeners import AtStep
 from lare_rl.cli import studies
-from lare_rl.compare import statistics
-from lare_rl.compare.scores import ERROR, RETURN, SUMMED_RETURN
+from lare_rl.compare import bootstrap
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
 from lare_rl.llm.recording import shipped_recordings
-from lare_rl.runs.directory import describe
+from lare_rl.runs.config_file import make_config
+from lare_rl.runs.metric_names import CREDIT_ERROR, RETURN, SUMMED_RETURN
 from lare_rl.sweep import processes
-from lare_rl.sweep.jobs import as_json, check, train_one
-from lare_rl.sweep.sweep import Share
+from lare_rl.sweep.jobs import job_to_json, train_job
+from lare_rl.sweep.sweep import Resources
 from lare_rl.training import train as training
-from paper.exhibits import OURS, Exhibit, budgets, exhibits, jobs_of
+from paper.exhibits import LARE_SOURCE, Exhibit, budgets, exhibit_jobs, exhibits
 from paper.reproduce import UNTRAINED, listed, reproduce
 from paper.trained import MEANING, TRAVELLED, WON, verdict
 
 EXHIBITS = exhibits()
 BUDGETS = tuple(budgets())
 NAMES = [name for name, _, _ in listed()]
-of_each_exhibit = pytest.mark.parametrize("exhibit", EXHIBITS.values(), ids=EXHIBITS)
-of_each_budget = pytest.mark.parametrize("budget", BUDGETS)
+each_exhibit = pytest.mark.parametrize("exhibit", EXHIBITS.values(), ids=EXHIBITS)
+each_budget = pytest.mark.parametrize("budget", BUDGETS)
 
 
 @pytest.fixture(autouse=True)
 def few_repetitions(monkeypatch):
-    monkeypatch.setattr(statistics, "REPETITIONS", 50)
+    monkeypatch.setattr(bootstrap, "REPETITIONS", 50)
 
 
 def write_run(value):
@@ -40,12 +40,12 @@ def write_run(value):
 
     def train(job, cores, running):
         job.directory.mkdir(parents=True)
-        (job.directory / "config.json").write_text(describe(job.task, job.resolved, ()).model_dump_json())
+        (job.directory / "config.json").write_text(make_config(job.task, job.resolved, ()).model_dump_json())
         lines = []
         for step in (job.resolved.steps // 2, job.resolved.steps):
             for seed in job.resolved.all_seeds:
-                found = float(value(job.resolved, seed))
-                measured = dict.fromkeys((RETURN, SUMMED_RETURN, TRAVELLED, WON), found) | {ERROR: 0.1 * found}
+                score = float(value(job.resolved, seed))
+                measured = dict.fromkeys((RETURN, SUMMED_RETURN, TRAVELLED, WON), score) | {CREDIT_ERROR: 0.1 * score}
                 lines.append({"step": step, "seed": seed, **measured, "credit/correlation": 0.5})
         (job.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
@@ -55,10 +55,12 @@ def write_run(value):
 @pytest.fixture
 def made_up(monkeypatch):
     """Each method has a return of its own, its place in the table of methods."""
-    monkeypatch.setattr(processes, "in_a_process", write_run(lambda settings, _: list(METHODS).index(settings.method)))
+    monkeypatch.setattr(
+        processes, "train_in_process", write_run(lambda settings, _: list(METHODS).index(settings.method))
+    )
 
 
-@of_each_exhibit
+@each_exhibit
 def test_what_is_claimed_and_printed_is_of_contenders_that_are_there(exhibit):
     labels = exhibit.contenders
     assert {name for claim in exhibit.claims for name in (claim.better, *claim.than)} <= set(labels)
@@ -68,36 +70,36 @@ def test_what_is_claimed_and_printed_is_of_contenders_that_are_there(exhibit):
     assert set(exhibit.laptop) <= set(exhibit.tasks)
 
 
-@of_each_budget
-@of_each_exhibit
+@each_budget
+@each_exhibit
 def test_every_run_of_an_exhibit_could_be_trained(exhibit, budget):
     """Settings that go together, and recordings that are there."""
-    for of_task in jobs_of(exhibit, budget, Path("runs")).values():
-        for job in (job for some in of_task.values() for job in some):
+    for task_jobs in exhibit_jobs(exhibit, budget, Path("runs")).values():
+        for job in (job for contender_jobs in task_jobs.values() for job in contender_jobs):
             method = METHODS[job.resolved.method]
-            if method.latent:
-                recorded = {recording.task for recording in shipped_recordings(method.kind, job.resolved.draw)}
+            if method.needs_phi:
+                recorded = {recording.task for recording in shipped_recordings(method.phi_kind, job.resolved.draw)}
                 # A task that is like another one has the same prompts.
                 assert {
                     re.sub("Sparse|Target|Threshold|Saturating|Foot", "", role.name) for role in job.task.roles
                 } <= recorded
 
 
-@of_each_exhibit
+@each_exhibit
 def test_runs_that_are_kept_are_taken_for_trained(exhibit):
-    kept = Path(__file__).parents[3] / "benchmarks" / "results" / "reproduce" / "laptop"
-    for of_task in jobs_of(exhibit, "laptop", kept).values():
-        for job in (job for some in of_task.values() for job in some):
-            check(job)
+    results = Path(__file__).parents[3] / "benchmarks" / "results" / "reproduce" / "laptop"
+    for task_jobs in exhibit_jobs(exhibit, "laptop", results).values():
+        for job in (job for contender_jobs in task_jobs.values() for job in contender_jobs):
+            check_job(job)
             assert job.done == job.begun
 
 
 @pytest.mark.parametrize("name", EXHIBITS)
 def test_every_exhibit_becomes_a_page(name, made_up, tmp_path):
     exhibit = EXHIBITS[name]
-    page = reproduce(name, "smoke", Share(), tmp_path / "runs", tmp_path / "out")
+    page = reproduce(name, "smoke", Resources(), tmp_path / "runs", tmp_path / "out")
     text = page.read_text()
-    origin = "Not in the paper" if exhibit.source == OURS else f"The paper's {exhibit.source}"
+    origin = "Not in the paper" if exhibit.source == LARE_SOURCE else f"The paper's {exhibit.source}"
     assert text.startswith(f"# {exhibit.title}\n\n{origin}, by `lare-rl reproduce {name} --budget smoke`.")
     assert all(f"| {label} |" in text for label in exhibit.contenders)
     assert all(f"* {difference}" in text for difference in exhibit.differences)
@@ -109,21 +111,23 @@ def test_every_exhibit_becomes_a_page(name, made_up, tmp_path):
 
 def test_figures_claims_and_verdicts(made_up, tmp_path):
     """With three seeds on two tasks: errors are the place in the table of methods, a tenth of it; more is worse."""
-    text = reproduce("errors", "laptop", Share(), tmp_path / "runs", tmp_path / "out").read_text()
-    places = {label: list(METHODS).index(name) / 10 for label, name in (("RD", "rd"), ("LaRe-RRDu", "lare-rrdu"))}
+    text = reproduce("errors", "laptop", Resources(), tmp_path / "runs", tmp_path / "out").read_text()
+    ranks = {label: list(METHODS).index(name) / 10 for label, name in (("RD", "rd"), ("LaRe-RRDu", "lare-rrdu"))}
     assert "50,000 environment steps, seeds 0 to 2, draw 0 of the language model." in text
-    assert f"| RD | {places['RD']:.4f} |" in text
+    assert f"| RD | {ranks['RD']:.4f} |" in text
     assert "| 0.7 ± 0.5 |" in text
-    assert places["RD"] < places["LaRe-RRDu"]
+    assert ranks["RD"] < ranks["LaRe-RRDu"]
     assert "| LaRe-RRDu errs less than RD | 0 of 9 | 0 of 9 | 1.000 | the other way round |" in text
 
 
 def test_draws_are_what_is_compared_where_there_are_several(tmp_path, monkeypatch):
     """Seeds differ by next to nothing, draws by much: three draws do not settle anything, however many seeds agree."""
     monkeypatch.setattr(
-        processes, "in_a_process", write_run(lambda settings, seed: settings.draw * 1000 + settings.candidates + seed)
+        processes,
+        "train_in_process",
+        write_run(lambda settings, seed: settings.draw * 1000 + settings.candidates + seed),
     )
-    text = reproduce("candidates", "laptop", Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    text = reproduce("candidates", "laptop", Resources(), tmp_path / "runs", tmp_path / "out").read_text()
     assert "| n = 5 is at least as good as n = 1 | 6 of 9 |" in text
     assert "| not refuted |" in text
     rows = (tmp_path / "out" / "laptop" / "candidates.csv").read_text().splitlines()
@@ -146,39 +150,39 @@ def test_verdicts(for_it, against, everywhere, at_least, said):
     assert verdict(for_it, against, everywhere, at_least) == said
 
 
-@of_each_budget
+@each_budget
 def test_no_two_contenders_share_a_run_by_chance(budget):
     """A directory is one run, whoever asks for it."""
-    found = {}
+    score = {}
     for exhibit in EXHIBITS.values():
-        for of_task in jobs_of(exhibit, budget, Path("runs")).values():
-            for job in (job for some in of_task.values() for job in some):
-                assert found.setdefault(job.directory, job.resolved) == job.resolved
+        for task_jobs in exhibit_jobs(exhibit, budget, Path("runs")).values():
+            for job in (job for contender_jobs in task_jobs.values() for job in contender_jobs):
+                assert score.setdefault(job.directory, job.resolved) == job.resolved
 
 
 def test_what_is_shared_or_done_is_not_trained_again(made_up, monkeypatch, tmp_path):
-    reproduce("bottleneck", "smoke", Share(), tmp_path / "runs", tmp_path / "out")
+    reproduce("bottleneck", "smoke", Resources(), tmp_path / "runs", tmp_path / "out")
     trained = []
-    monkeypatch.setattr(processes, "in_a_process", lambda job, *_: trained.append(job.name) or "no")
-    reproduce("bottleneck", "smoke", Share(), tmp_path / "runs", tmp_path / "out")
+    monkeypatch.setattr(processes, "train_in_process", lambda job, *_: trained.append(job.name) or "no")
+    reproduce("bottleneck", "smoke", Resources(), tmp_path / "runs", tmp_path / "out")
     assert trained == []
     with pytest.raises(LareError, match=r"^1 of 3 runs failed, so there is no page: Reacher-v4/rd-td3$"):
-        reproduce("errors", "smoke", Share(), tmp_path / "runs", tmp_path / "out")
+        reproduce("errors", "smoke", Resources(), tmp_path / "runs", tmp_path / "out")
     assert trained == ["Reacher-v4/rd-td3"]
 
 
 def test_remarks_outlive_a_page(made_up, tmp_path):
-    page = reproduce("sparse", "smoke", Share(), tmp_path / "runs", tmp_path / "out")
+    page = reproduce("sparse", "smoke", Resources(), tmp_path / "runs", tmp_path / "out")
     remarked = page.read_text() + "\n## Remarks\n\nNobody got anywhere.\n"
     page.write_text(remarked)
-    assert reproduce("sparse", "smoke", Share(), tmp_path / "runs", tmp_path / "out").read_text() == remarked
+    assert reproduce("sparse", "smoke", Resources(), tmp_path / "runs", tmp_path / "out").read_text() == remarked
 
 
 @pytest.mark.long
 def test_an_exhibit_that_is_trained(command, monkeypatch, tmp_path):
     """The whole way, from the command line; the runs in this process, whose compiler is told to hurry."""
-    monkeypatch.setattr(processes, "in_a_process", lambda job, cores, running: train_one(as_json(job)))
-    monkeypatch.setattr(training, "Terminal", lambda: At(-1, None))
+    monkeypatch.setattr(processes, "train_in_process", lambda job, cores, running: train_job(job_to_json(job)))
+    monkeypatch.setattr(training, "Terminal", lambda: AtStep(-1, None))
     status, out, err = command("reproduce", "errors", "--budget", "smoke")
     assert (status, out) == (0, "wrote results/smoke/errors.md\n"), err
     assert err.splitlines()[-1].startswith("3 of 3: Reacher-v4/")
@@ -190,9 +194,9 @@ def test_an_exhibit_that_is_trained(command, monkeypatch, tmp_path):
 
 
 def test_a_budget_that_teaches_nothing_says_so(made_up, tmp_path):
-    text = reproduce("sparse", "smoke", Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    text = reproduce("sparse", "smoke", Resources(), tmp_path / "runs", tmp_path / "out").read_text()
     assert "it runs, and learns nothing.**" in text
-    text = reproduce("triangle-area", "smoke", Share(), tmp_path / "runs", tmp_path / "out").read_text()
+    text = reproduce("triangle-area", "smoke", Resources(), tmp_path / "runs", tmp_path / "out").read_text()
     assert "* Environment steps: 600 (the paper: 2,050,000)." in text
 
 
@@ -207,21 +211,21 @@ def test_a_budget_that_teaches_nothing_says_so(made_up, tmp_path):
     ],
 )
 def test_where_nothing_can_be_written_nothing_is_trained(prepare, message, monkeypatch, tmp_path):
-    monkeypatch.setattr(processes, "in_a_process", lambda *_: pytest.fail("trained"))
+    monkeypatch.setattr(processes, "train_in_process", lambda *_: pytest.fail("trained"))
     out = tmp_path / "out"
     prepare(out)
     with pytest.raises(LareError) as error:
-        reproduce("sparse", "smoke", Share(), tmp_path / "runs", out)
+        reproduce("sparse", "smoke", Resources(), tmp_path / "runs", out)
     assert str(error.value) == message.format(out=out)
 
 
 def test_all_of_them_goes_on_after_one_that_fails(command, made_up, monkeypatch):
-    def made(name, *_):
+    def fail_reproduce(name, *_):
         if name == "errors":
             raise LareError("no luck")
         return Path(name)
 
-    monkeypatch.setattr("paper.reproduce.reproduce", made)
+    monkeypatch.setattr("paper.reproduce.reproduce", fail_reproduce)
     status, out, err = command("reproduce", "all", "--budget", "smoke")
     assert status == 2
     assert out.split() == [word for name in NAMES if name != "errors" for word in ("wrote", name)]
@@ -241,7 +245,7 @@ def test_an_exhibit_that_is_not_there(command):
 
 
 def test_without_a_checkout(command, monkeypatch, tmp_path):
-    monkeypatch.setattr(studies, "BENCHMARKS", tmp_path)
+    monkeypatch.setattr(studies, "_BENCHMARKS", tmp_path)
     status, _, err = command("reproduce")
     assert status == 2
     assert err == (
@@ -264,4 +268,4 @@ def test_a_contender_for_each_algorithm():
 
 def test_an_exhibit_of_which_something_is_missing():
     with pytest.raises(LareError, match=r"^the key 'tasks' is missing$"):
-        Exhibit(title="none", source=OURS, contenders={"dense": "dense"}, claims=[])
+        Exhibit(title="none", source=LARE_SOURCE, contenders={"dense": "dense"}, claims=[])

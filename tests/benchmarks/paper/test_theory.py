@@ -36,8 +36,8 @@ def test_the_estimate_against_least_squares():
     for row, total in zip(counts, totals, strict=True):
         state = theory.update(state, jnp.asarray(row), jnp.asarray(total))
     # Ridge regression is least squares on rows that ask for 0, sqrt(lambda) strong.
-    rows, asked = np.vstack([counts, np.sqrt(2.0) * np.eye(6)]), np.append(totals, np.zeros(6))
-    np.testing.assert_allclose(theory.estimate(state), np.linalg.lstsq(rows, asked)[0], rtol=1e-3, atol=1e-4)
+    rows, targets = np.vstack([counts, np.sqrt(2.0) * np.eye(6)]), np.append(totals, np.zeros(6))
+    np.testing.assert_allclose(theory.estimate(state), np.linalg.lstsq(rows, targets)[0], rtol=1e-3, atol=1e-4)
 
 
 def test_the_radius_is_that_of_the_paper():
@@ -80,7 +80,7 @@ def test_the_bound_holds_and_the_latent_regret_does_not_grow(mdp):
     regret = {}
     for redundant in (1, 2, 6):
         history = jax.vmap(lambda key, m=redundant: theory.oful(key, mdp, m, HORIZON, 1500))(keys)
-        assert np.asarray(theory.held(history)).all()
+        assert np.asarray(theory.bound_holds(history)).all()
         regret[redundant] = np.asarray(history.regret)
         assert (np.diff(regret[redundant], axis=1) >= -1e-6).all()
     assert regret[1][:, -1].mean() < regret[2][:, -1].mean() < regret[6][:, -1].mean()

@@ -17,7 +17,7 @@ SIZES = {
 
 
 def test_agents_and_observation_sizes():
-    assert {name: (task.agents, task.observation_size) for name, task in TASKS.items()} == SIZES
+    assert {name: (task.n_agents, task.observation_size) for name, task in TASKS.items()} == SIZES
 
 
 def test_a_name_finds_its_task():

@@ -7,8 +7,8 @@ import pytest
 
 from lare_rl.envs.particles.catalogue import TASKS
 from lare_rl.envs.particles.parallel_env import ParticleEnv
-from lare_rl.envs.particles.task import STEPS
-from lare_rl.errors import LareError, pip_install
+from lare_rl.envs.particles.task import MAX_STEPS
+from lare_rl.errors import LareError, install_command
 
 with warnings.catch_warnings():
     # PettingZoo's tests import a game of its own in a way that it has deprecated.
@@ -25,10 +25,10 @@ def test_pettingzoos_checkers_find_no_fault(name):
 def test_an_episode_is_cut_off_after_its_steps():
     environment = ParticleEnv("TriangleArea")
     environment.reset(seed=0)
-    for step in range(1, STEPS + 1):
+    for step in range(1, MAX_STEPS + 1):
         _, _, terminated, truncated, _ = environment.step(dict.fromkeys(environment.agents, 0))
         assert set(terminated.values()) == {False}
-        assert set(truncated.values()) == {step == STEPS}
+        assert set(truncated.values()) == {step == MAX_STEPS}
     assert environment.agents == []
 
 
@@ -60,17 +60,17 @@ def test_an_action_that_is_none_is_refused(action):
         environment.step({**dict.fromkeys(environment.agents, 0), "agent_3": action})
 
 
-@pytest.mark.parametrize("asked", ["step", "render", "state"])
-def test_what_comes_before_the_first_episode_is_refused(asked):
+@pytest.mark.parametrize("method", ["step", "render", "state"])
+def test_what_comes_before_the_first_episode_is_refused(method):
     environment = ParticleEnv("CN-6")
-    with pytest.raises(LareError, match="there is no episode yet: reset the environment first"):
-        getattr(environment, asked)(*([{}] if asked == "step" else []))
+    with pytest.raises(LareError, match="no episode yet"):
+        getattr(environment, method)(*([{}] if method == "step" else []))
 
 
 def test_nobody_acts_when_an_episode_is_over():
     environment = ParticleEnv("TriangleArea")
     environment.reset(seed=0)
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         environment.step(dict.fromkeys(environment.agents, 0))
     assert environment.step({}) == ({},) * 5
 
@@ -93,4 +93,4 @@ except lare_rl.LareError as error:
     print(error)
 """
     printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert printed == f"lare_rl.envs.particles.parallel_env needs an extra: {pip_install('particles')}\n"
+    assert printed == f"lare_rl.envs.particles.parallel_env needs an extra: {install_command('particles')}\n"

@@ -5,8 +5,8 @@ import pytest
 
 from lare_rl.envs.particles.catalogue import TASKS
 from lare_rl.envs.particles.predator_prey import SIZES, chase, observe_preys
-from lare_rl.envs.particles.prey import act, logits, shipped_prey
-from lare_rl.envs.particles.task import STEPS
+from lare_rl.envs.particles.prey import logits, sample_actions, shipped_prey
+from lare_rl.envs.particles.task import MAX_STEPS
 from lare_rl.envs.particles.world import at_rest, move, push
 
 
@@ -23,7 +23,7 @@ def test_the_network_is_the_one_described():
 
 def test_actions_are_drawn_from_the_softmax():
     layers = ((np.zeros((26, 5), np.float32), np.log(np.array([0.1, 0.2, 0.4, 0.3, 1e-9], np.float32))),)
-    action = act(layers, jnp.zeros((4000, 26)), jax.random.key(0))
+    action = sample_actions(layers, jnp.zeros((4000, 26)), jax.random.key(0))
     np.testing.assert_allclose(np.bincount(action, minlength=5) / 4000, [0.1, 0.2, 0.4, 0.3, 0], atol=0.03)
 
 
@@ -49,18 +49,18 @@ def test_the_shipped_prey_is_harder_to_catch_than_chance(name):
 
     def earned(key, at_random):
         def step(state, key):
-            random = jax.random.randint(key, (size.preys,), 0, 5)
+            random = jax.random.randint(key, (size.n_preys,), 0, 5)
             prey = jnp.where(at_random, random, task.script(state, key))
-            every = jnp.concatenate([chase(size, state), prey])
-            state = move(task.world, state, push(task.world, every))
+            all_actions = jnp.concatenate([chase(size, state), prey])
+            state = move(task.world, state, push(task.world, all_actions))
             return state, jnp.sum(task.reward(state))
 
-        return jnp.sum(jax.lax.scan(step, task.reset(key), jax.random.split(key, STEPS))[1])
+        return jnp.sum(jax.lax.scan(step, task.reset(key), jax.random.split(key, MAX_STEPS))[1])
 
     keys = jax.random.split(jax.random.key(0), 300)
-    ours, chance = (float(jax.jit(jax.vmap(earned, (0, None)))(keys, flag).mean()) for flag in (False, True))
-    assert ours < chance / 2
+    prey_actions, chance = (float(jax.jit(jax.vmap(earned, (0, None)))(keys, flag).mean()) for flag in (False, True))
+    assert prey_actions < chance / 2
     if name == "PP-6":
         # The published prey: 29.5, preys that move at random: 80.2; standard errors of 300 episodes are about 2.
-        assert ours == pytest.approx(29.5, abs=8)
+        assert prey_actions == pytest.approx(29.5, abs=8)
         assert chance == pytest.approx(80.2, abs=8)

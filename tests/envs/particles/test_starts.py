@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lare_rl.envs.particles.catalogue import TASKS
-from lare_rl.envs.particles.layouts import LAYOUTS, layouts
+from lare_rl.envs.particles.layouts import N_LAYOUTS, make_layouts
 
 # Half the sides of the squares of those that move and of the landmarks.
 REACH = {
@@ -28,33 +28,33 @@ def starts(name: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_what_moves_starts_uniform_in_its_square(name):
-    position = starts(name)[:, : TASKS[name].world.moving] / REACH[name][0]
+def test_moving_entities_start_uniformly(name):
+    position = starts(name)[:, : TASKS[name].world.n_moving] / REACH[name][0]
     assert np.abs(position).max() <= 1
     assert position.mean((0, 1)) == pytest.approx(0, abs=0.03)
     assert position.std((0, 1)) == pytest.approx(3**-0.5, rel=0.02)
 
 
 @pytest.mark.parametrize("name", [name for name in TASKS if not name.startswith("CN")])
-def test_landmarks_too(name):
-    position = starts(name)[:, TASKS[name].world.moving :] / REACH[name][1]
+def test_landmarks_start_uniformly(name):
+    position = starts(name)[:, TASKS[name].world.n_moving :] / REACH[name][1]
     assert np.abs(position).max() <= 1
     assert position.mean((0, 1)) == pytest.approx(0, abs=0.04)
     assert position.std((0, 1)) == pytest.approx(3**-0.5, rel=0.03)
 
 
 @pytest.mark.parametrize(("agents", "radius", "to_nearest"), [(6, 1.5, 0.939), (15, 2.2, 0.874), (30, 3.0, 0.843)])
-def test_landmarks_of_navigation_keep_their_distance(agents, radius, to_nearest):
+def test_navigation_landmarks_keep_their_distance(agents, radius, to_nearest):
     position = starts(f"CN-{agents}")[:, agents:]
     assert np.abs(position).max() <= radius
-    assert len(np.unique(position[:, 0, 0])) > LAYOUTS / 4
+    assert len(np.unique(position[:, 0, 0])) > N_LAYOUTS / 4
     distance = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1) + 10 * np.eye(agents)
     assert distance.min() > 0.675 - 1e-6
     # The mean that 400 layouts of the `bridson` package have, the published tasks' own.
     assert distance.min(axis=2).mean() == pytest.approx(to_nearest, abs=0.02)
 
 
-def test_layouts_are_always_the_same():
-    first = layouts(6, 1.5, 0.675)
-    layouts.cache_clear()
-    np.testing.assert_array_equal(first, layouts(6, 1.5, 0.675))
+def test_layouts_are_reproducible():
+    first = make_layouts(6, 1.5, 0.675)
+    make_layouts.cache_clear()
+    np.testing.assert_array_equal(first, make_layouts(6, 1.5, 0.675))

@@ -19,7 +19,7 @@ def apart(task: str, *near: tuple[float, float]) -> State:
 
 def step(task: str, state: State, *actions: int) -> State:
     world = find_particle_task(task).world
-    action = jnp.array([*actions, *[0] * (world.moving - len(actions))])
+    action = jnp.array([*actions, *[0] * (world.n_moving - len(actions))])
     return jax.jit(move, static_argnums=0)(world, state, push(world, action))
 
 

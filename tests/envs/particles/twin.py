@@ -19,7 +19,7 @@ class Twin(NamedTuple):
     bodies: list[Body]
     d_min: float | None
     """For every pair that collides; the sum of the radii where None."""
-    seen: dict[str, list[tuple[str, int]]]
+    visible: dict[str, list[tuple[str, int]]]
     """What each kind of agent sees: kinds and how many of the nearest; `velocity` of those named before it."""
 
 
@@ -28,14 +28,14 @@ def cn(n: int) -> Twin:
     return Twin(bodies, 0.3, {"agent": [("goal", 6), ("agent", 5)]})
 
 
-def pp(n, p, obstacles, sizes, d_min, seen, prey_seen=None) -> Twin:
+def pp(n, p, obstacles, sizes, d_min, observation, prey_visible=None) -> Twin:
     predator, prey, obstacle = sizes
     bodies = [Body("predator", predator, 3.0, 1.0)] * n + [Body("prey", prey, 4.0, 1.3)] * p
     bodies += [Body("obstacle", obstacle)] * obstacles
     kinds = ("obstacle", "predator", "prey")
-    views = {"predator": list(zip(kinds, seen, strict=True))}
-    if prey_seen:
-        views["prey"] = list(zip(kinds, prey_seen, strict=True))
+    views = {"predator": list(zip(kinds, observation, strict=True))}
+    if prey_visible:
+        views["prey"] = list(zip(kinds, prey_visible, strict=True))
     return Twin(bodies, d_min, views)
 
 
@@ -52,7 +52,7 @@ TWINS = {
 
 
 def learners(twin: Twin) -> list[int]:
-    return [i for i, body in enumerate(twin.bodies) if body.kind in twin.seen]
+    return [i for i, body in enumerate(twin.bodies) if body.kind in twin.visible]
 
 
 def step(twin: Twin, position: np.ndarray, velocity: np.ndarray, actions: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -78,26 +78,26 @@ def step(twin: Twin, position: np.ndarray, velocity: np.ndarray, actions: list[i
 
 
 def by_distance(twin: Twin, position: np.ndarray, i: int, kind: str) -> list[int]:
-    others = [j for j, body in enumerate(twin.bodies) if body.kind == kind and j != i]
-    return sorted(others, key=lambda j: math.dist(position[i], position[j]))
+    neighbours = [j for j, body in enumerate(twin.bodies) if body.kind == kind and j != i]
+    return sorted(neighbours, key=lambda j: math.dist(position[i], position[j]))
 
 
 def observe(twin: Twin, position: np.ndarray, velocity: np.ndarray, i: int) -> list[float]:
     kind = twin.bodies[i].kind
-    seen = [*velocity[i], *position[i]]
+    observation = [*velocity[i], *position[i]]
     if kind == "corner":
         for j in (3, 4, 5):
-            seen += [*(position[j] - position[i])]
+            observation += [*(position[j] - position[i])]
         for way in sorted(tuple(position[j] - position[i]) for j in range(3) if j != i):
-            seen += [*way]
-    for other, count in twin.seen[kind]:
+            observation += [*way]
+    for other, count in twin.visible[kind]:
         chosen = by_distance(twin, position, i, other)[:count]
         for j in chosen:
-            seen += [*(position[j] - position[i])]
+            observation += [*(position[j] - position[i])]
         if other == "prey":
             for j in chosen:
-                seen += [*velocity[j]]
-    return seen
+                observation += [*velocity[j]]
+    return observation
 
 
 def touching(twin: Twin, position: np.ndarray, i: int, kind: str) -> int:

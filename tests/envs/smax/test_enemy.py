@@ -5,38 +5,38 @@ import pytest
 
 from lare_rl.envs.smax import battle
 from lare_rl.envs.smax.battle import ATTACK, FIELD, STOP
-from lare_rl.envs.smax.enemy import act, remember
+from lare_rl.envs.smax.enemy import choose_actions, init_memory
 from lare_rl.envs.smax.scenarios import find_scenario
 
 SCENARIO = find_scenario("3s_vs_5z")
-LAST = ATTACK + SCENARIO.allies - 1
+LAST = ATTACK + SCENARIO.n_allies - 1
 """Attacks our unit 0."""
 
 
-def begin(ours: list[tuple[float, float]], zealot: tuple[float, float]) -> battle.Battle:
+def begin(allies: list[tuple[float, float]], zealot: tuple[float, float]) -> battle.Battle:
     """Our three, and one zealot among four that are dead."""
-    state = battle.start(SCENARIO, jax.random.key(0))
-    position = jnp.array([*ours, zealot, *[(30.0, 30.0)] * 4])
+    state = battle.start_battle(SCENARIO, jax.random.key(0))
+    position = jnp.array([*allies, zealot, *[(30.0, 30.0)] * 4])
     return state._replace(position=position, health=state.health.at[4:].set(0))
 
 
 def choice(state: battle.Battle, memory=None, seed: int = 0) -> int:
-    return int(act(SCENARIO, state, memory or remember(SCENARIO, state), jax.random.key(seed))[0][0])
+    return int(choose_actions(SCENARIO, state, memory or init_memory(SCENARIO, state), jax.random.key(seed))[0][0])
 
 
 def test_attacks_the_closest_in_reach_and_stays_with_it():
     state = begin([(16, 17.5), (17.2, 16), (30, 1)], (16, 16))
-    action, memory = act(SCENARIO, state, remember(SCENARIO, state), jax.random.key(0))
+    action, memory = choose_actions(SCENARIO, state, init_memory(SCENARIO, state), jax.random.key(0))
     assert (action[0], memory.attacked[0]) == (LAST - 1, 1)
     # Unit 0 is closer now, but unit 1 still in reach; then it is not.
     state = state._replace(position=state.position.at[0].set((16, 16.9)))
     assert choice(state, memory) == LAST - 1
     state = state._replace(position=state.position.at[1].set((25, 25)))
-    action, memory = act(SCENARIO, state, memory, jax.random.key(0))
+    action, memory = choose_actions(SCENARIO, state, memory, jax.random.key(0))
     assert (action[0], memory.attacked[0]) == (LAST, 0)
     # Nobody in reach: it forgets.
     state = state._replace(position=state.position.at[0].set((16, 24)))
-    assert act(SCENARIO, state, memory, jax.random.key(0))[1].attacked[0] == -1
+    assert choose_actions(SCENARIO, state, memory, jax.random.key(0))[1].attacked[0] == -1
 
 
 def test_does_not_attack_the_dead():
@@ -58,7 +58,7 @@ def test_draws_whom_it_walks_to_among_those_it_sees():
 
 def test_walks_to_the_mirror_image_of_its_start_where_it_sees_nobody():
     state = begin([(1, 1), (1, 31), (31, 31)], (24, 15))
-    memory = remember(SCENARIO, state)
+    memory = init_memory(SCENARIO, state)
     np.testing.assert_allclose(memory.goal[0], (FIELD - 24, FIELD - 15))
     assert choice(state, memory) == 3
     assert choice(state._replace(position=state.position.at[3].set((8, 12))), memory) == 0
@@ -66,6 +66,6 @@ def test_walks_to_the_mirror_image_of_its_start_where_it_sees_nobody():
 
 def test_the_dead_stop():
     state = begin([(16, 17.5), (17.2, 16), (30, 1)], (16, 16))
-    action, memory = act(SCENARIO, state, remember(SCENARIO, state), jax.random.key(0))
+    action, memory = choose_actions(SCENARIO, state, init_memory(SCENARIO, state), jax.random.key(0))
     assert action[1:].tolist() == [STOP] * 4
     assert memory.attacked[1:].tolist() == [-1] * 4

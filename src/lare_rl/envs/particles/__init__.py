@@ -1,1 +1,1 @@
-"""Multi-agent particle tasks in JAX. `table.py` lists them, `world.py` has their physics, `env.py` the training environment."""
+"""Multi-agent particle tasks in JAX. `catalogue.py` lists them, `world.py` has their physics."""

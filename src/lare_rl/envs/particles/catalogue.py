@@ -5,6 +5,8 @@ from lare_rl.envs.particles.task import ParticleTask
 from lare_rl.envs.particles.triangle_area import triangle_area
 from lare_rl.errors import LareError, did_you_mean
 
+__all__ = ["TASKS", "find_particle_task"]
+
 TASKS: dict[str, ParticleTask] = {
     task.name: task
     for task in (
@@ -17,7 +19,7 @@ TASKS: dict[str, ParticleTask] = {
 
 
 def find_particle_task(name: str) -> ParticleTask:
-    """The task of that name.
+    """Return the task of a name.
 
     Raises:
         LareError: no task has this name; the message lists all names.

@@ -14,33 +14,39 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.envs.particles.layouts import layouts
-from lare_rl.envs.particles.nearest import distances, nearest, relative, rows, span
+from lare_rl.envs.particles.layouts import make_layouts
+from lare_rl.envs.particles.nearest import concatenate_rows, distances, nearest_entities, relative_positions, slice_rows
 from lare_rl.envs.particles.task import ParticleTask, Team
 from lare_rl.envs.particles.world import State, World, at_rest
 
+__all__ = ["SIZES", "navigation"]
+
 AGENT, LANDMARK = 0.15, 0.05
-"""Radii."""
+"""The radii of both."""
 SENSITIVITY = 5.0
+"""The force of an action."""
 SEPARATION = 4.5 * AGENT
 """Landmarks are further apart than this."""
-SEEN_LANDMARKS, SEEN_AGENTS = 6, 5
+N_VISIBLE_LANDMARKS, N_VISIBLE_AGENTS = 6, 5
 """The numbers of nearest landmarks and nearest agents that an agent sees."""
 
 
 @dataclass(frozen=True)
 class Size:
-    agents: int
+    """The number of agents, and the square in which they start."""
+
+    n_agents: int
     """Also the number of landmarks."""
     radius: float
+    """Half the side of the square."""
 
     @property
-    def team(self) -> range:
-        return range(self.agents)
+    def agents(self) -> range:
+        return range(self.n_agents)
 
     @property
     def landmarks(self) -> range:
-        return range(self.agents, 2 * self.agents)
+        return range(self.n_agents, 2 * self.n_agents)
 
 
 SIZES = {
@@ -51,54 +57,55 @@ SIZES = {
 
 
 def navigation(name: str) -> ParticleTask:
+    """Make a task of `SIZES`."""
     size = SIZES[name]
     return ParticleTask(
         name=name,
-        teams=(Team("agent", 0, size.agents),),
-        observation_size=4 + 2 * SEEN_LANDMARKS + 2 * SEEN_AGENTS,
+        teams=(Team("agent", 0, size.n_agents),),
+        observation_size=4 + 2 * N_VISIBLE_LANDMARKS + 2 * N_VISIBLE_AGENTS,
         radius=size.radius,
-        world=world(size),
-        reset=partial(reset, size),
-        observe=partial(observe, size),
-        reward=partial(reward, size),
+        world=_world(size),
+        reset=partial(_reset, size),
+        observe=partial(_observe, size),
+        reward=partial(_reward, size),
     )
 
 
-def world(size: Size) -> World:
-    """Agents push each other. Landmarks do not collide with anything."""
-    n = size.agents
+def _world(size: Size) -> World:
+    """Make the world. Agents push each other. Landmarks do not collide with anything."""
+    n = size.n_agents
     return World(
         size=np.array([AGENT] * n + [LANDMARK] * n, np.float32),
-        moving=n,
-        colliding=n,
+        n_moving=n,
+        n_colliding=n,
         sensitivity=np.full(n, SENSITIVITY, np.float32),
         max_speed=np.full(n, np.inf, np.float32),
         contact=np.full((n, n), 2 * AGENT, np.float32),
     )
 
 
-def reset(size: Size, key: PRNGKeyArray) -> State:
-    """Agents start uniformly in the square, landmarks are at the points of a random layout."""
+def _reset(size: Size, key: PRNGKeyArray) -> State:
+    """Place agents uniformly in the square, and landmarks at the points of a random layout."""
     agents_key, landmarks_key = jax.random.split(key)
-    agents = jax.random.uniform(agents_key, (size.agents, 2), minval=-size.radius, maxval=size.radius)
-    places = jnp.asarray(layouts(size.agents, size.radius, SEPARATION))
-    landmarks = places[jax.random.randint(landmarks_key, (), 0, len(places))]
+    agents = jax.random.uniform(agents_key, (size.n_agents, 2), minval=-size.radius, maxval=size.radius)
+    layouts = jnp.asarray(make_layouts(size.n_agents, size.radius, SEPARATION))
+    landmarks = layouts[jax.random.randint(landmarks_key, (), 0, len(layouts))]
     return at_rest(jnp.concatenate([agents, landmarks]))
 
 
-def observe(size: Size, state: State) -> Float[Array, "agents observation"]:
-    """Each agent's own velocity and position, the nearest landmarks, and the nearest other agents."""
-    landmarks = nearest(state.position, size.team, size.landmarks, SEEN_LANDMARKS)
-    others = nearest(state.position, size.team, size.team, SEEN_AGENTS)
-    return rows(
-        span(state.velocity, size.team),
-        span(state.position, size.team),
-        relative(state.position, size.team, landmarks),
-        relative(state.position, size.team, others),
+def _observe(size: Size, state: State) -> Float[Array, "agents observation"]:
+    """Return each agent's velocity and position, the nearest landmarks, and the nearest other agents."""
+    landmarks = nearest_entities(state.position, size.agents, size.landmarks, N_VISIBLE_LANDMARKS)
+    other_agents = nearest_entities(state.position, size.agents, size.agents, N_VISIBLE_AGENTS)
+    return concatenate_rows(
+        slice_rows(state.velocity, size.agents),
+        slice_rows(state.position, size.agents),
+        relative_positions(state.position, size.agents, landmarks),
+        relative_positions(state.position, size.agents, other_agents),
     )
 
 
-def reward(size: Size, state: State) -> Float[Array, " agents"]:
-    to_landmarks = distances(state.position, size.team, size.landmarks)
-    to_others = distances(state.position, size.team, size.team)
-    return -jnp.min(to_landmarks, axis=1) - jnp.sum(to_others < 2 * AGENT, axis=1)
+def _reward(size: Size, state: State) -> Float[Array, " agents"]:
+    to_landmarks = distances(state.position, size.agents, size.landmarks)
+    to_agents = distances(state.position, size.agents, size.agents)
+    return -jnp.min(to_landmarks, axis=1) - jnp.sum(to_agents < 2 * AGENT, axis=1)

@@ -5,40 +5,42 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+__all__ = ["concatenate_rows", "distances", "nearest_entities", "relative_positions", "slice_rows"]
+
 
 def distances(
-    position: Float[Array, "entities 2"], observers: range, others: range
-) -> Float[Array, "observers others"]:
-    """The distances between the centres of observers and other entities; infinite from an entity to itself."""
-    offset = span(position, others) - span(position, observers)[:, None]
-    return jnp.where(same(observers, others), jnp.inf, jnp.sqrt(jnp.sum(offset**2, axis=-1)))
+    position: Float[Array, "entities 2"], observers: range, targets: range
+) -> Float[Array, "observers targets"]:
+    """Return the distances between the centres of observers and targets; infinite from an entity to itself."""
+    offset = slice_rows(position, targets) - slice_rows(position, observers)[:, None]
+    return jnp.where(_is_same(observers, targets), jnp.inf, jnp.sqrt(jnp.sum(offset**2, axis=-1)))
 
 
-def nearest(
-    position: Float[Array, "entities 2"], observers: range, others: range, count: int
+def nearest_entities(
+    position: Float[Array, "entities 2"], observers: range, targets: range, count: int
 ) -> Int[Array, "observers count"]:
-    """The indices of the `count` entities of `others` that are nearest to each observer, nearest first."""
-    _, index = jax.lax.top_k(-distances(position, observers, others), count)
-    return others.start + index
+    """Return the indices of the `count` targets that are nearest to each observer, nearest first."""
+    _, index = jax.lax.top_k(-distances(position, observers, targets), count)
+    return targets.start + index
 
 
-def relative(
-    position: Float[Array, "entities 2"], observers: range, seen: Int[Array, "observers count"]
+def relative_positions(
+    position: Float[Array, "entities 2"], observers: range, entities: Int[Array, "observers count"]
 ) -> Float[Array, "observers count 2"]:
-    """The positions of the seen entities, minus the observer's own position."""
-    return position[seen] - span(position, observers)[:, None]
+    """Return the positions of entities relative to each observer."""
+    return position[entities] - slice_rows(position, observers)[:, None]
 
 
-def span(values: Float[Array, "entities 2"], entities: range) -> Float[Array, "some 2"]:
-    """The rows of a range of entities."""
+def slice_rows(values: Float[Array, "entities 2"], entities: range) -> Float[Array, "range 2"]:
+    """Return the rows of a range of entities."""
     return values[entities.start : entities.stop]
 
 
-def same(observers: range, others: range) -> np.ndarray:
-    """Where observer and other are the same entity."""
-    return np.asarray(observers)[:, None] == np.asarray(others)
+def _is_same(observers: range, targets: range) -> np.ndarray:
+    """Return where observer and target are the same entity."""
+    return np.asarray(observers)[:, None] == np.asarray(targets)
 
 
-def rows(*parts: Float[Array, "observers ..."]) -> Float[Array, "observers observation"]:
-    """One row of numbers for each observer."""
-    return jnp.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+def concatenate_rows(*arrays: Float[Array, "observers ..."]) -> Float[Array, "observers observation"]:
+    """Flatten arrays to one row for each observer, and concatenate them."""
+    return jnp.concatenate([array.reshape(len(array), -1) for array in arrays], axis=1)

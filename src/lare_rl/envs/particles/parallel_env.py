@@ -10,26 +10,30 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete, Space
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from lare_rl.envs.canvas import to_pixels
 from lare_rl.envs.particles.catalogue import find_particle_task
-from lare_rl.envs.particles.drawing import draw, pixels
-from lare_rl.envs.particles.task import ACTIONS, STEPS, ParticleTask
+from lare_rl.envs.particles.drawing import draw_state
+from lare_rl.envs.particles.task import MAX_STEPS, N_ACTIONS, ParticleTask
 from lare_rl.envs.particles.world import State
-from lare_rl.errors import LareError, needs_extra
+from lare_rl.errors import LareError, missing_extra_error
 
 try:
     from pettingzoo import ParallelEnv
 except ImportError:
-    raise needs_extra("lare_rl.envs.particles.parallel_env", "particles") from None
+    raise missing_extra_error("lare_rl.envs.particles.parallel_env", "particles") from None
+
+
+__all__ = ["ParticleEnv"]
 
 
 @partial(jax.jit, static_argnums=0)
-def start(task: ParticleTask, key: PRNGKeyArray) -> tuple[State, Float[Array, "agents observation"]]:
+def _start(task: ParticleTask, key: PRNGKeyArray) -> tuple[State, Float[Array, "agents observation"]]:
     state = task.reset(key)
     return state, task.observe(state)
 
 
 @partial(jax.jit, static_argnums=0)
-def advance(
+def _advance(
     task: ParticleTask, state: State, action: Int[Array, " agents"], key: PRNGKeyArray
 ) -> tuple[State, Float[Array, "agents observation"], Float[Array, " agents"]]:
     state = task.step(state, action, key)
@@ -51,20 +55,20 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
 
     def __init__(self, name: str, render_mode: str | None = None):
         if render_mode not in (None, "rgb_array"):
-            raise LareError(f"no render mode {render_mode!r}; there is 'rgb_array'")
+            raise LareError(f"no render mode {render_mode!r}. Use 'rgb_array'.")
         self.task = find_particle_task(name)
         self.metadata = {**self.metadata, "name": name}
         self.render_mode = render_mode
-        self.possible_agents = [
-            f"{team.name}_{number}" for team in self.task.teams for number in range(team.stop - team.start)
-        ]
-        view, moves = Box(-np.inf, np.inf, (self.task.observation_size,), np.float32), Discrete(ACTIONS)
+        self.possible_agents = [f"{team.name}_{number}" for team in self.task.teams for number in range(team.n_agents)]
+        observations, actions = Box(-np.inf, np.inf, (self.task.observation_size,), np.float32), Discrete(N_ACTIONS)
         # Each agent needs its own space, because a space has its own random number generator.
-        self.observation_spaces: dict[str, Space[Any]] = {agent: deepcopy(view) for agent in self.possible_agents}
-        self.action_spaces: dict[str, Space[Any]] = {agent: deepcopy(moves) for agent in self.possible_agents}
+        self.observation_spaces: dict[str, Space[Any]] = {
+            agent: deepcopy(observations) for agent in self.possible_agents
+        }
+        self.action_spaces: dict[str, Space[Any]] = {agent: deepcopy(actions) for agent in self.possible_agents}
         self.agents: list[str] = []
-        self.current: State | None = None
-        self.key = jax.random.key(np.random.default_rng().integers(2**31))
+        self._state: State | None = None
+        self._key = jax.random.key(np.random.default_rng().integers(2**31))
 
     def observation_space(self, agent: str) -> Space[Any]:
         return self.observation_spaces[agent]
@@ -77,27 +81,27 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """Start an episode. The same seed gives the same episode. Options are ignored."""
         if seed is not None:
-            self.key = jax.random.key(seed)
-        self.current, observation = start(self.task, self.next_key())
+            self._key = jax.random.key(seed)
+        self._state, observation = _start(self.task, self._next_key())
         self.agents, self.steps = list(self.possible_agents), 0
-        return self.by_agent(np.asarray(observation)), {agent: {} for agent in self.agents}
+        return self._by_agent(np.asarray(observation)), {agent: {} for agent in self.agents}
 
     def step(
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        state, acted = self.now(), self.agents
+        state, acted = self._world_state(), self.agents
         if not acted:
             return {}, {}, {}, {}, {}
         for agent in acted:
             if not self.action_spaces[agent].contains(actions.get(agent)):
-                raise LareError(f"the action of {agent} is {actions.get(agent)!r}; it must be 0 to {ACTIONS - 1}")
-        chosen = jnp.asarray([int(actions[agent]) for agent in acted])
-        self.current, observation, reward = advance(self.task, state, chosen, self.next_key())
+                raise LareError(f"the action of {agent} is {actions.get(agent)!r}; it must be 0 to {N_ACTIONS - 1}")
+        action = jnp.asarray([int(actions[agent]) for agent in acted])
+        self._state, observation, reward = _advance(self.task, state, action, self._next_key())
         self.steps += 1
-        ended = self.steps == STEPS
+        ended = self.steps == MAX_STEPS
         results = (
-            self.by_agent(np.asarray(observation)),
-            self.by_agent(np.asarray(reward).tolist()),
+            self._by_agent(np.asarray(observation)),
+            self._by_agent(np.asarray(reward).tolist()),
             dict.fromkeys(acted, False),
             dict.fromkeys(acted, ended),
             {agent: {} for agent in acted},
@@ -107,22 +111,22 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
         return results
 
     def render(self) -> np.ndarray:
-        """The state as pixels (height, width, 3)."""
-        return pixels(draw(self.task, np.asarray(self.now().position)))
+        """Draw the state as pixels (height, width, 3)."""
+        return to_pixels(draw_state(self.task, np.asarray(self._world_state().position)))
 
     def state(self) -> np.ndarray:
-        """Positions and velocities of everything, in one row."""
-        return np.concatenate([np.asarray(part).ravel() for part in self.now()])
+        """Return the positions and velocities of all entities, in one vector."""
+        return np.concatenate([np.asarray(values).ravel() for values in self._world_state()])
 
-    def now(self) -> State:
-        """The state of the world. Raises `LareError` before the first reset."""
-        if self.current is None:
-            raise LareError("there is no episode yet: reset the environment first")
-        return self.current
+    def _world_state(self) -> State:
+        """Return the state of the world. Raises `LareError` before the first reset."""
+        if self._state is None:
+            raise LareError("there is no episode yet. Call reset first.")
+        return self._state
 
-    def by_agent(self, values: Any) -> dict[str, Any]:
+    def _by_agent(self, values: Any) -> dict[str, Any]:
         return dict(zip(self.possible_agents, values, strict=True))
 
-    def next_key(self) -> PRNGKeyArray:
-        self.key, now = jax.random.split(self.key)
-        return now
+    def _next_key(self) -> PRNGKeyArray:
+        self._key, key = jax.random.split(self._key)
+        return key

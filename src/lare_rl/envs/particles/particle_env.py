@@ -1,6 +1,6 @@
 """The particle tasks as `JaxEnv`s: pure functions, which are compiled together with training."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,12 +8,20 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.envs.particles.catalogue import find_particle_task
-from lare_rl.envs.particles.task import ACTIONS, STEPS
+from lare_rl.envs.particles.task import MAX_STEPS, N_ACTIONS
 from lare_rl.envs.particles.world import State
+from lare_rl.tasks.spec import TaskSpec
+
+__all__ = ["ParticleJaxEnv", "ParticleState", "make"]
 
 
-class Moment(NamedTuple):
-    """The world, and the number of steps so far."""
+def make(task: TaskSpec, **_: Any) -> "ParticleJaxEnv":
+    """Make the environment of a task with the name `particles/NAME`."""
+    return ParticleJaxEnv(task.environment_name)
+
+
+class ParticleState(NamedTuple):
+    """The world, and the number of steps since the start of the episode."""
 
     world: State
     step: Int[Array, ""]
@@ -27,42 +35,43 @@ class ParticleJaxEnv:
         self.spec = EnvSpec(
             teams=self.task.teams,
             observation_size=self.task.observation_size,
-            action_size=ACTIONS,
+            action_size=N_ACTIONS,
             discrete=True,
-            max_steps=STEPS,
+            max_steps=MAX_STEPS,
             fixed_length=True,
-            in_jax=True,
+            is_jax=True,
         )
 
-    def reset(self, key: PRNGKeyArray) -> tuple[Moment, Timestep]:
-        """The first state and timestep of an episode."""
-        moment = Moment(self.task.reset(key), jnp.zeros((), jnp.int32))
-        return moment, self.timestep(moment, jnp.zeros(self.spec.agents))
+    def reset(self, key: PRNGKeyArray) -> tuple[ParticleState, Timestep]:
+        """Start an episode."""
+        state = ParticleState(self.task.reset(key), jnp.zeros((), jnp.int32))
+        return state, self._make_timestep(state, jnp.zeros(self.spec.n_agents))
 
-    def step(self, state: Moment, action: Float[Array, "agents action"], key: PRNGKeyArray) -> tuple[Moment, Timestep]:
-        """All agents act at once."""
+    def step(
+        self, state: ParticleState, action: Float[Array, "agents action"], key: PRNGKeyArray
+    ) -> tuple[ParticleState, Timestep]:
+        """Make one step, in which all agents act at once."""
         world = self.task.step(state.world, jnp.argmax(action, axis=-1), key)
-        moment = Moment(world, state.step + 1)
-        return moment, self.timestep(moment, self.task.reward(world))
+        state = ParticleState(world, state.step + 1)
+        return state, self._make_timestep(state, self.task.reward(world))
 
-    def timestep(self, moment: Moment, reward: Float[Array, " agents"]) -> Timestep:
-        """The timestep of a state."""
-        agents = self.spec.agents
+    def _make_timestep(self, state: ParticleState, reward: Float[Array, " agents"]) -> Timestep:
+        agents = self.spec.n_agents
         return Timestep(
-            observation=self.task.observe(moment.world),
+            observation=self.task.observe(state.world),
             state=jnp.zeros(0),
-            available=jnp.ones((agents, ACTIONS), bool),
+            available=jnp.ones((agents, N_ACTIONS), bool),
             alive=jnp.ones(agents, bool),
             reward=reward,
-            terminated=moment.step >= STEPS,
+            terminated=state.step >= MAX_STEPS,
             truncated=jnp.zeros((), bool),
             measures={},
         )
 
     def frames(
-        self, states: Moment, credit: Float[np.ndarray, "steps agents"] | None = None
+        self, states: ParticleState, credit: Float[np.ndarray, "steps agents"] | None = None
     ) -> list[UInt8[np.ndarray, "height width 3"]]:
-        """An episode as pictures."""
-        from lare_rl.envs.particles.drawing import frames
+        """Draw the states of an episode."""
+        from lare_rl.envs.particles.drawing import draw_frames
 
-        return frames(self.task, np.asarray(states.world.position), credit)
+        return draw_frames(self.task, np.asarray(states.world.position), credit)

@@ -16,23 +16,37 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lare_rl.envs.particles.nearest import distances, nearest, relative, rows, span
-from lare_rl.envs.particles.prey import Layers, act, shipped_prey
+from lare_rl.envs.particles.nearest import concatenate_rows, distances, nearest_entities, relative_positions, slice_rows
+from lare_rl.envs.particles.prey import Layers, sample_actions, shipped_prey
 from lare_rl.envs.particles.task import ParticleTask, Team
 from lare_rl.envs.particles.world import State, World, at_rest
+
+__all__ = [
+    "SIZES",
+    "Size",
+    "chase",
+    "competitive",
+    "flee",
+    "make_world",
+    "observe_preys",
+    "predator_prey",
+    "reset",
+    "reward_predators",
+    "reward_preys",
+]
 
 PREDATOR_SENSITIVITY, PREY_SENSITIVITY = 3.0, 4.0
 PREDATOR_SPEED, PREY_SPEED = 1.0, 1.3
 CATCH = 10.0
-"""The reward of a predator, and the loss of a prey, for each touch in a step."""
+"""The reward of a predator, and the penalty of a prey, for each touch in a step."""
 DISTANCE_WEIGHT = 0.1
 MARGIN = 0.1
 """Obstacles keep this distance from the border of the square in which all other entities start."""
 
 
 @dataclass(frozen=True)
-class Sees:
-    """The number of nearest entities of each kind that an agent sees."""
+class View:
+    """The number of nearest entities of each kind that an agent view."""
 
     landmarks: int
     predators: int
@@ -45,48 +59,48 @@ class Sees:
 
 @dataclass(frozen=True)
 class Size:
-    """Numbers of entities, their radii, and the numbers of entities that agents see."""
+    """Numbers of entities, their radii, the square in which they start (± radius), and what agents see."""
 
-    predators: int
-    preys: int
-    landmarks: int
+    n_predators: int
+    n_preys: int
+    n_landmarks: int
     radius: float
-    predator: float
-    prey: float
-    landmark: float
-    predator_sees: Sees
-    prey_sees: Sees = Sees(3, 6, 1)
+    predator_radius: float
+    prey_radius: float
+    landmark_radius: float
+    predator_view: View
+    prey_view: View = View(3, 6, 1)
 
     @property
-    def hunters(self) -> range:
-        return range(self.predators)
+    def predators(self) -> range:
+        return range(self.n_predators)
 
     @property
-    def hunted(self) -> range:
-        return range(self.predators, self.predators + self.preys)
+    def preys(self) -> range:
+        return range(self.n_predators, self.n_predators + self.n_preys)
 
     @property
     def obstacles(self) -> range:
-        return range(self.hunted.stop, self.hunted.stop + self.landmarks)
+        return range(self.preys.stop, self.preys.stop + self.n_landmarks)
 
 
 SIZES = {
-    "PP-6": Size(6, 2, 3, 1.5, 0.075, 0.05, 0.2, Sees(3, 5, 2)),
-    "PP-15": Size(15, 5, 5, 1.0, 0.02, 0.01, 0.1, Sees(3, 6, 3)),
-    "PP-30": Size(30, 10, 10, 1.0, 0.01, 0.005, 0.05, Sees(5, 6, 5)),
+    "PP-6": Size(6, 2, 3, 1.5, 0.075, 0.05, 0.2, View(3, 5, 2)),
+    "PP-15": Size(15, 5, 5, 1.0, 0.02, 0.01, 0.1, View(3, 6, 3)),
+    "PP-30": Size(30, 10, 10, 1.0, 0.01, 0.005, 0.05, View(5, 6, 5)),
 }
-COMPETITIVE = Size(6, 2, 3, 1.5, 0.075, 0.05, 0.2, Sees(3, 5, 1), Sees(3, 5, 1))
+COMPETITIVE = Size(6, 2, 3, 1.5, 0.075, 0.05, 0.2, View(3, 5, 1), View(3, 5, 1))
 
 
 def predator_prey(name: str) -> ParticleTask:
-    """The task in which only the predators learn."""
+    """Make a task of `SIZES`, in which only the predators learn."""
     size = SIZES[name]
     return ParticleTask(
         name=name,
-        teams=(Team("predator", 0, size.predators),),
-        observation_size=size.predator_sees.observation_size,
+        teams=(Team("predator", 0, size.n_predators),),
+        observation_size=size.predator_view.observation_size,
         radius=size.radius,
-        world=world(size),
+        world=make_world(size),
         reset=partial(reset, size),
         observe=partial(observe_predators, size),
         reward=partial(reward_predators, size),
@@ -95,72 +109,76 @@ def predator_prey(name: str) -> ParticleTask:
 
 
 def competitive() -> ParticleTask:
-    """The task in which predators and preys learn. Their observations have the same size, so that one network can serve both."""
+    """Make the task in which predators and preys learn. Their observations have the same size, so one network can serve both."""
     size = COMPETITIVE
     return ParticleTask(
         name="CompetitivePP-6",
-        teams=(Team("predator", 0, size.predators), Team("prey", size.predators, size.hunted.stop)),
-        observation_size=size.predator_sees.observation_size,
+        teams=(Team("predator", 0, size.n_predators), Team("prey", size.n_predators, size.preys.stop)),
+        observation_size=size.predator_view.observation_size,
         radius=size.radius,
-        world=world(size),
+        world=make_world(size),
         reset=partial(reset, size),
         observe=lambda state: jnp.concatenate([observe_predators(size, state), observe_preys(size, state)]),
         reward=lambda state: jnp.concatenate([reward_predators(size, state), reward_preys(size, state)]),
     )
 
 
-def world(size: Size) -> World:
-    """All entities collide, and all pairs at the distance at which two predators touch: so the published tasks are defined.
+def make_world(size: Size) -> World:
+    """Make the world. All pairs of entities collide at the distance at which two predators touch, as in the published tasks.
 
     Entities can thus overlap the drawn obstacles, and a predator must push slightly into a prey to catch it.
     """
-    moving, entities = size.hunted.stop, size.obstacles.stop
-    kinds = [size.predators, size.preys]
+    moving, entities = size.preys.stop, size.obstacles.stop
+    kinds = [size.n_predators, size.n_preys]
     return World(
-        size=np.repeat([size.predator, size.prey, size.landmark], [*kinds, size.landmarks]).astype(np.float32),
-        moving=moving,
-        colliding=entities,
+        size=np.repeat(
+            [size.predator_radius, size.prey_radius, size.landmark_radius], [*kinds, size.n_landmarks]
+        ).astype(np.float32),
+        n_moving=moving,
+        n_colliding=entities,
         sensitivity=np.repeat([PREDATOR_SENSITIVITY, PREY_SENSITIVITY], kinds).astype(np.float32),
         max_speed=np.repeat([PREDATOR_SPEED, PREY_SPEED], kinds).astype(np.float32),
-        contact=np.full((entities, entities), 2 * size.predator, np.float32),
+        contact=np.full((entities, entities), 2 * size.predator_radius, np.float32),
     )
 
 
 def reset(size: Size, key: PRNGKeyArray) -> State:
-    """All entities start uniformly in their squares, and may overlap."""
-    reach = jnp.array([size.radius] * size.hunted.stop + [size.radius - MARGIN] * size.landmarks)
+    """Place all entities uniformly in their squares. They may overlap."""
+    reach = jnp.array([size.radius] * size.preys.stop + [size.radius - MARGIN] * size.n_landmarks)
     return at_rest(reach[:, None] * jax.random.uniform(key, (len(reach), 2), minval=-1, maxval=1))
 
 
 def observe_predators(size: Size, state: State) -> Float[Array, "predators observation"]:
-    return observe(size, state, size.hunters, size.predator_sees)
+    return _observe(size, state, size.predators, size.predator_view)
 
 
 def observe_preys(size: Size, state: State) -> Float[Array, "preys observation"]:
-    return observe(size, state, size.hunted, size.prey_sees)
+    return _observe(size, state, size.preys, size.prey_view)
 
 
-def observe(size: Size, state: State, observers: range, sees: Sees) -> Float[Array, "observers observation"]:
-    """Each observer's velocity and position; the nearest obstacles, other predators and other preys; these preys' velocities."""
+def _observe(size: Size, state: State, observers: range, view: View) -> Float[Array, "observers observation"]:
+    """Return each observer's velocity and position; the nearest obstacles, predators and preys; these preys' velocities."""
     position = state.position
-    preys = nearest(position, observers, size.hunted, sees.preys)
-    return rows(
-        span(state.velocity, observers),
-        span(position, observers),
-        relative(position, observers, nearest(position, observers, size.obstacles, sees.landmarks)),
-        relative(position, observers, nearest(position, observers, size.hunters, sees.predators)),
-        relative(position, observers, preys),
+    preys = nearest_entities(position, observers, size.preys, view.preys)
+    return concatenate_rows(
+        slice_rows(state.velocity, observers),
+        slice_rows(position, observers),
+        relative_positions(position, observers, nearest_entities(position, observers, size.obstacles, view.landmarks)),
+        relative_positions(position, observers, nearest_entities(position, observers, size.predators, view.predators)),
+        relative_positions(position, observers, preys),
         state.velocity[preys],
     )
 
 
 def touches(size: Size, state: State) -> Float[Array, "predators preys"]:
-    """1 where a predator touches a prey."""
-    return (distances(state.position, size.hunters, size.hunted) < size.predator + size.prey).astype(jnp.float32)
+    """Return 1 where a predator touches a prey."""
+    return (distances(state.position, size.predators, size.preys) < size.predator_radius + size.prey_radius).astype(
+        jnp.float32
+    )
 
 
 def reward_predators(size: Size, state: State) -> Float[Array, " predators"]:
-    to_prey = jnp.min(distances(state.position, size.hunters, size.hunted), axis=1)
+    to_prey = jnp.min(distances(state.position, size.predators, size.preys), axis=1)
     return CATCH * jnp.sum(touches(size, state), axis=1) - DISTANCE_WEIGHT * to_prey
 
 
@@ -169,14 +187,15 @@ def reward_preys(size: Size, state: State) -> Float[Array, " preys"]:
 
 
 def flee(size: Size, layers: Layers, state: State, key: PRNGKeyArray) -> Int[Array, " preys"]:
-    """The actions of scripted preys."""
-    return act(layers, observe_preys(size, state), key)
+    """Sample the actions of scripted preys."""
+    return sample_actions(layers, observe_preys(size, state), key)
 
 
 def chase(size: Size, state: State) -> Int[Array, " predators"]:
-    """The actions of greedy predators, which are used to evaluate preys. They move along the axis on which the nearest prey is
-    further away.
+    """Return the actions of greedy predators, which are used to evaluate preys.
+
+    They move along the axis on which the nearest prey is further away.
     """
-    prey = nearest(state.position, size.hunters, size.hunted, 1)
-    x, y = jnp.moveaxis(relative(state.position, size.hunters, prey)[:, 0], -1, 0)
+    prey = nearest_entities(state.position, size.predators, size.preys, 1)
+    x, y = jnp.moveaxis(relative_positions(state.position, size.predators, prey)[:, 0], -1, 0)
     return jnp.where(jnp.abs(x) > jnp.abs(y), jnp.where(x > 0, 2, 1), jnp.where(y > 0, 4, 3))

@@ -11,69 +11,73 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.envs.particles.nearest import distances, relative, rows, span
+from lare_rl.envs.particles.nearest import concatenate_rows, distances, relative_positions, slice_rows
 from lare_rl.envs.particles.task import ParticleTask, Team
 from lare_rl.envs.particles.world import State, World, at_rest
 
+__all__ = ["triangle_area"]
+
 AGENTS, OBSTACLES = range(3), range(3, 6)
 AGENT, OBSTACLE = 0.15, 0.4
-"""Radii."""
+"""The radii of both."""
 SENSITIVITY = 5.0
+"""The force of an action."""
 AREA_WEIGHT = 0.1
-START = 0.2
-"""Agents start within ±START,"""
-RADIUS = 1.5
-"""and obstacles lie within ±RADIUS."""
+AGENT_RANGE = 0.2
+"""Agents start within ±AGENT_RANGE."""
+OBSTACLE_RANGE = 1.5
+"""Obstacles lie within ±OBSTACLE_RANGE."""
 
 
 def triangle_area() -> ParticleTask:
+    """Make the task."""
     return ParticleTask(
         name="TriangleArea",
         teams=(Team("agent", 0, len(AGENTS)),),
         observation_size=4 + 2 * len(OBSTACLES) + 2 * (len(AGENTS) - 1),
-        radius=RADIUS,
-        world=world(),
-        reset=reset,
-        observe=observe,
-        reward=reward,
+        radius=OBSTACLE_RANGE,
+        world=_world(),
+        reset=_reset,
+        observe=_observe,
+        reward=_reward,
     )
 
 
-def world() -> World:
-    """Agents and obstacles push each other when they touch."""
+def _world() -> World:
+    """Make the world. Agents and obstacles push each other when they touch."""
     size = np.array([AGENT] * len(AGENTS) + [OBSTACLE] * len(OBSTACLES), np.float32)
     return World(
         size=size,
-        moving=len(AGENTS),
-        colliding=len(size),
+        n_moving=len(AGENTS),
+        n_colliding=len(size),
         sensitivity=np.full(len(AGENTS), SENSITIVITY, np.float32),
         max_speed=np.full(len(AGENTS), np.inf, np.float32),
         contact=size[:, None] + size,
     )
 
 
-def reset(key: PRNGKeyArray) -> State:
-    """An obstacle may overlap the agents at the start, and then pushes them away."""
-    reach = jnp.array([START] * len(AGENTS) + [RADIUS] * len(OBSTACLES))
+def _reset(key: PRNGKeyArray) -> State:
+    """Place agents and obstacles uniformly. An obstacle may overlap an agent, and then pushes it away."""
+    reach = jnp.array([AGENT_RANGE] * len(AGENTS) + [OBSTACLE_RANGE] * len(OBSTACLES))
     return at_rest(reach[:, None] * jax.random.uniform(key, (len(reach), 2), minval=-1, maxval=1))
 
 
-def observe(state: State) -> Float[Array, "agents observation"]:
-    """Each agent's own velocity and position; the obstacles, in a fixed order; the two other agents, sorted by x and then y."""
-    agents = span(state.position, AGENTS)
+def _observe(state: State) -> Float[Array, "agents observation"]:
+    """Return each agent's velocity and position; the obstacles, in a fixed order; the other agents, sorted by x and then y."""
+    agents = slice_rows(state.position, AGENTS)
     obstacles = jnp.broadcast_to(jnp.array(OBSTACLES), (len(AGENTS), len(OBSTACLES)))
-    others = jnp.array([[j for j in AGENTS if j != i] for i in AGENTS])
-    offset = relative(state.position, AGENTS, others)
+    other_agents = jnp.array([[j for j in AGENTS if j != i] for i in AGENTS])
+    offset = relative_positions(state.position, AGENTS, other_agents)
     order = jax.vmap(lambda pair: jnp.lexsort((pair[:, 1], pair[:, 0])))(offset)
-    return rows(
-        span(state.velocity, AGENTS),
+    return concatenate_rows(
+        slice_rows(state.velocity, AGENTS),
         agents,
-        relative(state.position, AGENTS, obstacles),
+        relative_positions(state.position, AGENTS, obstacles),
         jnp.take_along_axis(offset, order[..., None], axis=1),
     )
 
 
-def reward(state: State) -> Float[Array, " agents"]:
+def _reward(state: State) -> Float[Array, " agents"]:
     first, second = state.position[1] - state.position[0], state.position[2] - state.position[0]
     area = jnp.abs(first[0] * second[1] - first[1] * second[0]) / 2
     overlaps = jnp.sum(distances(state.position, AGENTS, OBSTACLES) < AGENT + OBSTACLE)

@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+__all__ = ["State", "World", "at_rest", "contact_force", "move", "push"]
+
 TIME_STEP = 0.1
 DAMPING = 0.25
 """The share of its velocity that each entity loses in a step."""
@@ -35,50 +37,51 @@ class World:
     """The constants of a world. The first `moving` entities are agents and preys; the others are landmarks, which do not move."""
 
     size: Float[np.ndarray, " entities"]
-    """Radii."""
-    moving: int
-    colliding: int
-    """This many entities, from the first on, push each other away: the moving ones, or all."""
-    sensitivity: Float[np.ndarray, " moving"]
+    """The radii."""
+    n_moving: int
+    n_colliding: int
+    """The first `n_colliding` entities push each other away: the moving ones, or all."""
+    sensitivity: Float[np.ndarray, " n_moving"]
     """The force of an action."""
-    max_speed: Float[np.ndarray, " moving"]
+    max_speed: Float[np.ndarray, " n_moving"]
     """`inf` if there is no limit."""
     contact: Float[np.ndarray, "colliding colliding"]
     """d_min: the distance between two centres below which the entities push each other."""
 
 
 class State(NamedTuple):
-    """The part of a world that a step changes."""
+    """The variables of a world, which a step changes."""
 
     position: Float[Array, "entities 2"]
     velocity: Float[Array, "entities 2"]
 
 
 def at_rest(position: Float[Array, "entities 2"]) -> State:
+    """Return a state without motion."""
     return State(position, jnp.zeros_like(position))
 
 
 def push(world: World, action: Int[Array, " moving"]) -> Float[Array, "moving 2"]:
-    """The force that each entity's own action applies to it."""
+    """Return the force of each entity's action on itself."""
     return jnp.asarray(world.sensitivity)[:, None] * jnp.asarray(DIRECTIONS)[action]
 
 
 def contact_force(world: World, position: Float[Array, "entities 2"]) -> Float[Array, "moving 2"]:
-    """The sum of contact forces on each moving entity. Two entities with the same centre have no direction, and so no force."""
-    bodies = position[: world.colliding]
-    offset = bodies[: world.moving, None] - bodies
+    """Return the sum of contact forces on each moving entity. Two entities with the same centre exert no force."""
+    bodies = position[: world.n_colliding]
+    offset = bodies[: world.n_moving, None] - bodies
     distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
-    overlap = (world.contact[: world.moving] - distance) / CONTACT_MARGIN
+    overlap = (world.contact[: world.n_moving] - distance) / CONTACT_MARGIN
     force = CONTACT_FORCE * CONTACT_MARGIN * jnp.logaddexp(overlap, 0)
     # An entity's distance to itself is 0 too.
     return jnp.sum((force / jnp.where(distance > 0, distance, jnp.inf))[..., None] * offset, axis=1)
 
 
 def move(world: World, state: State, force: Float[Array, "moving 2"]) -> State:
-    """One step of TIME_STEP. The contact forces are computed from the positions before it."""
+    """Make one step of TIME_STEP. Contact forces follow from the positions before it."""
     force = force + contact_force(world, state.position)
-    velocity = (1 - DAMPING) * state.velocity[: world.moving] + TIME_STEP * force
+    velocity = (1 - DAMPING) * state.velocity[: world.n_moving] + TIME_STEP * force
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1))
     velocity = jnp.where(speed > world.max_speed, world.max_speed / speed, 1)[:, None] * velocity
-    moved = state.position[: world.moving] + TIME_STEP * velocity
-    return State(state.position.at[: world.moving].set(moved), state.velocity.at[: world.moving].set(velocity))
+    moved = state.position[: world.n_moving] + TIME_STEP * velocity
+    return State(state.position.at[: world.n_moving].set(moved), state.velocity.at[: world.n_moving].set(velocity))

@@ -26,39 +26,39 @@ FIELD = 32.0
 TICK = 1 / 16
 TICKS = 8
 """The number of ticks in a step."""
-SPREAD = 2.0
-"""The largest distance, in x and in y, of a unit's start from the centre of its side's start."""
-OURS, THEIRS = (FIELD / 4, FIELD / 2), (3 * FIELD / 4, FIELD / 2)
+START_RANGE = 2.0
+"""The largest distance in x and y between a unit and the centre of its side at the start."""
+ALLY_START, ENEMY_START = (FIELD / 4, FIELD / 2), (3 * FIELD / 4, FIELD / 2)
 """The centres of both sides' starts."""
 
 DIRECTIONS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0)], np.float32)
-"""The directions of the first four choices: up, right, down, left."""
+"""The directions of the first four actions: up, right, down, left."""
 STOP = 4
 ATTACK = 5
-"""The choice ATTACK + k attacks the k-th unit of the other side. For the enemy, k counts our units from the last to the first."""
+"""The action ATTACK + k attacks the k-th unit of the other side. For the enemy, k counts our units from the last to the first."""
 
 
 class Battle(NamedTuple):
-    """The part of a battle that a step changes. A unit without health is dead."""
+    """The variables of a battle, which a step changes. A unit without health is dead."""
 
     position: Float[Array, "units 2"]
     health: Float[Array, " units"]
     cooldown: Float[Array, " units"]
     """Seconds until a unit may attack again; 0 or less if it may attack now."""
     action: Int[Array, " units"]
-    """The choice of each unit in the previous step; STOP at the start."""
+    """The action of each unit in the previous step; STOP at the start."""
     step: Int[Array, ""]
 
 
-def start(scenario: Scenario, key: PRNGKeyArray) -> Battle:
-    """A new battle: each side starts in its own square, and overlapping units are pushed apart once."""
-    middle = np.repeat(np.array([OURS, THEIRS], np.float32), [scenario.allies, scenario.enemies], axis=0)
-    position = jax.random.uniform(key, middle.shape, minval=-SPREAD, maxval=SPREAD) + middle
+def start_battle(scenario: Scenario, key: PRNGKeyArray) -> Battle:
+    """Start a battle: each side starts in its own square, and overlapping units are pushed apart once."""
+    middle = np.repeat(np.array([ALLY_START, ENEMY_START], np.float32), [scenario.n_allies, scenario.n_enemies], axis=0)
+    position = jax.random.uniform(key, middle.shape, minval=-START_RANGE, maxval=START_RANGE) + middle
     return Battle(
-        position=push(scenario, position, jnp.ones(scenario.units, bool)),
-        health=jnp.asarray(scenario.each("health")),
-        cooldown=jnp.zeros(scenario.units, jnp.float32),
-        action=jnp.full(scenario.units, STOP, jnp.int32),
+        position=separate_units(scenario, position, jnp.ones(scenario.n_units, bool)),
+        health=jnp.asarray(scenario.unit_stats("health")),
+        cooldown=jnp.zeros(scenario.n_units, jnp.float32),
+        action=jnp.full(scenario.n_units, STOP, jnp.int32),
         step=jnp.zeros((), jnp.int32),
     )
 
@@ -67,45 +67,46 @@ def alive(battle: Battle) -> Bool[Array, " units"]:
     return battle.health > 0
 
 
-def spread(key: PRNGKeyArray, scenario: Scenario) -> Float[Array, "ticks units"]:
-    """The random addition to each cooldown that begins in a tick."""
-    return jax.random.uniform(key, (TICKS, scenario.units), minval=-TICK, maxval=2 * TICK)
+def sample_cooldown_noise(key: PRNGKeyArray, scenario: Scenario) -> Float[Array, "ticks units"]:
+    """Sample the random addition to each cooldown that begins in a tick."""
+    return jax.random.uniform(key, (TICKS, scenario.n_units), minval=-TICK, maxval=2 * TICK)
 
 
 def advance(
-    scenario: Scenario, battle: Battle, action: Int[Array, " units"], longer: Float[Array, "ticks units"]
+    scenario: Scenario, battle: Battle, action: Int[Array, " units"], cooldown_noise: Float[Array, "ticks units"]
 ) -> Battle:
-    """One step. `longer` is a result of `spread`."""
-    velocity = jnp.asarray(scenario.each("speed"))[:, None] * direction(action)
-    aims = target(scenario, action)[:, None] == jnp.arange(scenario.units)
+    """Make one step. `cooldown_noise` is a result of `sample_cooldown_noise`."""
+    velocity = jnp.asarray(scenario.unit_stats("speed"))[:, None] * move_direction(action)
+    aims = attack_target(scenario, action)[:, None] == jnp.arange(scenario.n_units)
 
-    def tick(battle: Battle, longer: Float[Array, " units"]) -> tuple[Battle, None]:
-        lives = alive(battle)
-        hits = aims & in_reach(scenario, battle) & (battle.cooldown <= 0)[:, None]
-        damage = jnp.sum(jnp.where(hits, scenario.each("damage")[:, None], 0), axis=0)
-        cooldown = jnp.where(jnp.any(hits, axis=1), scenario.each("cooldown") + longer, battle.cooldown - TICK)
+    def tick(battle: Battle, cooldown_noise: Float[Array, " units"]) -> tuple[Battle, None]:
+        is_alive = alive(battle)
+        hits = aims & within_reach(scenario, battle) & (battle.cooldown <= 0)[:, None]
+        damage = jnp.sum(jnp.where(hits, scenario.unit_stats("damage")[:, None], 0), axis=0)
+        reloaded = scenario.unit_stats("cooldown") + cooldown_noise
+        cooldown = jnp.where(jnp.any(hits, axis=1), reloaded, battle.cooldown - TICK)
         moved = jnp.clip(battle.position + TICK * velocity, 0, FIELD)
-        position = jnp.where(lives[:, None], moved, battle.position)
+        position = jnp.where(is_alive[:, None], moved, battle.position)
         at_border = jnp.any((position <= 0) | (position >= FIELD), axis=1)
         health = jnp.where(at_border, 0, jnp.maximum(battle.health - damage, 0))
-        position = push(scenario, position, health > 0)
+        position = separate_units(scenario, position, health > 0)
         return battle._replace(position=position, health=health, cooldown=cooldown), None
 
-    after, _ = jax.lax.scan(tick, battle, longer)
-    return after._replace(action=action, step=battle.step + 1)
+    next_battle, _ = jax.lax.scan(tick, battle, cooldown_noise)
+    return next_battle._replace(action=action, step=battle.step + 1)
 
 
-def direction(action: Int[Array, " units"]) -> Float[Array, "units 2"]:
-    """The direction in which each unit moves; zero unless it chose to move."""
+def move_direction(action: Int[Array, " units"]) -> Float[Array, "units 2"]:
+    """Return the direction in which each unit moves; zero for other actions."""
     still = np.zeros((1, 2), np.float32)
     return jnp.asarray(np.concatenate([DIRECTIONS, still]))[jnp.minimum(action, STOP)]
 
 
-def target(scenario: Scenario, action: Int[Array, " units"]) -> Int[Array, " units"]:
-    """The unit that each unit attacks, or -1."""
-    place = action - ATTACK
-    other = jnp.where(scenario.enemy == 1, scenario.allies - 1 - place, scenario.allies + place)
-    return jnp.where(place >= 0, other, -1)
+def attack_target(scenario: Scenario, action: Int[Array, " units"]) -> Int[Array, " units"]:
+    """Return the unit that each unit attacks, or -1."""
+    k = action - ATTACK
+    target = jnp.where(scenario.is_enemy == 1, scenario.n_allies - 1 - k, scenario.n_allies + k)
+    return jnp.where(k >= 0, target, -1)
 
 
 def distances(position: Float[Array, "units 2"]) -> Float[Array, "units units"]:
@@ -114,41 +115,41 @@ def distances(position: Float[Array, "units 2"]) -> Float[Array, "units units"]:
     return jnp.sqrt((x[:, None] - x) ** 2 + (y[:, None] - y) ** 2)
 
 
-def in_reach(scenario: Scenario, battle: Battle) -> Bool[Array, "units units"]:
-    """Whether the first unit could hit the second: both are alive, and the distance is small enough."""
-    lives = alive(battle)
-    return (distances(battle.position) < scenario.each("reach")[:, None]) & lives[:, None] & lives
+def within_reach(scenario: Scenario, battle: Battle) -> Bool[Array, "units units"]:
+    """Return whether the first unit could hit the second: both are alive, and the distance is small enough."""
+    is_alive = alive(battle)
+    return (distances(battle.position) < scenario.unit_stats("reach")[:, None]) & is_alive[:, None] & is_alive
 
 
-def push(
-    scenario: Scenario, position: Float[Array, "units 2"], lives: Bool[Array, " units"]
+def separate_units(
+    scenario: Scenario, position: Float[Array, "units 2"], is_alive: Bool[Array, " units"]
 ) -> Float[Array, "units 2"]:
     """Move units that overlap halfway apart, all pairs at once."""
-    radius = scenario.each("radius")
+    radius = scenario.unit_stats("radius")
     # A unit's offset to itself is 0, so that this pair does not move it.
-    distance = distances(position) + np.eye(scenario.units, dtype=np.float32) + 1e-6
+    distance = distances(position) + np.eye(scenario.n_units, dtype=np.float32) + 1e-6
     overlap = jax.nn.relu((radius[:, None] + radius) / distance - 1)
-    overlap = jnp.where(lives[:, None] & lives, overlap, 0)
+    overlap = jnp.where(is_alive[:, None] & is_alive, overlap, 0)
     x, y = position[:, 0], position[:, 1]
-    apart = [jnp.sum(overlap * (one[:, None] - one), axis=1) for one in (x, y)]
-    return position + jnp.stack(apart, axis=1) / 2
+    shift = [jnp.sum(overlap * (axis[:, None] - axis), axis=1) for axis in (x, y)]
+    return position + jnp.stack(shift, axis=1) / 2
 
 
-def legal(scenario: Scenario, battle: Battle) -> Bool[Array, "allies choices"]:
-    """The available choices of our units. Dead units can only stop; others can attack enemies within their reach."""
-    lives = alive(battle)[: scenario.allies, None]
-    move = jnp.repeat(lives, len(DIRECTIONS), axis=1)
-    attack = in_reach(scenario, battle)[: scenario.allies, scenario.allies :]
-    return jnp.concatenate([move, jnp.ones_like(lives), attack], axis=1)
+def available_actions(scenario: Scenario, battle: Battle) -> Bool[Array, "allies action"]:
+    """Return the available actions of our units. Dead units can only stop; others can attack enemies within their reach."""
+    is_alive = alive(battle)[: scenario.n_allies, None]
+    move = jnp.repeat(is_alive, len(DIRECTIONS), axis=1)
+    attack = within_reach(scenario, battle)[: scenario.n_allies, scenario.n_allies :]
+    return jnp.concatenate([move, jnp.ones_like(is_alive), attack], axis=1)
 
 
 def defeated(scenario: Scenario, battle: Battle) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether all our units are dead, and whether all enemy units are dead."""
-    lives = alive(battle)
-    return ~jnp.any(lives[: scenario.allies]), ~jnp.any(lives[scenario.allies :])
+    """Return whether all our units are dead, and whether all enemy units are dead."""
+    is_alive = alive(battle)
+    return ~jnp.any(is_alive[: scenario.n_allies]), ~jnp.any(is_alive[scenario.n_allies :])
 
 
 def won(scenario: Scenario, battle: Battle) -> Bool[Array, ""]:
-    """Whether only the enemy is defeated. If both sides die in the same step, neither has won."""
-    ours, theirs = defeated(scenario, battle)
-    return theirs & ~ours
+    """Return whether only the enemy is defeated. If both sides die in the same step, neither has won."""
+    allies_defeated, enemies_defeated = defeated(scenario, battle)
+    return enemies_defeated & ~allies_defeated

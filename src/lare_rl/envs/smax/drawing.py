@@ -3,74 +3,82 @@
 from operator import itemgetter
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle, Wedge
 
-from lare_rl.envs.canvas import blank, pixels
-from lare_rl.envs.smax.battle import ATTACK, FIELD, Battle
+from lare_rl.envs.canvas import blank_figure, to_pixels
+from lare_rl.envs.smax.battle import FIELD, Battle, attack_target
 from lare_rl.envs.smax.scenarios import Scenario
 
-OURS, THEIRS, FALLEN = "#0072b2", "#d55e00", "#bbbbbb"
+__all__ = ["draw_frames", "draw_state", "find_hits"]
+
+ALLY_COLOUR, ENEMY_COLOUR, DEAD_COLOUR = "#0072b2", "#d55e00", "#bbbbbb"
 
 
-def draw(scenario: Scenario, battle: Battle, before: Battle | None = None, credit: float | None = None) -> Figure:
-    """A state. Each unit is a disc, filled in proportion to its health. With the state `before`, lines show the hits."""
-    figure, axes = blank()
-    paint(axes, scenario, battle, before, credit)
+def draw_state(
+    scenario: Scenario, battle: Battle, previous: Battle | None = None, credit: float | None = None
+) -> Figure:
+    """Draw a state. Each unit is a disc, filled in proportion to its health. Lines show the hits since the previous state."""
+    figure, axes = blank_figure()
+    _paint(axes, scenario, battle, previous, credit)
     return figure
 
 
-def frames(
+def draw_frames(
     scenario: Scenario, battles: Battle, credit: Float[np.ndarray, " steps"] | None = None
 ) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """An episode as pictures.
+    """Draw an episode as pictures.
 
     Args:
         scenario: the units.
         battles: one state for each picture, along a leading axis.
-        credit: for each state, the credit of the step that led to it. It is shown as a number.
+        credit: for each state, the credit of the step before it, which is shown as a number.
     """
-    figure, axes = blank()
+    figure, axes = blank_figure()
     battles = jax.tree.map(np.asarray, battles)
-    found, before = [], None
+    frames, previous = [], None
     for step in range(len(battles.step)):
         axes.clear()
         battle = jax.tree.map(itemgetter(step), battles)
-        paint(axes, scenario, battle, before, None if credit is None else float(credit[step]))
-        before = battle
-        found.append(pixels(figure))
-    return found
+        _paint(axes, scenario, battle, previous, None if credit is None else float(credit[step]))
+        previous = battle
+        frames.append(to_pixels(figure))
+    return frames
 
 
-def paint(axes: Axes, scenario: Scenario, battle: Battle, before: Battle | None, credit: float | None) -> None:
+def _paint(axes: Axes, scenario: Scenario, battle: Battle, previous: Battle | None, credit: float | None) -> None:
     axes.set(xlim=(-0.5, FIELD + 0.5), ylim=(-0.5, FIELD + 0.5), aspect="equal")
     axes.axis("off")
     axes.add_patch(Rectangle((0, 0), FIELD, FIELD, fill=False, edgecolor="#888888"))
-    lives = np.asarray(battle.health > 0)
-    share = np.asarray(battle.health) / scenario.each("health")
-    names = (*scenario.ours, *scenario.theirs)
-    for unit in np.argsort(lives, kind="stable"):  # dead units are drawn first, below the others
+    is_alive = np.asarray(battle.health > 0)
+    health = np.asarray(battle.health) / scenario.unit_stats("health")
+    names = (*scenario.ally_types, *scenario.enemy_types)
+    for unit in np.argsort(is_alive, kind="stable").tolist():  # dead units are drawn first, below the others
         x, y = map(float, battle.position[unit])
-        if not lives[unit]:
-            axes.plot(x, y, marker="x", color=FALLEN, markersize=5)
+        if not is_alive[unit]:
+            axes.plot(x, y, marker="x", color=DEAD_COLOUR, markersize=5)
             continue
-        colour, radius = THEIRS if scenario.enemy[unit] else OURS, float(scenario.each("radius")[unit])
+        colour, radius = _side_colour(scenario, unit), float(scenario.unit_stats("radius")[unit])
         axes.add_patch(Circle((x, y), radius, facecolor="white", edgecolor=colour, linewidth=1.2))
-        axes.add_patch(Wedge((x, y), radius, 90, 90 + 360 * float(share[unit]), facecolor=colour, alpha=0.8))
+        axes.add_patch(Wedge((x, y), radius, 90, 90 + 360 * float(health[unit]), facecolor=colour, alpha=0.8))
         axes.text(x, y, names[unit][0], fontsize=7, ha="center", va="center", color="black")
-    for shooter, hit in shots(scenario, battle, before) if before else ():
-        (x, y), (to_x, to_y) = battle.position[shooter], battle.position[hit]
-        axes.plot([x, to_x], [y, to_y], color=THEIRS if scenario.enemy[shooter] else OURS, linewidth=1, alpha=0.7)
-    said = f"step {int(battle.step)}" + ("" if credit is None else f"   credit {credit:.2g}")
-    axes.text(0.5, FIELD - 0.5, said, fontsize=9, ha="left", va="top")
+    for shooter, target in find_hits(scenario, battle, previous) if previous else ():
+        (x, y), (to_x, to_y) = battle.position[shooter], battle.position[target]
+        axes.plot([x, to_x], [y, to_y], color=_side_colour(scenario, shooter), linewidth=1, alpha=0.7)
+    label = f"step {int(battle.step)}" + ("" if credit is None else f"   credit {credit:.2g}")
+    axes.text(0.5, FIELD - 0.5, label, fontsize=9, ha="left", va="top")
 
 
-def shots(scenario: Scenario, battle: Battle, before: Battle) -> list[tuple[int, int]]:
-    """Pairs (unit, the unit that it hit) of a step. A unit has hit if its cooldown rose; without a hit, cooldowns fall."""
-    place = np.asarray(battle.action) - ATTACK
-    hit = np.where(scenario.enemy == 1, scenario.allies - 1 - place, scenario.allies + place)
-    fired = np.asarray(battle.cooldown) > np.asarray(before.cooldown)
-    return [(int(unit), int(hit[unit])) for unit in np.flatnonzero(fired)]
+def _side_colour(scenario: Scenario, unit: int) -> str:
+    return ENEMY_COLOUR if scenario.is_enemy[unit] else ALLY_COLOUR
+
+
+def find_hits(scenario: Scenario, battle: Battle, previous: Battle) -> list[tuple[int, int]]:
+    """Return the pairs (unit, its target) of the hits of a step. A unit has hit if its cooldown rose; otherwise it falls."""
+    target = np.asarray(attack_target(scenario, jnp.asarray(battle.action)))
+    fired = np.asarray(battle.cooldown) > np.asarray(previous.cooldown)
+    return [(int(unit), int(target[unit])) for unit in np.flatnonzero(fired)]

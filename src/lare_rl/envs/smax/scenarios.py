@@ -1,7 +1,7 @@
 """The types of units, and the armies of each battle.
 
-All figures except those of the colossus are the defaults of SMAX in JaxMARL 0.2.0 (Rutherford et al., 2024; `smax_env.py`,
-Apache-2.0), where shields count as health. JaxMARL has no colossus. Its figures here are those of StarCraft II: health (200, and
+All stats except those of the colossus are the defaults of SMAX in JaxMARL 0.2.0 (Rutherford et al., 2024; `smax_env.py`,
+Apache-2.0), where shields count as health. JaxMARL has no colossus. Its stats here are those of StarCraft II: health (200, and
 a shield of 150), range, cooldown and speed. Its two attacks of 10 are one attack of 20, which hits only the target.
 """
 
@@ -12,12 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare_rl.envs.smax import NAMES
+from lare_rl.envs.smax import SCENARIO_NAMES
 from lare_rl.errors import LareError, did_you_mean
+
+__all__ = ["SCENARIOS", "UNIT_TYPES", "Scenario", "find_scenario"]
 
 
 class UnitType(NamedTuple):
-    """The figures of all units of a type. Lengths are in units of the field, times in seconds."""
+    """The stats of all units of a type. Lengths are in units of the field, times in seconds."""
 
     speed: float
     damage: float
@@ -47,62 +49,64 @@ class Scenario:
     """A battle. Along an axis of units, ours come first."""
 
     name: str
-    ours: tuple[str, ...]
-    theirs: tuple[str, ...]
-    limit: int
-    """The most steps of an episode."""
-    unit_types: int = 6
+    ally_types: tuple[str, ...]
+    enemy_types: tuple[str, ...]
+    max_steps: int
+    """The maximum length of an episode."""
+    n_unit_types: int = 6
     """The number of types in the one-hot encoding of observations and states."""
 
     @property
-    def allies(self) -> int:
-        return len(self.ours)
+    def n_allies(self) -> int:
+        return len(self.ally_types)
 
     @property
-    def enemies(self) -> int:
-        return len(self.theirs)
+    def n_enemies(self) -> int:
+        return len(self.enemy_types)
 
     @property
-    def units(self) -> int:
-        return self.allies + self.enemies
+    def n_units(self) -> int:
+        return self.n_allies + self.n_enemies
 
     @cached_property
-    def unit_type(self) -> Int[np.ndarray, " units"]:
+    def unit_type(self) -> Int[np.ndarray, " n_units"]:
         """Each unit's number in UNIT_TYPES."""
         numbers = list(UNIT_TYPES)
-        return np.array([numbers.index(name) for name in (*self.ours, *self.theirs)])
+        return np.array([numbers.index(name) for name in (*self.ally_types, *self.enemy_types)])
 
     @cached_property
-    def enemy(self) -> Float[np.ndarray, " units"]:
+    def is_enemy(self) -> Float[np.ndarray, " n_units"]:
         """1 for the enemy's units, 0 for ours."""
-        return np.repeat(np.array([0, 1], np.float32), [self.allies, self.enemies])
+        return np.repeat(np.array([0, 1], np.float32), [self.n_allies, self.n_enemies])
 
-    def each(self, figure: str) -> Float[np.ndarray, " units"]:
-        """A figure of each unit's type."""
-        return np.array([getattr(UNIT_TYPES[name], figure) for name in (*self.ours, *self.theirs)], np.float32)
+    def unit_stats(self, stat: str) -> Float[np.ndarray, " n_units"]:
+        """Return a stat of each unit."""
+        return np.array([getattr(UNIT_TYPES[name], stat) for name in (*self.ally_types, *self.enemy_types)], np.float32)
 
 
-def army(colossi: int = 0, stalkers: int = 0, zealots: int = 0) -> tuple[str, ...]:
+def _army(colossi: int = 0, stalkers: int = 0, zealots: int = 0) -> tuple[str, ...]:
     return ("colossus",) * colossi + ("stalker",) * stalkers + ("zealot",) * zealots
 
 
 SCENARIOS = {
     scenario.name: scenario
     for scenario in (
-        Scenario("2s3z", army(0, 2, 3), army(0, 2, 3), 120),
-        Scenario("3s_vs_5z", army(0, 3, 0), army(0, 0, 5), 250),
-        Scenario("1c3s5z", army(1, 3, 5), army(1, 3, 5), 180, unit_types=7),
+        Scenario("2s3z", _army(0, 2, 3), _army(0, 2, 3), 120),
+        Scenario("3s_vs_5z", _army(0, 3, 0), _army(0, 0, 5), 250),
+        Scenario("1c3s5z", _army(1, 3, 5), _army(1, 3, 5), 180, n_unit_types=7),
     )
 }
 """The battles, with their time limits in SMAC."""
 
 
 def find_scenario(name: str) -> Scenario:
-    """The battle of that name.
+    """Return the battle of a name.
 
     Raises:
         LareError: no battle has this name; the message lists all names.
     """
     if name in SCENARIOS:
         return SCENARIOS[name]
-    raise LareError(f"no battle {name!r}{did_you_mean(name, SCENARIOS)}; the battles of SMAX are {', '.join(NAMES)}")
+    raise LareError(
+        f"no battle {name!r}{did_you_mean(name, SCENARIOS)}. The battles of SMAX are {', '.join(SCENARIO_NAMES)}."
+    )

@@ -5,7 +5,7 @@
 which is 10 times the reward of SMAX, so that the largest return of an episode is 20, as in SMAC (Samvelyan et al., 2019).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,16 +13,34 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
-from lare_rl.envs.smax.battle import ATTACK, Battle, advance, alive, defeated, legal, spread, start, won
-from lare_rl.envs.smax.enemy import Memory, act, remember
-from lare_rl.envs.smax.observation import field, observation_size, observe, state_size
+from lare_rl.envs.smax.battle import (
+    ATTACK,
+    Battle,
+    advance,
+    alive,
+    available_actions,
+    defeated,
+    sample_cooldown_noise,
+    start_battle,
+    won,
+)
+from lare_rl.envs.smax.enemy import Memory, choose_actions, init_memory
+from lare_rl.envs.smax.observation import global_state, observation_size, observe, state_size
 from lare_rl.envs.smax.scenarios import Scenario, find_scenario
+from lare_rl.tasks.spec import TaskSpec
 
-MOST = 20.0
+__all__ = ["SMAX", "WIN_RETURN", "SmaxState", "make", "reward"]
+
+WIN_RETURN = 20.0
 """The return of an episode that is won."""
 
 
-class State(NamedTuple):
+def make(task: TaskSpec, **_: Any) -> "SMAX":
+    """Make the environment of a task with the name `smax/SCENARIO`."""
+    return SMAX(task.environment_name)
+
+
+class SmaxState(NamedTuple):
     """A battle, and the enemy's memory."""
 
     battle: Battle
@@ -32,13 +50,13 @@ class State(NamedTuple):
 class SMAX:
     """A battle in which the agents are the units of one side. A `JaxEnv`.
 
-    The choices are up, right, down, left, stop, and one attack for each enemy unit. A choice that is not available does nothing.
+    The actions are up, right, down, left, stop, and one attack for each enemy unit. An action that is not available does nothing.
     A unit that dies leaves. All living units receive the same reward: the reward of their side.
 
     >>> env = SMAX("2s3z")
-    >>> state, seen = env.reset(jax.random.key(0))
-    >>> state, seen = env.step(state, jax.nn.one_hot(jnp.full(5, 1), 10), jax.random.key(1))
-    >>> seen.observation.shape, seen.state.shape, float(seen.measures["won"])
+    >>> state, timestep = env.reset(jax.random.key(0))
+    >>> state, timestep = env.step(state, jax.nn.one_hot(jnp.full(5, 1), 10), jax.random.key(1))
+    >>> timestep.observation.shape, timestep.state.shape, float(timestep.measures["won"])
     ((5, 127), (120,), 0.0)
     """
 
@@ -48,62 +66,63 @@ class SMAX:
     def __init__(self, name: str):
         self.scenario = scenario = find_scenario(name)
         self.spec = EnvSpec(
-            teams=(Team("ally", 0, scenario.allies),),
+            teams=(Team("ally", 0, scenario.n_allies),),
             observation_size=observation_size(scenario),
-            action_size=ATTACK + scenario.enemies,
+            action_size=ATTACK + scenario.n_enemies,
             discrete=True,
-            max_steps=scenario.limit,
+            max_steps=scenario.max_steps,
             state_size=state_size(scenario),
             agents_leave=True,
             masks_actions=True,
-            in_jax=True,
+            is_jax=True,
             measures=("won",),
         )
 
-    def reset(self, key: PRNGKeyArray) -> tuple[State, Timestep]:
+    def reset(self, key: PRNGKeyArray) -> tuple[SmaxState, Timestep]:
         """Start a battle. Both armies have full health."""
-        battle = start(self.scenario, key)
-        return State(battle, remember(self.scenario, battle)), self.show(battle, jnp.zeros(self.scenario.allies))
+        battle = start_battle(self.scenario, key)
+        state = SmaxState(battle, init_memory(self.scenario, battle))
+        return state, self._make_timestep(battle, jnp.zeros(self.scenario.n_allies))
 
-    def step(self, state: State, action: Float[Array, "agents action"], key: PRNGKeyArray) -> tuple[State, Timestep]:
-        """Both sides choose from the same state, and the battle continues for half a second."""
-        enemy_key, battle_key = jax.random.split(key)
-        theirs, memory = act(self.scenario, state.battle, state.memory, enemy_key)
-        ours = jnp.argmax(action, axis=1).astype(jnp.int32)
-        longer = spread(battle_key, self.scenario)
-        battle = advance(self.scenario, state.battle, jnp.concatenate([ours, theirs]), longer)
-        lived = alive(state.battle)[: self.scenario.allies]
-        return State(battle, memory), self.show(
-            battle, jnp.where(lived, reward(self.scenario, state.battle, battle), 0)
-        )
+    def step(
+        self, state: SmaxState, action: Float[Array, "agents action"], key: PRNGKeyArray
+    ) -> tuple[SmaxState, Timestep]:
+        """Make one step of half a second. Both sides choose from the same state."""
+        scenario, battle = self.scenario, state.battle
+        enemy_key, noise_key = jax.random.split(key)
+        enemy_action, memory = choose_actions(scenario, battle, state.memory, enemy_key)
+        joint_action = jnp.concatenate([jnp.argmax(action, axis=1).astype(jnp.int32), enemy_action])
+        next_battle = advance(scenario, battle, joint_action, sample_cooldown_noise(noise_key, scenario))
+        team_reward = reward(scenario, battle, next_battle)
+        rewards = jnp.where(alive(battle)[: scenario.n_allies], team_reward, 0)
+        return SmaxState(next_battle, memory), self._make_timestep(next_battle, rewards)
 
-    def show(self, battle: Battle, paid: Float[Array, " agents"]) -> Timestep:
-        """The timestep of a battle after a step with the given rewards."""
-        ours, theirs = defeated(self.scenario, battle)
+    def _make_timestep(self, battle: Battle, reward: Float[Array, " agents"]) -> Timestep:
+        allies_defeated, enemies_defeated = defeated(self.scenario, battle)
         return Timestep(
             observation=observe(self.scenario, battle),
-            state=field(self.scenario, battle),
-            available=legal(self.scenario, battle),
-            alive=alive(battle)[: self.scenario.allies],
-            reward=paid,
-            terminated=ours | theirs,
-            truncated=battle.step >= self.scenario.limit,
+            state=global_state(self.scenario, battle),
+            available=available_actions(self.scenario, battle),
+            alive=alive(battle)[: self.scenario.n_allies],
+            reward=reward,
+            terminated=allies_defeated | enemies_defeated,
+            truncated=battle.step >= self.scenario.max_steps,
             measures={"won": won(self.scenario, battle).astype(jnp.float32)},
         )
 
     def frames(
-        self, states: State, credit: Float[np.ndarray, "steps agents"] | None = None
+        self, states: SmaxState, credit: Float[np.ndarray, "steps agents"] | None = None
     ) -> list[UInt8[np.ndarray, "height width 3"]]:
-        """An episode as pictures."""
-        from lare_rl.envs.smax.drawing import frames
+        """Draw the states of an episode."""
+        from lare_rl.envs.smax.drawing import draw_frames
 
         if credit is not None:  # all living units have the same credit, dead units none
             credit = np.take_along_axis(credit, np.abs(credit).argmax(axis=1)[:, None], axis=1)[:, 0]
-        return frames(self.scenario, states.battle, credit)
+        return draw_frames(self.scenario, states.battle, credit)
 
 
-def reward(scenario: Scenario, before: Battle, after: Battle) -> Float[Array, ""]:
-    """The reward of our side for a step. The win is only paid once, even if the battle is continued after it."""
-    lost = (before.health - after.health) / scenario.each("health")
-    harm = jnp.sum(lost[scenario.allies :]) / scenario.enemies
-    return MOST / 2 * (harm + (won(scenario, after) & ~won(scenario, before)))
+def reward(scenario: Scenario, battle: Battle, next_battle: Battle) -> Float[Array, ""]:
+    """Return the reward of our side for a step. A win counts once, even if the battle continues after it."""
+    lost = (battle.health - next_battle.health) / scenario.unit_stats("health")
+    harm = jnp.sum(lost[scenario.n_allies :]) / scenario.n_enemies
+    return WIN_RETURN / 2 * (harm + (won(scenario, next_battle) & ~won(scenario, battle)))

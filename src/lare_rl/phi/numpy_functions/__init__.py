@@ -1,6 +1,25 @@
-"""NumPy's functions, made of the operations of the graph."""
+"""NumPy's functions, made of the operations of the graph. Importing a module registers its functions."""
 
-from lare_rl.phi.numpy_functions import creation, elementwise, products, reductions, shapes, tables
-from lare_rl.phi.numpy_functions.registry import FUNCTIONS, call_numpy
+from lare_rl.phi.numpy_functions import (
+    constants,
+    creation,
+    elementwise,
+    joining,
+    linear_algebra,
+    order,
+    positions,
+    products,
+    reductions,
+    sequences,
+    shapes,
+    tables,
+)  # fmt: skip
+from lare_rl.phi.numpy_functions.creation import INDEXED
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, KIND_OF_DTYPE, call_numpy
+from lare_rl.phi.numpy_functions.tables import Polynomial
 
-__all__ = ["FUNCTIONS", "call_numpy", "creation", "elementwise", "products", "reductions", "shapes", "tables"]
+__all__ = [
+    "FUNCTIONS", "INDEXED", "KIND_OF_DTYPE", "Polynomial", "call_numpy",
+    "constants", "creation", "elementwise", "joining", "linear_algebra", "order", "positions", "products", "reductions",
+    "sequences", "shapes", "tables",
+]  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import operator
 from collections.abc import Callable
@@ -10,10 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import ALL, Array, BatchSize, as_array, broadcast, elementwise, stack
-from lare_rl.phi.graph import Refused, current_builder
-from lare_rl.phi.numpy_functions.registry import FUNCTIONS, as_float, astype, constant_of, kind_of, numpy_function
-from lare_rl.phi.numpy_functions.shapes import column_stack, concatenate_, ravel, split_shape
+from lare_rl.phi.arrays import Array, as_array, broadcast, elementwise, stack
+from lare_rl.phi.batch import BatchSize
+from lare_rl.phi.builder import current_builder
+from lare_rl.phi.indices import ALL
+from lare_rl.phi.limits import (
+    RefusedError,
+)
+from lare_rl.phi.numpy_functions.joining import column_stack, concatenate_
+from lare_rl.phi.numpy_functions.registry import (
+    FUNCTIONS,
+    as_float,
+    astype,
+    dtype_kind,
+    numpy_function,
+)
+from lare_rl.phi.numpy_functions.shapes import ravel, split_shape
 
 
 @numpy_function()
@@ -26,7 +37,7 @@ def array(object: Any, dtype: Any = None, ndmin: Any = 0) -> Array:  # noqa: A00
     "asarray", "asanyarray", "ascontiguousarray", "asfortranarray", "asarray_chkfinite", "require", "fromiter"
 )
 def asarray(a: Array, dtype: Any = None, count: Any = -1) -> Array:
-    return a if dtype is None or kind_of(dtype) == a.kind else astype(a, dtype)
+    return a if dtype is None or dtype_kind(dtype) == a.kind else astype(a, dtype)
 
 
 @numpy_function("copy")
@@ -58,7 +69,7 @@ def ones(shape: Any, dtype: Any = "float") -> Array:
 @numpy_function()
 def empty(shape: Any, dtype: Any = "float") -> Array:
     """Not a number, until the program has written numbers into it."""
-    return full(shape, math.nan if kind_of(dtype) == "float" else 0, dtype)
+    return full(shape, math.nan if dtype_kind(dtype) == "float" else 0, dtype)
 
 
 @numpy_function()
@@ -183,11 +194,11 @@ def fromfunction(function: Callable[..., Any], shape: Any, *, dtype: Any = "floa
 
 @numpy_function()
 def apply_along_axis(func1d: Callable[..., Any], axis: int, arr: Array, *args: Any, **kwargs: Any) -> Any:
-    """A function of each series along an axis. It is called once for all rows, and once for each place on other axes."""
+    """Apply a function to each series along an axis. It is called once for all rows, and once for each entry of the other axes."""
     (at,) = arr.row_axes(axis)
     lead = [i for i in range(arr.ndim) if i not in (at, arr.batch_axis)]
     if at != arr.ndim - 1 or (arr.batch_axis is not None and (arr.batch_axis or arr.row_shape[0] != 1)):
-        raise Refused(
+        raise RefusedError(
             "E-NUMPY", "np.apply_along_axis is available along the last axis: write the function with axis=-1"
         )
     in_row = Array(arr.node, None).reshaped((-1, arr.row_shape[at]), None)  # arrays of one row, without a batch axis
@@ -233,65 +244,6 @@ class Grid:
 
 INDEXED = {"r_": Concatenator(False), "c_": Concatenator(True), "mgrid": Grid(False), "ogrid": Grid(True)}
 """Objects of NumPy that are used with an index."""
-
-
-# --- of constants alone, by NumPy itself --------------------------------------------------------------------------------
-
-LARGEST_CONSTANT, LARGEST_SYSTEM = 1024, 64
-"""The most numbers of each argument of these functions, and the most of those that solve equations."""
-
-
-def register_constant_function(
-    name: str,
-    options: str = "",
-    largest: int = LARGEST_CONSTANT,
-    work: Callable[[Any], int] = lambda x: 20 * np.size(x),
-) -> None:
-    """Register a function of constants that NumPy itself computes.
-
-    Args:
-        name: its name behind `np.`.
-        options: the keywords that it takes.
-        largest: the most numbers of an argument, and the largest integer.
-        work: what it costs to compute, for each of its arguments.
-    """
-    function: Any = functools.reduce(getattr, name.split("."), np)
-
-    def of_constants(*args: Any, **kwargs: Any) -> Any:
-        unknown = set(kwargs) - set(options.split())
-        if unknown or len(args) > 3:
-            raise Refused("E-NUMPY", f"np.{name} takes constants, and {options or 'no keywords'}")
-        values = [plain_constant(x, name, largest) for x in args]
-        more = {key: plain_constant(x, name, largest) for key, x in kwargs.items()}
-        current_builder().spend(sum(map(work, values)))
-        result = function(*values, **more)
-        return tuple(map(as_array, result)) if isinstance(result, (tuple, list)) else as_array(result)
-
-    numpy_function(name)(of_constants)
-
-
-def plain_constant(x: Any, name: str, largest: int) -> Any:
-    """A small constant as NumPy takes it: a number, or an array of at most two axes."""
-    if isinstance(x, (bool, float)) or x is None:
-        return x
-    values = constant_of(x, f"the arguments of np.{name}")
-    if values.ndim > 2 or values.size > largest or (values.dtype.kind == "i" and np.abs(values).max() > largest):
-        raise Refused("E-COST", f"np.{name} of more than {largest} numbers, or of larger integers")
-    return values.item() if values.ndim == 0 else values
-
-
-for _name, _options in {
-    "nonzero": "", "flatnonzero": "", "argwhere": "", "union1d": "", "intersect1d": "", "setdiff1d": "", "setxor1d": "",
-    "unique": "return_index return_inverse return_counts", "array_equal": "", "trim_zeros": "", "i0": "", "hanning": "",
-    "hamming": "", "blackman": "", "bartlett": "", "kaiser": "", "histogram": "bins", "bincount": "minlength",
-    "vander": "N increasing", "triu_indices_from": "k", "tril_indices_from": "k",
-}.items():  # fmt: skip
-    register_constant_function(_name, _options)
-for _name, _options in {
-    "roots": "", "poly": "", "polyfit": "deg", "tril_indices": "k m", "triu_indices": "k m", "diag_indices": "",
-    "cov": "ddof rowvar", "corrcoef": "rowvar", "gcd": "", "lcm": "", "allclose": "rtol atol",
-}.items():  # fmt: skip
-    register_constant_function(_name, _options, LARGEST_SYSTEM)
 
 
 @numpy_function()

@@ -1,4 +1,4 @@
-"""Functions on each number, and Python's operators on arrays."""
+"""NumPy's functions on each number."""
 
 from __future__ import annotations
 
@@ -8,9 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import ALL, Array, Operand, as_array, concatenate, elementwise, invert, power
-from lare_rl.phi.graph import ELEMENTWISE, Refused
-from lare_rl.phi.numpy_functions.registry import UFUNCS, as_numbers, as_operand, call_numpy, numpy_function
+from lare_rl.phi.arrays import Array, as_array, concatenate, elementwise, invert, power
+from lare_rl.phi.indices import ALL
+from lare_rl.phi.kinds import ELEMENTWISE
+from lare_rl.phi.limits import (
+    RefusedError,
+)
+from lare_rl.phi.numpy_functions.registry import (
+    UFUNCS,
+    as_numbers,
+    as_operand,
+    call_numpy,
+    numpy_function,
+)
+from lare_rl.phi.operand import Operand
 
 UNARY = frozenset(
     "sqrt exp log log1p expm1 exp2 log2 log10 cbrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh arctanh abs "
@@ -21,7 +32,7 @@ ALIASES = {
     "arctan": "atan", "arctan2": "atan2", "arccosh": "acosh", "arcsinh": "asinh", "arctanh": "atanh",
     "left_shift": "bitwise_left_shift", "right_shift": "bitwise_right_shift",
 }  # fmt: skip
-LARGEST_FLOAT = float(np.finfo(np.float32).max)
+MAX_FLOAT32 = float(np.finfo(np.float32).max)
 
 
 def _register_ufunc(op: str, function: Callable[..., Any]) -> None:
@@ -70,7 +81,7 @@ for _name, _function in {
 @numpy_function()
 def where(condition: Operand, x: Operand | None = None, y: Operand | None = None) -> Any:
     if x is None or y is None:
-        raise Refused("E-NUMPY", "np.where needs three arguments: where a condition holds differs from row to row")
+        raise RefusedError("E-NUMPY", "np.where needs three arguments: where a condition holds differs from row to row")
     return elementwise("where", condition, as_operand(x), as_operand(y))
 
 
@@ -88,8 +99,8 @@ def divmod_(x1: Operand, x2: Operand) -> tuple[Any, Any]:
 
 @numpy_function()
 def modf(x: Operand) -> tuple[Any, Any]:
-    whole = elementwise("trunc", x)
-    return elementwise("subtract", x, whole), whole
+    integral = elementwise("trunc", x)
+    return elementwise("subtract", x, integral), integral
 
 
 @numpy_function()
@@ -108,8 +119,8 @@ def sinc(x: Operand) -> Any:
 @numpy_function()
 def nan_to_num(x: Operand, copy: Any = True, nan: Any = 0.0, posinf: Any = None, neginf: Any = None) -> Any:
     x = elementwise("where", elementwise("isnan", x), nan, x)
-    x = elementwise("where", elementwise("equal", x, math.inf), LARGEST_FLOAT if posinf is None else posinf, x)
-    return elementwise("where", elementwise("equal", x, -math.inf), -LARGEST_FLOAT if neginf is None else neginf, x)
+    x = elementwise("where", elementwise("equal", x, math.inf), MAX_FLOAT32 if posinf is None else posinf, x)
+    return elementwise("where", elementwise("equal", x, -math.inf), -MAX_FLOAT32 if neginf is None else neginf, x)
 
 
 @numpy_function("round", "around", "round_")

@@ -1,4 +1,4 @@
-"""Products and small linear algebra."""
+"""Products and convolutions."""
 
 from __future__ import annotations
 
@@ -9,40 +9,48 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import ALL, Array, as_array, elementwise, stack
-from lare_rl.phi.graph import Refused, current_builder
-from lare_rl.phi.numpy_functions.creation import register_constant_function
+from lare_rl.phi.arrays import Array, as_array, elementwise, stack
+from lare_rl.phi.builder import current_builder
+from lare_rl.phi.indices import ALL
+from lare_rl.phi.limits import (
+    MAX_EINSUM_ARRAYS,
+    RefusedError,
+)
+from lare_rl.phi.numpy_functions.positions import diagonal
 from lare_rl.phi.numpy_functions.reductions import along
-from lare_rl.phi.numpy_functions.registry import FUNCTIONS, constant_of, numpy_function
-from lare_rl.phi.numpy_functions.shapes import diagonal, ravel
+from lare_rl.phi.numpy_functions.registry import (
+    FUNCTIONS,
+    array_functions,
+    numpy_function,
+    require_constant,
+)
+from lare_rl.phi.numpy_functions.shapes import ravel
 
 _TERM = r"[a-zA-Z]*+(\.\.\.)?[a-zA-Z]*+"
 PATTERN = re.compile(rf"{_TERM}(,{_TERM})*+(->{_TERM})?")
 """The subscripts of np.einsum. A letter stands once in the result."""
-LARGEST_INVERSE = 4
-"""The largest matrix that is inverted by its cofactors."""
 
 
 @numpy_function()
 def einsum(subscripts: Any, *operands: Array, optimize: Any = False) -> Array:
-    """A letter for each axis. The batch axis must have the same letter in all arrays, and be kept."""
+    """Multiply and sum, with a letter for each axis. The batch axis has one letter in all arrays and in the result."""
     if not isinstance(subscripts, str):
-        raise Refused("E-NUMPY", "np.einsum takes its subscripts as a text, such as 'bij,bj->bi'")
+        raise RefusedError("E-NUMPY", "np.einsum takes its subscripts as a text, such as 'bij,bj->bi'")
     compact = "".join(subscripts.split())
-    kept = [letter for letter in compact.partition("->")[2] if letter != "."]
-    if not PATTERN.fullmatch(compact) or len(set(kept)) < len(kept) or len(operands) > 8:
-        raise Refused(
+    output = [letter for letter in compact.partition("->")[2] if letter != "."]
+    if not PATTERN.fullmatch(compact) or len(set(output)) < len(output) or len(operands) > MAX_EINSUM_ARRAYS:
+        raise RefusedError(
             "E-NUMPY", f"np.einsum({subscripts[:40]!r}): use at most 8 arrays and 20 letters, such as 'bij,bj->bi'"
         )
-    left, arrow, right = compact.partition("->")
-    terms = left.split(",")
-    unused = [letter for letter in string.ascii_letters if letter not in left]
+    inputs, arrow, result = compact.partition("->")
+    terms = inputs.split(",")
+    unused = [letter for letter in string.ascii_letters if letter not in inputs]
     ndims = [a.ndim - len(term) + 3 for a, term in zip(operands, terms, strict=True) if "..." in term]
     dots = "".join(unused[: max(ndims, default=0)])
-    if not arrow:
-        letters = sorted(letter for letter in set(left) - set(",.") if left.count(letter) == 1)
-        right = ("..." if "..." in left else "") + "".join(letters)
-    result = right.replace("...", dots)
+    if not arrow:  # as in NumPy: the dots, then the letters that occur once
+        once = sorted(letter for letter in set(inputs) - set(",.") if inputs.count(letter) == 1)
+        result = ("..." if "..." in inputs else "") + "".join(once)
+    result = result.replace("...", dots)
     terms = [
         term.replace("...", dots[len(dots) - (a.ndim - len(term) + 3) :])
         for a, term in zip(operands, terms, strict=True)
@@ -51,21 +59,19 @@ def einsum(subscripts: Any, *operands: Array, optimize: Any = False) -> Array:
         raise ValueError(
             f"np.einsum({subscripts!r}) does not fit the shapes {' and '.join(str(a.shape) for a in operands)}"
         )
-    arrays, letters_of = [], []
+    arrays, letters = [], []
     for a, term in zip(operands, terms, strict=True):  # NumPy broadcasts axes of length 1 behind the dots
         single = [i for i, c in enumerate(term) if c in dots and a.row_shape[i] == 1 and i != a.batch_axis]
         arrays.append(a[tuple(0 if i in single else ALL for i in range(a.ndim))] if single else a)
-        letters_of.append("".join(c for i, c in enumerate(term) if i not in single))
-    batch_letters = {term[a.batch_axis] for a, term in zip(arrays, letters_of, strict=True) if a.batch_axis is not None}
+        letters.append("".join(c for i, c in enumerate(term) if i not in single))
+    batch_letters = {term[a.batch_axis] for a, term in zip(arrays, letters, strict=True) if a.batch_axis is not None}
     batch = batch_letters.pop() if batch_letters else ""
     if batch_letters or (batch and result.count(batch) != 1):
-        raise Refused("E-ROWS", f"np.einsum({subscripts!r}) combines the rows of the batch")
-    if batch and any(
-        term.count(batch) != (a.batch_axis is not None) for a, term in zip(arrays, letters_of, strict=True)
-    ):
-        raise Refused("E-ROWS", f"np.einsum({subscripts!r}) combines the batch axis with another axis")
-    present = "".join(c for c in result if any(c in term for term in letters_of))
-    node = current_builder().einsum(letters_of, present, [a.node for a in arrays])
+        raise RefusedError("E-ROWS", f"np.einsum({subscripts!r}) combines the rows of the batch")
+    if batch and any(term.count(batch) != (a.batch_axis is not None) for a, term in zip(arrays, letters, strict=True)):
+        raise RefusedError("E-ROWS", f"np.einsum({subscripts!r}) combines the batch axis with another axis")
+    present = "".join(c for c in result if any(c in term for term in letters))
+    node = current_builder().einsum(letters, present, [a.node for a in arrays])
     product = Array(node, present.index(batch) if batch else None)
     return product[tuple(ALL if c in present else None for c in result)] if present != result else product
 
@@ -74,9 +80,9 @@ def einsum(subscripts: Any, *operands: Array, optimize: Any = False) -> Array:
 def matmul(x1: Array, x2: Array) -> Any:
     if not x1.ndim or not x2.ndim:
         raise ValueError("np.matmul of a single number: use *")
-    left, right = ("...ij" if x1.ndim > 1 else "j"), ("...jk" if x2.ndim > 1 else "j")
+    terms = ("...ij" if x1.ndim > 1 else "j"), ("...jk" if x2.ndim > 1 else "j")
     dots = "..." if x1.ndim > 1 or x2.ndim > 1 else ""
-    return einsum(f"{left},{right}->{dots}{'i' * (x1.ndim > 1)}{'k' * (x2.ndim > 1)}", x1, x2)
+    return einsum(f"{','.join(terms)}->{dots}{'i' * (x1.ndim > 1)}{'k' * (x2.ndim > 1)}", x1, x2)
 
 
 @numpy_function()
@@ -84,7 +90,7 @@ def dot(a: Array, b: Array) -> Any:
     if not a.ndim or not b.ndim:
         return elementwise("multiply", a, b)
     if b.ndim > 2:
-        raise Refused("E-NUMPY", "np.dot with an array of more than two axes: use np.einsum or @")
+        raise RefusedError("E-NUMPY", "np.dot with an array of more than two axes: use np.einsum or @")
     return matmul(a, b)
 
 
@@ -96,46 +102,21 @@ def inner(a: Array, b: Array) -> Any:
     return einsum(f"{first}z,{second}z->{first}{second}", a, b)
 
 
-@numpy_function("outer", "linalg.outer")
-def outer(a: Array, b: Array) -> Any:
-    return einsum("i,j->ij", ravel(a), ravel(b))
-
-
-@numpy_function()
-def vdot(a: Array, b: Array) -> Any:
-    return einsum("i,i->", ravel(a), ravel(b))
-
-
-@numpy_function("vecdot", "linalg.vecdot")
-def vecdot(x1: Array, x2: Array, axis: int = -1) -> Any:
-    return along("sum", elementwise("multiply", x1, x2), axis)
-
-
-@numpy_function()
-def matvec(x1: Array, x2: Array) -> Any:
-    return einsum("...ij,...j->...i", x1, x2)
-
-
-@numpy_function()
-def vecmat(x1: Array, x2: Array) -> Any:
-    return einsum("...j,...jk->...k", x1, x2)
-
-
 @numpy_function()
 def tensordot(a: Array, b: Array, axes: Any = 2) -> Any:
     first, second = list(string.ascii_lowercase[: a.ndim]), list(string.ascii_uppercase[: b.ndim])
     pairs = [range(a.ndim - axes, a.ndim), range(axes)] if isinstance(axes, int) else axes
-    left, right = (list(pair) if isinstance(pair, (list, tuple, range)) else [pair] for pair in pairs)
-    for i, j in zip(left, right, strict=True):
+    axes_a, axes_b = (list(pair) if isinstance(pair, (list, tuple, range)) else [pair] for pair in pairs)
+    for i, j in zip(axes_a, axes_b, strict=True):
         second[b.axis(j)] = first[a.axis(i)]
-    kept = [letter for letter in first if letter not in second] + [letter for letter in second if letter not in first]
-    return einsum(f"{''.join(first)},{''.join(second)}->{''.join(kept)}", a, b)
+    free = [letter for letter in first if letter not in second] + [letter for letter in second if letter not in first]
+    return einsum(f"{''.join(first)},{''.join(second)}->{''.join(free)}", a, b)
 
 
 @numpy_function()
 def kron(a: Array, b: Array) -> Any:
     current_builder().check_size([math.prod(a.row_shape), math.prod(b.row_shape)])
-    return as_array(np.kron(constant_of(a, "the arrays of np.kron"), constant_of(b, "the arrays of np.kron")))
+    return as_array(np.kron(require_constant(a, "the arrays of np.kron"), require_constant(b, "the arrays of np.kron")))
 
 
 @numpy_function("cross", "linalg.cross")
@@ -162,128 +143,9 @@ def trace(a: Array, offset: int = 0, axis1: Any = None, axis2: Any = None) -> An
     return along("sum", diagonal(a, offset, *axes), -1)
 
 
-@numpy_function("linalg.det")
-def det(a: Array) -> Array:
-    _check_square(a, "det")
-    return Array(current_builder().det(a.node), a.batch_axis)
-
-
-@numpy_function("linalg.slogdet")
-def slogdet(a: Array) -> tuple[Any, Any]:
-    value = det(a)
-    return elementwise("sign", value), elementwise("log", elementwise("abs", value))
-
-
-@numpy_function("linalg.inv")
-def inv(a: Array) -> Any:
-    """The inverse by cofactors, of at most 4 x 4 numbers; of a constant, by NumPy. Not finite for a singular matrix."""
-    n = _check_square(a, "inv")
-    if a.constant is not None:
-        current_builder().spend(n * math.prod(a.row_shape))
-        return as_array(np.linalg.inv(a.constant))
-    if n > LARGEST_INVERSE:
-        raise Refused(
-            "E-NUMPY", f"np.linalg.inv of matrices larger than {LARGEST_INVERSE} x {LARGEST_INVERSE} is not available"
-        )
-    if n == 1:
-        return elementwise("divide", 1.0, a)
-
-    def cofactor(i: int, j: int) -> Any:
-        rest = a[..., [k for k in range(n) if k != i], :][..., [k for k in range(n) if k != j]]
-        return elementwise("multiply", det(rest), (-1.0) ** (i + j))
-
-    adjugate = stack([stack([cofactor(i, j) for i in range(n)], -1) for j in range(n)], -2)
-    return elementwise("divide", adjugate, det(a)[..., None, None])
-
-
-@numpy_function("linalg.solve")
-def solve(a: Array, b: Array) -> Any:
-    return matmul(inv(a), b)
-
-
-@numpy_function("linalg.matrix_power")
-def matrix_power(a: Array, n: int) -> Any:
-    size = _check_square(a, "matrix_power")
-    base = inv(a) if n < 0 else a
-    if abs(n) > 64:
-        raise Refused("E-COST", "np.linalg.matrix_power: at most 64")
-    if n == 0:
-        return FUNCTIONS["broadcast_to"](as_array(np.eye(size)), a.shape)
-    result = base
-    for _ in range(abs(n) - 1):
-        result = matmul(result, base)
-    return result
-
-
-@numpy_function("linalg.multi_dot")
-def multi_dot(arrays: list[Array]) -> Any:
-    result = arrays[0]
-    for array in arrays[1:]:
-        result = matmul(result, array)
-    return result
-
-
-def _check_square(a: Array, name: str) -> int:
-    if a.ndim < 2 or a.row_shape[-1] != a.row_shape[-2] or a.batch_axis in (a.ndim - 1, a.ndim - 2):
-        raise ValueError(f"np.linalg.{name} needs square matrices in the last two axes: the shape is {a.shape}")
-    return a.row_shape[-1]
-
-
-@numpy_function("linalg.eigvalsh")
-def eigvalsh(a: Array, UPLO: Any = "L") -> Any:  # noqa: N803
-    """The eigenvalues of symmetric matrices of 2 x 2 or 3 x 3 numbers, in rising order; of a constant, by NumPy.
-
-    For 3 x 3: O. K. Smith, Eigenvalues of a symmetric 3 x 3 matrix, Communications of the ACM 4(4), 1961.
-    """
-    n = _check_square(a, "eigvalsh")
-    if a.constant is not None:
-        current_builder().spend(10 * n * math.prod(a.row_shape))
-        return as_array(np.linalg.eigvalsh(a.constant, UPLO))
-    if n > 3:
-        raise Refused("E-NUMPY", "np.linalg.eigvalsh of matrices larger than 3 x 3 is not available")
-    if n == 1:
-        return a[..., 0]
-    if n == 3:
-        return _eigenvalues_3x3(a, UPLO)
-    off = a[..., 1, 0] if UPLO == "L" else a[..., 0, 1]
-    middle = (a[..., 0, 0] + a[..., 1, 1]) / 2
-    radius = elementwise("hypot", (a[..., 0, 0] - a[..., 1, 1]) / 2, off)
-    return stack([middle - radius, middle + radius], -1)
-
-
-def _eigenvalues_3x3(a: Array, uplo: Any) -> Any:
-    rows, columns = ([1, 2, 2], [0, 0, 1]) if uplo == "L" else ([0, 0, 1], [1, 2, 2])
-    diagonals = diagonal(a, 0, a.ndim - 2, a.ndim - 1)
-    off = a[..., rows, columns]
-    middle = FUNCTIONS["mean"](diagonals, -1, keepdims=True)
-    centered = elementwise("subtract", diagonals, middle)
-    square = along("sum", elementwise("multiply", centered, centered), -1, True)
-    radius = elementwise("sqrt", (square + 2 * along("sum", elementwise("multiply", off, off), -1, True)) / 6)
-    scale = elementwise("where", elementwise("equal", radius, 0), 1.0, radius)
-    d, e = centered / scale, elementwise("divide", off, scale)
-    determinant = (
-        d[..., 0:1] * d[..., 1:2] * d[..., 2:3] + 2 * e[..., 0:1] * e[..., 1:2] * e[..., 2:3]
-        - d[..., 0:1] * e[..., 2:3] ** 2 - d[..., 1:2] * e[..., 1:2] ** 2 - d[..., 2:3] * e[..., 0:1] ** 2
-    )  # fmt: skip
-    angle = elementwise("arccos", FUNCTIONS["clip"](determinant / 2, -1.0, 1.0)) / 3
-    turns = as_array(np.array([2, -2, 0]) * math.pi / 3)  # from the smallest to the largest
-    return middle + 2 * radius * elementwise("cos", elementwise("add", angle, turns))
-
-
-@numpy_function()
-def convolve(a: Array, v: Array, mode: Any = "full") -> Any:
-    """Sum over j of a_j v_(k - j)."""
-    return _correlate(a, v, mode, reverse=True)
-
-
-@numpy_function()
-def correlate(a: Array, v: Array, mode: Any = "valid") -> Any:
-    return _correlate(a, v, mode, reverse=False)
-
-
 def _correlate(a: Array, v: Array, mode: str, reverse: bool) -> Any:
     if a.ndim != 1 or v.ndim != 1 or a.batch_axis is not None or v.batch_axis is not None:
-        raise Refused(
+        raise RefusedError(
             "E-ROWS",
             "np.convolve takes one series, not a batch: sum shifted slices, or use sliding_window_view along axis 1",
         )
@@ -298,7 +160,14 @@ def _correlate(a: Array, v: Array, mode: str, reverse: bool) -> Any:
     return full[start : start + length]
 
 
-for _name in (
-    "linalg.pinv linalg.cholesky linalg.matrix_rank linalg.cond linalg.eigh linalg.svd linalg.svdvals linalg.qr".split()
-):
-    register_constant_function(_name, work=lambda x: np.size(x) * max(np.shape(x), default=1))
+array_functions(
+    {
+        "outer linalg.outer": lambda a, b: einsum("i,j->ij", ravel(a), ravel(b)),
+        "vdot": lambda a, b: einsum("i,i->", ravel(a), ravel(b)),
+        "vecdot linalg.vecdot": lambda x1, x2, axis=-1: along("sum", elementwise("multiply", x1, x2), axis),
+        "matvec": lambda x1, x2: einsum("...ij,...j->...i", x1, x2),
+        "vecmat": lambda x1, x2: einsum("...j,...jk->...k", x1, x2),
+        "convolve": lambda a, v, mode="full": _correlate(a, v, mode, reverse=True),
+        "correlate": lambda a, v, mode="valid": _correlate(a, v, mode, reverse=False),
+    }
+)

@@ -11,8 +11,11 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from lare_rl.phi.arrays import Array, Operand, as_array, elementwise
-from lare_rl.phi.graph import Kind, Refused, current_builder
+from lare_rl.phi.arrays import Array, as_array, elementwise
+from lare_rl.phi.builder import current_builder
+from lare_rl.phi.graph import Kind
+from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.operand import Operand
 
 Function = Callable[..., Any]
 
@@ -32,43 +35,63 @@ KIND_OF_DTYPE: dict[str, Kind] = {
 IGNORED = frozenset("order casting subok copy like device".split())
 """Arguments of NumPy that change no number."""
 
+UFUNCS: set[str] = set()
+"""Functions on each number that take `where=` together with `out=`."""
+
 _SIGNATURES: dict[str, inspect.Signature] = {}
+_CONVERTERS: dict[str, dict[str, Callable[[Any], Any]]] = {}
+"""For each function, what converts its arguments."""
 
 
 def numpy_function(*names: str) -> Callable[[Function], Function]:
-    """Register a function under NumPy's names for it; without any, under its own. A last underscore is left out."""
+    """Register a function under NumPy's names for it, or else under its own without a last underscore.
+
+    Its annotations say what the arguments are converted to.
+    """
 
     def register(function: Function) -> Function:
+        signature = inspect.signature(function)
+        converters = {
+            key: _CONVERSIONS[parameter.annotation]
+            for key, parameter in signature.parameters.items()
+            if parameter.annotation in _CONVERSIONS
+        }
         for name in names or (function.__name__.rstrip("_"),):
-            FUNCTIONS[name] = function
-            _SIGNATURES[name] = inspect.signature(function)
+            FUNCTIONS[name], _SIGNATURES[name], _CONVERTERS[name] = function, signature, converters
         return function
 
     return register
 
 
+def array_functions(table: Mapping[str, Function]) -> None:
+    """Register functions under names that are separated by spaces. Arguments without a default are converted to arrays."""
+    for names, function in table.items():
+        for name in names.split():
+            numpy_function(name)(function)
+            parameters = _SIGNATURES[name].parameters
+            _CONVERTERS[name] = {key: as_array for key, p in parameters.items() if p.default is p.empty}
+
+
 def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
     """Call a registered function with the values of a program."""
     signature = _SIGNATURES[name]
-    own = {
+    arguments = {
         key: value
         for key, value in kwargs.items()
         if key in signature.parameters or key not in ("out", "dtype", *IGNORED)
     }
     try:
-        bound = signature.bind(*args, **own)
+        bound = signature.bind(*args, **arguments)
     except TypeError as error:
-        raise Refused("E-NUMPY", f"np.{name}: {error}; it takes {signature_text(name)}") from None
+        raise RefusedError("E-NUMPY", f"np.{name}: {error}; it takes {_signature_text(name)}") from None
+    converters = _CONVERTERS[name]
     for key, value in bound.arguments.items():
-        parameter = signature.parameters[key]
-        convert = _CONVERSIONS.get(parameter.annotation)
-        if convert is not None and parameter.kind is parameter.VAR_POSITIONAL:
-            bound.arguments[key] = tuple(convert(item) for item in value)
-        elif convert is not None:
-            bound.arguments[key] = convert(value)
+        if key in converters:
+            several = signature.parameters[key].kind is inspect.Parameter.VAR_POSITIONAL
+            bound.arguments[key] = tuple(map(converters[key], value)) if several else converters[key](value)
     out, dtype = kwargs.get("out"), kwargs.get("dtype")
-    if out is None and own.get("where", True) is not True and name in UFUNCS:
-        raise Refused(
+    if out is None and arguments.get("where", True) is not True and name in UFUNCS:
+        raise RefusedError(
             "E-NUMPY", f"np.{name} with where= needs out=: without it, NumPy returns memory that nobody has written"
         )
     result = FUNCTIONS[name](*bound.args, **bound.kwargs)
@@ -78,19 +101,16 @@ def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any
         out = out[0] if isinstance(out, tuple) else out
         if not isinstance(out, Array):
             raise TypeError("out= must be an array")
-        where = own.get("where", True) if name in UFUNCS else True
+        where = arguments.get("where", True) if name in UFUNCS else True
         out[...] = result if where is True else elementwise("where", where, result, out)
         return out
     return result
 
 
-def signature_text(name: str) -> str:
-    """The parameters of a function, for a message."""
-    return ", ".join(str(p).partition(":")[0] for p in _SIGNATURES[name].parameters.values()) or "no arguments"
-
-
-UFUNCS: set[str] = set()
-"""Functions on each number that take `where=` together with `out=`."""
+def _signature_text(name: str) -> str:
+    """Return the parameters of a function, for a message."""
+    parameters = _SIGNATURES[name].parameters.values()
+    return ", ".join("*" * (p.kind is p.VAR_POSITIONAL) + p.name for p in parameters) or "no arguments"
 
 
 def as_operand(value: Any) -> Any:
@@ -111,33 +131,33 @@ def as_float(value: Any) -> float:
 
 def astype(x: Any, dtype: Any) -> Array:
     array = as_array(x)
-    return Array(current_builder().cast(array.node, kind_of(dtype)), array.batch_axis)
+    return Array(current_builder().cast(array.node, dtype_kind(dtype)), array.batch_axis)
 
 
 def as_numbers(x: Any) -> Array:
-    """An array of fractional numbers."""
+    """Return an array of fractional numbers."""
     return astype(x, "float")
 
 
-def kind_of(dtype: Any) -> Kind:
-    """The kind of a type: "float32", np.float32, float, x.dtype. Raises `Refused` for other types."""
+def dtype_kind(dtype: Any) -> Kind:
+    """Return the kind of a type: "float32", np.float32, float, x.dtype. Raises `RefusedError` for other types."""
     name = dtype_name(dtype)
     if name not in KIND_OF_DTYPE:
-        raise Refused("E-NUMPY", f"{name[:40]!r} is no available type: use float, np.float32, int or bool")
+        raise RefusedError("E-NUMPY", f"{name[:40]!r} is no available type: use float, np.float32, int or bool")
     return KIND_OF_DTYPE[name]
 
 
 def dtype_name(dtype: Any) -> str:
-    """The name of a type without np., for a text or for what is known by its name; else an empty text."""
+    """Return the name of a type without np., if it is a text or a symbol; else an empty text."""
     name = dtype if isinstance(dtype, str) else getattr(dtype, "name", "")
     return name.removeprefix("np.") if isinstance(name, str) else ""
 
 
-def constant_of(x: Any, what: str) -> Any:
-    """The numbers of a constant. Raises `Refused` if they differ from row to row."""
+def require_constant(x: Any, what: str) -> Any:
+    """Return the numbers of a constant. Raises `RefusedError` if they differ from row to row."""
     values = as_array(x).constant
     if values is None:
-        raise Refused("E-NUMPY", f"{what} must be the same for all rows")
+        raise RefusedError("E-NUMPY", f"{what} must be the same for all rows")
     return values
 
 

@@ -11,14 +11,22 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, elementwise
-from lare_rl.phi.graph import current_builder
-from lare_rl.phi.numpy_functions.creation import LARGEST_SYSTEM, plain_constant, register_constant_function
+from lare_rl.phi.builder import current_builder
+from lare_rl.phi.limits import (
+    MAX_SYSTEM_SIZE,
+)
+from lare_rl.phi.numpy_functions.constants import plain_constant, register_constant_function
 from lare_rl.phi.numpy_functions.reductions import along
-from lare_rl.phi.numpy_functions.registry import as_float, as_numbers, constant_of, numpy_function
+from lare_rl.phi.numpy_functions.registry import (
+    as_float,
+    as_numbers,
+    numpy_function,
+    require_constant,
+)
 
 
 def _steps_above(x: Array, edges: Array, op: str) -> Array:
-    """How many of some edges lie below each number (op "greater") or not above it ("greater_equal"). NaN lies above all."""
+    """Return how many edges lie below each number (op "greater") or not above it ("greater_equal"). NaN lies above all."""
     beyond = elementwise({"greater": "less_equal", "greater_equal": "less"}[op], x[..., None], edges)
     return along("sum", elementwise("logical_not", beyond), -1)
 
@@ -32,7 +40,7 @@ def searchsorted(a: Array, v: Array, side: Any = "left", sorter: Any = None) -> 
 
 @numpy_function()
 def digitize(x: Array, bins: Array, right: Any = False) -> Any:
-    edges = constant_of(bins, "the bins of np.digitize")
+    edges = require_constant(bins, "the bins of np.digitize")
     if len(edges) > 1 and edges[0] > edges[-1]:  # falling: bins[i - 1] > x >= bins[i]
         count = _steps_above(x, as_array(edges), "greater_equal" if not right else "greater")
         return elementwise("subtract", len(edges), count)
@@ -42,34 +50,34 @@ def digitize(x: Array, bins: Array, right: Any = False) -> Any:
 @numpy_function()
 def interp(x: Array, xp: Array, fp: Array, left: Any = None, right: Any = None, period: Any = None) -> Any:
     """Straight lines between the points (xp, fp), constant before the first and behind the last."""
-    places = constant_of(xp, "xp of np.interp").astype(float)
+    knots = require_constant(xp, "xp of np.interp").astype(float)
     x = as_numbers(x)
     if period is not None:
         x = elementwise("remainder", x, as_float(period))
-        order = np.argsort(places % as_float(period), kind="stable")
-        fp, places = fp[as_array(order)], (places % as_float(period))[order]
-        places = np.concatenate([[places[-1] - period], places, [places[0] + period]])
+        order = np.argsort(knots % as_float(period), kind="stable")
+        fp, knots = fp[as_array(order)], (knots % as_float(period))[order]
+        knots = np.concatenate([[knots[-1] - period], knots, [knots[0] + period]])
         fp = fp[as_array([len(order) - 1, *range(len(order)), 0])]
-    if len(places) != fp.row_shape[0] or not (np.diff(places) >= 0).all():
+    if len(knots) != fp.row_shape[0] or not (np.diff(knots) >= 0).all():
         raise ValueError("np.interp needs rising xp, and as many fp")
-    start = _interval(x, places)
+    start = _interval(x, knots)
     low, high = fp[start], fp[elementwise("add", start, 1)]
-    left_edge, width = as_array(places[:-1])[start], as_array(np.diff(places))[start]
+    left_edge, width = as_array(knots[:-1])[start], as_array(np.diff(knots))[start]
     share = (x - left_edge) / elementwise("where", elementwise("equal", width, 0), 1.0, width)
     result = low + (high - low) * elementwise("minimum", elementwise("maximum", share, 0.0), 1.0)
     result = elementwise("where", elementwise("isnan", x), math.nan, result)
-    result = result if left is None else elementwise("where", elementwise("less", x, places[0]), left, result)
-    return result if right is None else elementwise("where", elementwise("greater", x, places[-1]), right, result)
+    result = result if left is None else elementwise("where", elementwise("less", x, knots[0]), left, result)
+    return result if right is None else elementwise("where", elementwise("greater", x, knots[-1]), right, result)
 
 
-def _interval(x: Array, places: np.ndarray) -> Any:
-    """The number of the interval between places that each number lies in."""
-    if len(places) < 2:
+def _interval(x: Array, knots: np.ndarray) -> Any:
+    """Return the index of the interval between knots that each number lies in."""
+    if len(knots) < 2:
         raise ValueError("np.interp needs at least two points")
-    current_builder().check_size((math.prod(x.row_shape), len(places)))
+    current_builder().check_size((math.prod(x.row_shape), len(knots)))
     return (
-        _steps_above(x, as_array(places[1:-1]), "greater_equal")
-        if len(places) > 2
+        _steps_above(x, as_array(knots[1:-1]), "greater_equal")
+        if len(knots) > 2
         else elementwise("multiply", 0, elementwise("isnan", x))
     )
 
@@ -122,7 +130,7 @@ def rising_polyval(x: Array, c: Any, tensor: Any = True) -> Any:
 
 def _register_series_value(name: str, to_powers: Callable[[Any], np.ndarray]) -> None:
     def value(x: Array, c: Any, tensor: Any = True) -> Any:
-        return rising_polyval(x, to_powers(plain_constant(c, name, LARGEST_SYSTEM)))
+        return rising_polyval(x, to_powers(plain_constant(c, name, MAX_SYSTEM_SIZE)))
 
     numpy_function(f"polynomial.{name}")(value)
 
@@ -148,9 +156,9 @@ def poly1d(c_or_r: Array) -> Polynomial:
 
 
 for _name in "polyadd polysub polymul polyder polyint polydiv".split():
-    register_constant_function(_name, "m", LARGEST_SYSTEM)
+    register_constant_function(_name, "m", MAX_SYSTEM_SIZE)
 for _name in "polyder polyint polymul polyadd".split():
-    register_constant_function(f"polynomial.polynomial.{_name}", "m", LARGEST_SYSTEM)
+    register_constant_function(f"polynomial.polynomial.{_name}", "m", MAX_SYSTEM_SIZE)
 
 
 # --- sets ---------------------------------------------------------------------------------------------------------------

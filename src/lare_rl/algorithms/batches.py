@@ -1,0 +1,51 @@
+"""The data that the training loop hands to an update, by what the algorithm consumes."""
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Bool, Float
+
+__all__ = ["Rollout", "Sequences", "Transitions"]
+
+
+class Transitions(NamedTuple):
+    """A batch of single steps from the replay: `Consumes.TRANSITIONS`. Actions lie in [-1, 1]."""
+
+    observation: Float[Array, "batch observation"]
+    action: Float[Array, "batch action"]
+    reward: Float[Array, " batch"]
+    next_observation: Float[Array, "batch observation"]
+    terminated: Float[Array, " batch"]
+    """1 where the episode terminated. A time limit is not a termination: the target still bootstraps there."""
+
+
+class Rollout(NamedTuple):
+    """The newest steps of all environments: `Consumes.ROLLOUTS`. The axis `actors` has one entry per agent and environment."""
+
+    observation: Float[Array, "time actors observation"]
+    action: Float[Array, "time actors action"]
+    reward: Float[Array, "time actors"]
+    next_observation: Float[Array, "time actors observation"]
+    terminated: Float[Array, "time actors"]
+    """1 where the episode terminated, else 0, where the target bootstraps."""
+    done: Float[Array, "time actors"]
+    """1 at the last step of an episode, terminated or truncated, and at the last step of an agent that leaves."""
+    available: Bool[Array, "time actors action"] | None = None
+    """Which choices were available. None: all of them."""
+    mask: Float[Array, "time actors"] | None = None
+    """1 where the agent acted, 0 after it has left. None: all 1."""
+
+
+class Sequences(NamedTuple):
+    """Whole episodes, padded to one length: `Consumes.SEQUENCES`. `terminated` and `mask` must be 0 in the padding."""
+
+    observation: Float[Array, "episodes steps+1 agents observation"]
+    state: Float[Array, "episodes steps+1 state"]
+    available: Bool[Array, "episodes steps+1 agents action"]
+    action: Float[Array, "episodes steps agents action"]
+    """One-hot rows."""
+    reward: Float[Array, "episodes steps"]
+    """The team's reward."""
+    terminated: Float[Array, "episodes steps"]
+    """1 at the last step of an episode, even if a time limit ended it."""
+    mask: Float[Array, "episodes steps"]
+    """1 on the steps of the episode."""

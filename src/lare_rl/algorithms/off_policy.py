@@ -1,0 +1,34 @@
+"""The hyperparameters and default run settings that TD3, DDPG and SAC share."""
+
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from lare_rl.algorithms.registry import AlgorithmSettings
+from lare_rl.envs.interface import EnvSpec
+
+__all__ = ["OffPolicySettings", "run_defaults"]
+
+
+class OffPolicySettings(AlgorithmSettings):
+    """The hyperparameters that these algorithms share; none of them depends on the task."""
+
+    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
+    """Widths of the hidden layers of actor and critics."""
+    critics: Annotated[int, Field(ge=1)] = 2
+    """Number of critics. The target uses the smallest of their values."""
+    learning_rate: Annotated[float, Field(gt=0)] = 3e-4
+    """Learning rate of Adam, for all networks."""
+    batch_size: Annotated[int, Field(ge=1)] = 256
+    """Transitions in one update."""
+    gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
+    """Discount factor."""
+    tau: Annotated[float, Field(gt=0, le=1)] = 0.005
+    """Fraction of the way that the target networks move towards the online networks at a time."""
+    warmup: Annotated[int, Field(ge=0)] = 10_000
+    """Environment steps with uniformly random actions before the first update."""
+
+
+def run_defaults(env: EnvSpec, environments: int) -> dict[str, Any]:
+    """Return the default run settings."""
+    return {"environments": environments or 1, "rollout_steps": 50, "evaluate_every": 5000, "capacity": 1_000_000}

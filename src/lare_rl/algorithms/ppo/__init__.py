@@ -1,0 +1,105 @@
+"""PPO and IPPO: hyperparameters, default run settings and registration. The update is in `ppo.py`."""
+
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, register_algorithm
+from lare_rl.envs.interface import EnvSpec
+
+__all__ = ["PPOSettings"]
+
+
+class PPOSettings(AlgorithmSettings):
+    """Hyperparameters of PPO."""
+
+    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (64, 64)
+    """Widths of the hidden layers of actor and critic."""
+    learning_rate: Annotated[float, Field(gt=0)] = 3e-4
+    """Learning rate of Adam, for actor and critic."""
+    gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
+    """Discount factor."""
+    gae_lambda: Annotated[float, Field(ge=0, le=1)] = 0.95
+    """Lambda of the generalised advantage estimates: 0 relies on the critic, 1 on the rewards."""
+    epochs: Annotated[int, Field(ge=1)] = 10
+    """Number of passes over the rollout in one update."""
+    minibatch_size: Annotated[int, Field(ge=1)] = 64
+    """Steps in one gradient step; a step of each agent counts by itself."""
+    clip: Annotated[float, Field(gt=0)] = 0.2
+    """How far the probability ratio may move from 1."""
+    value_clip: Annotated[float, Field(gt=0)] = 0.5
+    """How far the value may move in one update, in standard deviations of the return."""
+    value_coef: Annotated[float, Field(ge=0)] = 0.5
+    """Coefficient of the value loss."""
+    entropy_coef: Annotated[float, Field(ge=0)] = 0.0
+    """Coefficient of the entropy bonus."""
+    huber_delta: Annotated[float, Field(gt=0)] = 10.0
+    """Error at which the value loss turns from quadratic to linear, in standard deviations of the return."""
+    max_grad_norm: Annotated[float, Field(gt=0)] = 0.5
+    """Largest norm of the gradient of actor and critic together; a larger gradient is scaled down to it."""
+    anneal: bool = False
+    """Let learning rate and clip fall linearly to 0 over the run."""
+    normalise_observations: bool = False
+    """Normalise the networks' observations by their running mean and standard deviation."""
+
+
+def _ppo_defaults(env: EnvSpec, environments: int) -> dict[str, Any]:
+    environments = environments or 1
+    return {
+        "environments": environments,
+        "rollout_steps": max(1, 2000 // environments),
+        "fit_updates": 500,
+        "evaluate_iterations": 5,
+        "capacity": 1_000_000,
+    }
+
+
+def _ippo_defaults(env: EnvSpec, environments: int) -> dict[str, Any]:
+    # In JAX, as published for particle tasks: 82 episodes of 25 steps between two updates.
+    environments = environments or (82 if env.is_jax else 1)
+    return {
+        "environments": environments,
+        "rollout_steps": env.max_steps if env.fixed_length else max(1, (2050 if env.is_jax else 2000) // environments),
+        "fit_every": 10,
+        "fit_updates": 50,
+        "first_fit": "held-out",
+        "steps_iterations": 1000,
+        "evaluate_iterations": 10,
+        "evaluation_episodes": 50 if env.is_jax else 10,
+        "capacity": 15_000 * (env.max_steps + 1),
+    }
+
+
+register_algorithm(
+    Algorithm(
+        name="ppo",
+        consumes=Consumes.ROLLOUTS,
+        settings=PPOSettings(hidden=(256, 256), entropy_coef=0.01, anneal=True, normalise_observations=True),
+        module="lare_rl.algorithms.ppo.ppo",
+        run_defaults=_ppo_defaults,
+        summary="clipped policy steps on the newest rollout; observations are normalised",
+        source="Schulman et al., 2017; a Gaussian takes the place of LaRe's Beta policy",
+    )
+)
+register_algorithm(
+    Algorithm(
+        name="ippo",
+        consumes=Consumes.ROLLOUTS,
+        settings=PPOSettings(
+            learning_rate=1e-4,
+            gamma=1.0,
+            minibatch_size=128,
+            clip=0.5,
+            entropy_coef=0.01,
+            max_grad_norm=10.0,
+            anneal=True,
+        ),
+        module="lare_rl.algorithms.ppo.ppo",
+        run_defaults=_ippo_defaults,
+        summary="ppo for every agent, with one actor and one critic for all",
+        source="de Witt et al., 2020; hyperparameters of LaRe",
+        single_agent=False,
+        multi_agent=True,
+        multi_team=True,
+    )
+)

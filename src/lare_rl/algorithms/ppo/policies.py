@@ -1,0 +1,75 @@
+"""Stochastic policies: Gaussian for continuous actions, categorical over the available choices for discrete ones."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from lare_rl.nn.networks import MLP
+
+__all__ = ["UNAVAILABLE_LOGIT", "Available", "StochasticPolicy"]
+
+Available = Bool[Array, "*batch action"] | None
+"""Which choices are available. None: all of them, or the actions are continuous."""
+
+UNAVAILABLE_LOGIT = -1e9
+
+
+class StochasticPolicy(eqx.Module):
+    """A Gaussian whose standard deviation does not depend on the state or, if `log_std` is None, a categorical distribution.
+
+    A choice is a one-hot row, so that every action is a row of numbers. Observations are already normalised, if they are at all.
+    """
+
+    network: MLP
+    log_std: Float[Array, "*stack action"] | None
+
+    def logits(
+        self, observation: Float[Array, "*batch observation"], available: Available
+    ) -> Float[Array, "*batch action"]:
+        """Return the logit of each choice. That of an unavailable choice is so low that its probability is 0."""
+        logits = self.network(observation)
+        return logits if available is None else jnp.where(available, logits, UNAVAILABLE_LOGIT)
+
+    def log_probability(
+        self,
+        observation: Float[Array, "*batch observation"],
+        action: Float[Array, "*batch action"],
+        available: Available = None,
+    ) -> Float[Array, "*batch"]:
+        """Return log pi(a | s)."""
+        if self.log_std is None:
+            return jnp.sum(action * jax.nn.log_softmax(self.logits(observation, available)), axis=-1)
+        z = (action - self.network(observation)) * jnp.exp(-self.log_std)
+        return jnp.sum(-0.5 * z**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
+
+    def entropy(
+        self, observation: Float[Array, "*batch observation"], available: Available = None
+    ) -> Float[Array, "*batch"]:
+        """Return the entropy, -E log pi(a | s)."""
+        if self.log_std is None:
+            log_pi = jax.nn.log_softmax(self.logits(observation, available))
+            return -jnp.sum(jnp.exp(log_pi) * log_pi, axis=-1)
+        entropy = self.log_std + 0.5 * jnp.log(2 * jnp.pi * jnp.e)
+        return jnp.broadcast_to(jnp.sum(entropy, axis=-1), observation.shape[:-1])
+
+    def sample(
+        self,
+        observation: Float[Array, "*batch observation"],
+        noise: Float[Array, "*batch action"],
+        available: Available = None,
+    ) -> Float[Array, "*batch action"]:
+        """Return the action for this noise: standard normal or, for choices, Gumbel (the largest logit plus noise is chosen)."""
+        if self.log_std is None:
+            logits = self.logits(observation, available)
+            return jax.nn.one_hot(jnp.argmax(logits + noise, axis=-1), logits.shape[-1])
+        return self.network(observation) + jnp.exp(self.log_std) * noise
+
+    def mode(
+        self, observation: Float[Array, "*batch observation"], available: Available = None
+    ) -> Float[Array, "*batch action"]:
+        """Return the likeliest action."""
+        if self.log_std is None:
+            logits = self.logits(observation, available)
+            return jax.nn.one_hot(jnp.argmax(logits, axis=-1), logits.shape[-1])
+        return self.network(observation)

@@ -1,0 +1,109 @@
+"""The registry of reinforcement learning algorithms, built-in ones and plugins.
+
+An algorithm is one package or one file: its settings, its update, and a call of `register_algorithm`. It does not know which
+method computed its rewards. `Algorithm.module` names the module of its functions, which is imported when the algorithm is first
+used: listing the algorithms does not import JAX. The training loop calls these functions:
+
+    TRANSITIONS    init, get_actor, act, explore, update     as in `td3/td3.py`; the settings derive from `OffPolicySettings`
+    ROLLOUTS       init, get_actor, act, explore, update     as in `ppo/ppo.py`
+    SEQUENCES      init, get_actor, act, init_memory, epsilon, update     as in `qmix/qmix.py`; the settings derive from `QMIXSettings`
+
+`lare-rl export` needs a function `policy_graph(observation, actor, config)` if the actor is of a type of its own.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from importlib import import_module
+from typing import Any
+
+from lare_rl.envs.interface import EnvSpec
+from lare_rl.errors import CheckedModel
+from lare_rl.util.plugins import Registry
+
+__all__ = ["ALGORITHMS", "Algorithm", "AlgorithmSettings", "Consumes", "Noise", "register_algorithm"]
+
+
+class AlgorithmSettings(CheckedModel):
+    """The base class of an algorithm's hyperparameters."""
+
+
+class Consumes(StrEnum):
+    """The data that an update of an algorithm reads."""
+
+    TRANSITIONS = "transitions"
+    """Single steps from a replay of past steps."""
+    ROLLOUTS = "rollouts"
+    """The newest steps, collected by the newest policy."""
+    SEQUENCES = "sequences"
+    """Whole episodes from a replay."""
+
+
+class Noise(StrEnum):
+    """The distribution of the exploration noise: independent numbers, one for each entry of an action."""
+
+    NORMAL = "normal"
+    GUMBEL = "gumbel"
+    """The choice with the largest logit plus noise is a sample from the softmax."""
+    UNIFORM = "uniform"
+    """In [0, 1), with one more number for each agent: whether it explores."""
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """A name with its hyperparameters, and what the algorithm can do.
+
+    Several names may share a module and differ only in their hyperparameters: `ddpg` is TD3 with one critic and without delay.
+    """
+
+    name: str
+    consumes: Consumes
+    settings: AlgorithmSettings
+    """The published hyperparameters."""
+    module: str
+    """The module with the functions that the training loop calls (see above)."""
+    run_defaults: Callable[[EnvSpec, int], dict[str, Any]]
+    """Return default settings of a run, from an environment and the requested number of its copies (0: not requested). They have the
+    names of `Settings`; `steps_iterations` and `evaluate_iterations` count iterations, and `credit` holds changes."""
+    summary: str
+    source: str
+    continuous: bool = True
+    """Whether it supports continuous actions."""
+    discrete: bool = True
+    """Whether it supports discrete actions."""
+    single_agent: bool = True
+    """Whether it trains a single agent."""
+    multi_agent: bool = False
+    """Whether it trains many agents."""
+    multi_team: bool = False
+    """Whether it trains several teams, each on its own rewards."""
+
+    def load(self) -> Any:
+        """Import and return the module of its functions."""
+        return import_module(self.module)
+
+    def noise(self, discrete: bool) -> Noise:
+        """Return the distribution of the exploration noise for continuous or discrete actions."""
+        if self.consumes is Consumes.SEQUENCES:
+            return Noise.UNIFORM
+        return Noise.GUMBEL if discrete else Noise.NORMAL
+
+    def greedy(self, discrete: bool) -> bool:
+        """Return whether a policy acts without noise outside training.
+
+        A policy over choices is trained as a distribution. Until it is nearly deterministic, always taking its most likely choice
+        can earn far less than sampling.
+        """
+        return self.consumes is not Consumes.ROLLOUTS or not (discrete or self.multi_agent)
+
+
+ALGORITHMS = Registry[Algorithm]("algorithm")
+
+
+def register_algorithm(algorithm: Algorithm) -> None:
+    """Add an algorithm. Its name then works in `Settings(algorithm=...)` and on the command line.
+
+    Raises:
+        LareError: another algorithm has this name.
+    """
+    ALGORITHMS.register(algorithm.name, algorithm)

@@ -1,0 +1,166 @@
+"""SAC: soft actor-critic with a learned temperature (Haarnoja et al., "Soft actor-critic algorithms and applications", 2018).
+
+    a', a ~ pi(. | s'), pi(. | s)
+    y     = r + gamma * (1 - terminated) * (min_i Q'_i(s', a') - alpha log pi(a' | s'))
+    Q_i  <- descend mean (Q_i(s, a_replay) - y)^2                       Eq. 5, 6
+    pi   <- descend mean (alpha log pi(a | s) - min_i Q_i(s, a))        Eq. 9
+    alpha <- descend -alpha mean (log pi(a | s) + H),  H = -dim(A)      Eq. 18
+    Q'   <- (1 - tau) Q' + tau Q                                        every target_every-th update
+
+The policy is a normal distribution squashed by a tanh, pi = tanh(N(mu(s), sigma(s))), in [-1, 1].
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
+
+from lare_rl.algorithms.batches import Transitions
+from lare_rl.algorithms.critics import critic_loss, init_critics, q_values
+from lare_rl.algorithms.sac import SACSettings
+from lare_rl.nn.networks import MLP, adam_step, init_adam, polyak_update
+
+__all__ = ["SAC", "Networks", "act", "explore", "get_actor", "init", "sample", "soft_td_targets", "update"]
+
+MIN_LOG_SIGMA, MAX_LOG_SIGMA = -20.0, 2.0
+
+
+class Networks(NamedTuple):
+    actor: MLP
+    """From observations to mu and log sigma of each dimension of the action."""
+    critics: MLP
+    """All critics in one pytree, stacked on a leading axis."""
+    log_temperature: Float[Array, ""]
+
+
+class SAC(NamedTuple):
+    """Everything that SAC learns."""
+
+    online: Networks
+    target: MLP
+    """The target critics."""
+    actor_optimizer: optax.OptState
+    critic_optimizer: optax.OptState
+    temperature_optimizer: optax.OptState
+
+
+def init(key: PRNGKeyArray, observation_size: int, action_size: int, settings: SACSettings) -> SAC:
+    """Return untrained networks."""
+    actor_key, critic_key = jax.random.split(key)
+    actor = MLP(observation_size, settings.hidden, 2 * action_size, key=actor_key)
+    critics = init_critics(critic_key, observation_size, action_size, settings.hidden, settings.critics)
+    online = Networks(actor, critics, jnp.log(jnp.asarray(settings.temperature)))
+    return SAC(
+        online=online,
+        # The targets are copies, because one buffer cannot be donated twice to the compiled update.
+        target=jax.tree.map(jnp.copy, critics),
+        actor_optimizer=init_adam(actor, settings.learning_rate),
+        critic_optimizer=init_adam(critics, settings.learning_rate),
+        temperature_optimizer=init_adam(online.log_temperature, settings.learning_rate),
+    )
+
+
+def get_actor(state: SAC) -> MLP:
+    """Return what is needed to act."""
+    return state.online.actor
+
+
+def _normal(
+    actor: MLP, observation: Float[Array, "*batch observation"]
+) -> tuple[Float[Array, "*batch action"], Float[Array, "*batch action"]]:
+    """Return mu and log sigma of the policy, before the tanh."""
+    mu, log_sigma = jnp.split(actor(observation), 2, axis=-1)
+    return mu, jnp.clip(log_sigma, MIN_LOG_SIGMA, MAX_LOG_SIGMA)
+
+
+def act(actor: MLP, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch action"]:
+    """Return the deterministic policy's action, tanh(mu(s))."""
+    return jnp.tanh(_normal(actor, observation)[0])
+
+
+def explore(
+    actor: MLP,
+    observation: Float[Array, "*batch observation"],
+    noise: Float[Array, "*batch action"],
+    settings: SACSettings,
+) -> Float[Array, "*batch action"]:
+    """Return an action sampled from the policy. `noise` is standard normal."""
+    mu, log_sigma = _normal(actor, observation)
+    return jnp.tanh(mu + jnp.exp(log_sigma) * noise)
+
+
+def sample(
+    actor: MLP, observation: Float[Array, "batch observation"], key: PRNGKeyArray
+) -> tuple[Float[Array, "batch action"], Float[Array, " batch"]]:
+    """Return sampled actions and their log pi: log normal density minus log slope of the tanh (appendix C, Eq. 21)."""
+    mu, log_sigma = _normal(actor, observation)
+    noise = jax.random.normal(key, mu.shape)
+    u = mu + jnp.exp(log_sigma) * noise
+    log_density = -0.5 * noise**2 - log_sigma - 0.5 * jnp.log(2 * jnp.pi)
+    # This form of log(1 - tanh(u)^2) keeps its precision for large u.
+    log_slope = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))
+    return jnp.tanh(u), jnp.sum(log_density - log_slope, axis=-1)
+
+
+def soft_td_targets(state: SAC, batch: Transitions, key: PRNGKeyArray, settings: SACSettings) -> Float[Array, " batch"]:
+    """Return y: the reward, plus the discounted smallest target value with its entropy term, at a sampled action."""
+    next_action, log_pi = sample(state.online.actor, batch.next_observation, key)
+    next_q = jnp.min(q_values(state.target, batch.next_observation, next_action), axis=0)
+    soft_value = next_q - jnp.exp(state.online.log_temperature) * log_pi
+    discount = settings.gamma * (1 - batch.terminated)
+    return batch.reward + discount * soft_value
+
+
+def update(
+    state: SAC, batch: Transitions, key: PRNGKeyArray, update_index: Int[Scalar, ""], settings: SACSettings
+) -> tuple[SAC, dict[str, Float[Array, ""]]]:
+    """Update critics, actor and temperature. Every `target_every`-th update also moves the target critics.
+
+    `update_index` counts updates from 0. It is an argument, not part of the state, so that `vmap` over seeds keeps it a single
+    value.
+    """
+    rate = settings.learning_rate
+    target_key, actor_key = jax.random.split(key)
+    alpha = jnp.exp(state.online.log_temperature)
+
+    # Fit all critics to one target.
+    target_q = soft_td_targets(state, batch, target_key, settings)
+    loss, gradient = jax.value_and_grad(critic_loss)(state.online.critics, batch, target_q)
+    critics, critic_optimizer = adam_step(state.online.critics, gradient, state.critic_optimizer, rate)
+
+    # Improve the policy by the new critics.
+    def actor_loss(actor: MLP) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        action, log_pi = sample(actor, batch.observation, actor_key)
+        q = jnp.min(q_values(critics, batch.observation, action), axis=0)
+        return jnp.mean(alpha * log_pi - q), jnp.mean(log_pi)
+
+    gradient, log_pi = jax.grad(actor_loss, has_aux=True)(state.online.actor)
+    actor, actor_optimizer = adam_step(state.online.actor, gradient, state.actor_optimizer, rate)
+
+    # Raise the temperature if the entropy, -log pi, is below -dim(A); lower it if above.
+    slope = -alpha * (log_pi - batch.action.shape[-1])
+    log_temperature, temperature_optimizer = adam_step(
+        state.online.log_temperature, slope, state.temperature_optimizer, rate
+    )
+
+    target = jax.lax.cond(
+        (update_index + 1) % settings.target_every == 0,
+        lambda target: polyak_update(target, critics, settings.tau),
+        lambda target: target,
+        state.target,
+    )
+    state = SAC(
+        online=Networks(actor, critics, log_temperature),
+        target=target,
+        actor_optimizer=actor_optimizer,
+        critic_optimizer=critic_optimizer,
+        temperature_optimizer=temperature_optimizer,
+    )
+    return state, {
+        "critic/loss": loss,
+        "critic/value": jnp.mean(target_q),
+        "actor/entropy": -log_pi,
+        "actor/temperature": alpha,
+    }

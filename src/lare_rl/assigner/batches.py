@@ -1,0 +1,97 @@
+"""Batches of stored episodes, for the fits of a decoder."""
+
+from collections.abc import Iterator, Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from lare_rl.assigner import compiled_functions as compiled
+from lare_rl.assigner.store import Episode, Store
+from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.engine import CreditSpec, agent_shares
+from lare_rl.credit.methods import Fit
+from lare_rl.data.layouts import Layout, lay_out_drawn, lay_out_packed, lay_out_padded
+
+__all__ = ["pack_in_order", "sample_batch"]
+
+
+def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, longest: int) -> CreditBatch:
+    """Draw the steps of one gradient update, from episodes that are drawn uniformly with replacement.
+
+    Args:
+        store: a store with at least one episode.
+        spec: what is fitted.
+        random: the generator of random numbers.
+        longest: the largest number of steps of an episode. Batches with the same value have the same shape.
+    """
+    settings, fit = spec.settings, spec.method.fit
+    assert fit is not None
+    if fit is Fit.DECODER_LOSS:
+        episodes = _sample_episodes(store, settings.episodes, random)
+        return _gather(store, episodes, lay_out_padded(_lengths(episodes), longest), len(episodes))
+    if fit.samples_steps:
+        episodes = _sample_episodes(store, max(1, settings.steps // settings.drawn_steps), random)
+        length = _lengths(episodes)
+        key = jax.random.key(int(random.integers(2**31)))
+        number = np.asarray(compiled.draw_step_numbers(key, length.astype(np.int32), steps=settings.drawn_steps))
+        return _gather(store, episodes, lay_out_drawn(length, number), len(episodes))
+    mean_length = max(1, store.ended_steps // store.ended)
+    n_slots = max(1, settings.steps // 2)
+    episodes = _sample_episodes(store, max(1, settings.steps // mean_length), random)[:n_slots]
+    return _pack(store, episodes, n_slots, max(settings.steps, longest))
+
+
+def pack_in_order(store: Store, episodes: Sequence[Episode], n_slots: int, rows: int) -> Iterator[CreditBatch]:
+    """Yield whole episodes in their order, in batches of at most `n_slots` episodes in `rows` rows."""
+    start = 0
+    while start < len(episodes):
+        end, n_steps = start, 0
+        while end < len(episodes) and end - start < n_slots and n_steps + len(episodes[end].steps) <= rows:
+            n_steps += len(episodes[end].steps)
+            end += 1
+        yield _pack(store, episodes[start:end], n_slots, rows)
+        start = end
+
+
+def _sample_episodes(store: Store, count: int, random: np.random.Generator) -> list[Episode]:
+    return [store.episodes[store.oldest[i][1]] for i in random.integers(len(store.oldest), size=count)]
+
+
+def _lengths(episodes: Sequence[Episode]) -> Int[np.ndarray, " episodes"]:
+    return np.array([len(episode.steps) for episode in episodes])
+
+
+def _pack(store: Store, episodes: Sequence[Episode], n_slots: int, rows: int) -> CreditBatch:
+    """Put whole episodes one after the other. Those that do not fit into the rows are left out."""
+    length = _lengths(episodes)
+    layout, mask = lay_out_packed(length, np.ones(len(length)), rows)
+    episodes = episodes[: int(mask.sum())]
+    is_step = layout.slot < len(episodes)
+    return _gather(store, episodes, Layout(np.where(is_step, layout.slot, n_slots), layout.number), n_slots)
+
+
+def _gather(store: Store, episodes: Sequence[Episode], layout: Layout, n_slots: int) -> CreditBatch:
+    """Return the features of the steps of a layout, with the returns of their episodes.
+
+    Args:
+        store: the store.
+        episodes: the episodes of the batch.
+        layout: the step of each row, with an axis of episodes or without. Padding reads some stored step.
+        n_slots: the number of episodes that the arrays have, at least as many as there are.
+    """
+    count = len(episodes)
+    first = np.cumsum(_lengths(episodes)) - _lengths(episodes)
+    slot = np.arange(count)[:, None] if layout.slot.ndim > 1 else np.minimum(layout.slot, count - 1)
+    steps = np.concatenate([episode.steps for episode in episodes])[first[slot] + layout.number].ravel()
+    rows = steps % store.capacity
+    length, score = np.ones(n_slots, np.int32), np.zeros(n_slots)
+    length[:count], score[:count] = _lengths(episodes), [episode.score for episode in episodes]
+    return CreditBatch(
+        features=store.features[rows],  # pyright: ignore[reportArgumentType]
+        episode_index=layout.slot.ravel().astype(np.int32),
+        length=length,  # pyright: ignore[reportArgumentType]
+        mean_reward=(score / length).astype(np.float32),  # pyright: ignore[reportArgumentType]
+        mask=(np.arange(n_slots) < count).astype(np.float32),  # pyright: ignore[reportArgumentType]
+        share=None if store.alive is None else agent_shares(store.alive[rows]),
+    )

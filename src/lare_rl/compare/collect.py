@@ -1,0 +1,105 @@
+"""Collects the results of a comparison from run directories and tables, and finds what is wrong with them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from lare_rl.compare.labels import find_differences, find_origin_differences, label_runs
+from lare_rl.compare.results import Results, read_results_table, read_run_results
+from lare_rl.errors import LareError, did_you_mean
+from lare_rl.runs.directory import Run, open_without_functions
+from lare_rl.runs.discover import find_run_directories
+from lare_rl.runs.metric_names import RETURN, SUMMED_RETURN
+from lare_rl.training.advice import describe_untrained
+from lare_rl.util.findings import Finding
+
+__all__ = ["collect_results", "select_runs"]
+
+
+def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[Results], list[Finding]]:
+    """Read the results in run directories and tables (.csv), and find what the user should know about them.
+
+    The first label is the baseline. Runs come before tables, unless the first path is a table: its first method is the baseline.
+
+    Raises:
+        LareError: there is nothing to compare, or a table cannot be read.
+    """
+    tables = [path for path in paths if path.suffix == ".csv"]
+    directories = [path for path in paths if path not in tables]
+    runs, findings = [], []
+    if directories or not tables:
+        runs, findings = select_runs(
+            [open_without_functions(path) for path in find_run_directories(directories)], metric
+        )
+    run_results = read_run_results(label_runs(runs), metric)
+    table_results = [result for path in tables for result in read_results_table(path, metric)]
+    if run_results:
+        findings += _find_other_tasks(run_results, table_results)
+        tasks = {result.task for result in run_results}
+        table_results = [result for result in table_results if result.task in tasks]
+        findings += _find_other_steps(run_results, table_results, metric)
+    results = run_results + table_results
+    if (
+        paths
+        and paths[0] in tables
+        and (first := [result.label for result in table_results if result.source == paths[0]])
+    ):
+        results.sort(key=lambda result: result.label != first[0])
+    several = len({result.label for result in results}) > 1
+    if differences := (find_differences(runs) if several else []) + find_origin_differences(runs):
+        findings.append(Finding("differ", {"differences": tuple(differences)}))
+    return results, findings
+
+
+def select_runs(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], list[Finding]]:
+    """Select the runs that have a metric, and find runs that were not trained to their end.
+
+    Raises:
+        LareError: no run has an evaluation, or none has a value of the metric.
+    """
+    selected, without_metric, findings, names = [], [], [], set()
+    for run in runs:
+        lines, steps = run.metrics(), run.config.settings.steps
+        if not lines:
+            findings.append(Finding("no_evaluation", {"run": run.directory}))
+            continue
+        names |= {name for line in lines for name in line}
+        (selected if any(line.get(metric) is not None for line in lines) else without_metric).append(run)
+        if (step := lines[-1]["step"]) < steps:
+            findings.append(Finding("unfinished", {"run": run.directory, "step": step, "steps": steps}))
+        if reason := describe_untrained(run):
+            findings.append(Finding("untrained", {"run": run.directory, "reason": reason}))
+    if not selected:
+        if not without_metric:
+            raise LareError(f"{', '.join(str(run.directory) for run in runs)}: no run has an evaluation yet")
+        if metric in names:
+            raise LareError(f"no run has a value of {metric} yet: it is null in all evaluations")
+        metrics = sorted(names - {"step", "seed"})
+        raise LareError(
+            f"no run has the metric {metric!r}{did_you_mean(metric, metrics)}; they have {', '.join(metrics)}"
+        )
+    findings += [Finding("no_metric", {"run": run.directory, "metric": metric}) for run in without_metric]
+    if metric == RETURN and SUMMED_RETURN in names:
+        findings.append(Finding("mean_over_agents", {"metric": SUMMED_RETURN}))
+    return selected, findings
+
+
+def _find_other_tasks(run_results: Sequence[Results], table_results: Sequence[Results]) -> list[Finding]:
+    """Return the tasks of tables that no run has."""
+    tasks = tuple(sorted({result.task for result in run_results}))
+    unknown = dict.fromkeys((result.source, result.task) for result in table_results if result.task not in tasks)
+    return [Finding("other_task", {"source": source, "task": task, "tasks": tasks}) for source, task in unknown]
+
+
+def _find_other_steps(run_results: Sequence[Results], table_results: Sequence[Results], metric: str) -> list[Finding]:
+    """Return the methods of tables that lack the last step of the runs."""
+    last_steps: dict[str, int] = {}  # of the shortest run on each task
+    for result in run_results:
+        last_step = max(step for curve in result.curves.values() for step in curve)
+        last_steps[result.task] = min(last_step, last_steps.get(result.task, last_step))
+    findings = []
+    for result in table_results:
+        step = last_steps[result.task]
+        if any(step not in curve for curve in result.curves.values()):
+            values = {"source": result.source, "metric": metric, "label": result.label, "step": step}
+            findings.append(Finding("other_steps", values))
+    return findings

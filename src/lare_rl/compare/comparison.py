@@ -1,0 +1,214 @@
+"""The statistics of a comparison, which stay honest for few runs.
+
+Intervals have 95%, by stratified bootstrap over the seeds (`bootstrap.py`). A method that was trained on several draws of the
+language model has a second interval, over the draws. The score of a draw is the mean over its seeds.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lare_rl.compare.bootstrap import (
+    Estimate,
+    OtherScores,
+    Scores,
+    bootstrap,
+    bootstrap_band,
+    interquartile_means,
+    probability_of_improvement,
+)
+from lare_rl.compare.mann_whitney import mann_whitney
+from lare_rl.compare.results import Results
+from lare_rl.compare.scores import Group, group_results
+from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
+from lare_rl.runs.metric_names import RETURN
+from lare_rl.util.statistics import Band, sample_std
+
+__all__ = ["Comparison", "OverallRow", "Row", "compare", "compare_over_tasks", "compare_tasks"]
+
+MAX_SPLITS = 20_000
+"""The exact test needs all ways to split the runs into two groups: 12,870 for two groups of 8 seeds. Beyond this limit, the interval
+says enough."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method, over all tasks."""
+
+    label: str
+    n_seeds: int
+    n_draws: int
+    iqm: Estimate
+    """Interquartile mean, its interval over the seeds."""
+    mean: float
+    std: float | None
+    """Standard deviation over the seeds of their means over the tasks; None for a single seed."""
+    draw_mean: Estimate | None
+    """The mean, its interval over the draws; None for a single draw."""
+    difference: Estimate | None
+    """The interquartile mean minus that of the baseline; None for the baseline and for single seeds."""
+    improvement: Estimate | None
+    """Probability that a run scores more than a run of the baseline; None like `difference`."""
+    p_value: float | None
+    """Probability that chance wins as many pairs of runs or, if fewer than half were won, loses as many (`mann_whitney`).
+
+    None like `difference`, and for more than `MAX_SPLITS` ways to split the runs.
+    """
+
+
+@dataclass(frozen=True)
+class OverallRow:
+    """One method compared with the baseline over tasks whose scores have no common scale."""
+
+    label: str
+    n_seeds: int
+    improvement: Estimate | None
+    """As in `Row`."""
+    p_value: float | None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The statistics of some methods, of which the first one is the baseline."""
+
+    rows: tuple[Row, ...]
+    curves: Mapping[str, Band]
+    """Interquartile mean by step, of each label."""
+    profiles: Mapping[str, Band]
+    """Share of runs that score more than x, of each label."""
+    groups: Mapping[str, Group]
+    """The scores, by label."""
+    metric: str
+    step: int | None
+    """The step at which runs are compared; None for the last one that all runs have."""
+    late: bool
+    """Whether scores are means over the last quarter of the steps."""
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The names of the tasks."""
+        return self.groups[self.rows[0].label].tasks
+
+    @property
+    def normalised(self) -> bool:
+        """Whether scores are scaled, because there are several tasks."""
+        return len(self.tasks) > 1
+
+    @property
+    def last_step(self) -> int:
+        """The step at which runs are compared."""
+        return self.groups[self.rows[0].label].steps[-1]
+
+
+def compare(
+    results: Sequence[Results], metric: str = RETURN, step: int | None = None, late: bool = False
+) -> Comparison:
+    """Compare results by their labels, of which the first one is the baseline.
+
+    Args:
+        results: for each label, the same tasks, seeds and draws.
+        metric: the metric of the results.
+        step, late: what a score is (`group_results`).
+
+    Raises:
+        LareError: some results are missing, or rliable is not installed.
+    """
+    groups = group_results(results, metric, step, late)
+    final = {group.label: group.final_scores.mean(axis=0) for group in groups}
+    baseline = final[groups[0].label]
+    steps = np.array(groups[0].steps, float)
+    thresholds = np.linspace(min(map(np.min, final.values())), max(map(np.max, final.values())), 101)
+
+    def shares_above(scores: Scores) -> np.ndarray:
+        return np.mean(scores[..., None] > thresholds, axis=(0, 1))
+
+    return Comparison(
+        rows=tuple(_make_row(group, None if group is groups[0] else baseline) for group in groups),
+        curves={group.label: bootstrap_band(steps, group.scores.mean(axis=0), interquartile_means) for group in groups},
+        profiles={label: bootstrap_band(thresholds, scores, shares_above) for label, scores in final.items()},
+        groups={group.label: group for group in groups},
+        metric=metric,
+        step=step,
+        late=late,
+    )
+
+
+def compare_tasks(
+    results: Sequence[Results], metric: str = RETURN, step: int | None = None, late: bool = False
+) -> list[Comparison]:
+    """Compare all tasks together, or each task alone if their scores have no common scale."""
+    tasks = sorted({result.task for result in results})
+    if len(tasks) == 1 or (metric == RETURN and all(task in REFERENCE_RETURNS for task in tasks)):
+        return [compare(results, metric, step, late)]
+    return [compare([result for result in results if result.task == task], metric, step, late) for task in tasks]
+
+
+def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
+    """Compare methods with the baseline over the tasks of several comparisons.
+
+    Runs are compared with runs on the same task by their order alone, so the tasks need no common scale. Each task has the same
+    weight. The methods are those that are on every task, with equally many seeds. Without two of them, or if the comparisons have
+    different baselines, there are no rows.
+    """
+    if len(comparisons) < 2:
+        return []
+    final: dict[str, Scores] = {}
+    for label in comparisons[0].groups:
+        groups = [comparison.groups[label] for comparison in comparisons if label in comparison.groups]
+        if len(groups) == len(comparisons) and len({len(group.seeds) for group in groups}) == 1:
+            final[label] = np.concatenate([group.final_scores.mean(axis=0) for group in groups], axis=1)
+    baselines = {comparison.rows[0].label for comparison in comparisons}
+    if len(baselines) > 1 or not final.keys() > baselines:
+        return []
+    (baseline,) = baselines
+    rows = []
+    for label, scores in final.items():
+        improvement, p_value = (None, None) if label == baseline else _improvement(scores, final[baseline])
+        rows.append(OverallRow(label=label, n_seeds=len(scores), improvement=improvement, p_value=p_value))
+    return rows
+
+
+def _make_row(group: Group, baseline: Scores | None) -> Row:
+    scores = group.final_scores.mean(axis=0)
+    seed_means = scores.mean(axis=1)
+    (iqm,) = bootstrap(scores[..., None], interquartile_means)
+    draw_mean = difference = improvement = p_value = None
+    if len(group.draws) > 1:
+        (draw_mean,) = bootstrap(group.final_scores.mean(axis=1), lambda draws: np.array([np.mean(draws)]))
+    if baseline is not None:
+        difference = _iqm_difference(scores, baseline)
+        improvement, p_value = _improvement(scores, baseline)
+    return Row(
+        label=group.label,
+        n_seeds=len(group.seeds),
+        n_draws=len(group.draws),
+        iqm=iqm,
+        mean=float(np.mean(seed_means)),
+        std=sample_std(seed_means) if len(seed_means) > 1 else None,
+        draw_mean=draw_mean,
+        difference=difference,
+        improvement=improvement,
+        p_value=p_value,
+    )
+
+
+def _iqm_difference(scores: Scores, baseline: OtherScores) -> Estimate | None:
+    """Return the difference of two interquartile means, or None for single seeds."""
+    if min(len(scores), len(baseline)) < 2:
+        return None
+    (difference,) = bootstrap(
+        (scores, baseline), lambda a, b: interquartile_means(a[..., None]) - interquartile_means(b[..., None])
+    )
+    return difference
+
+
+def _improvement(scores: Scores, baseline: OtherScores) -> tuple[Estimate | None, float | None]:
+    """Return `Row.improvement` and `Row.p_value`."""
+    if min(len(scores), len(baseline)) < 2:
+        return None, None
+    (improvement,) = bootstrap((scores, baseline), lambda a, b: np.array([probability_of_improvement(a, b)]))
+    if math.comb(len(scores) + len(baseline), len(scores)) > MAX_SPLITS:
+        return improvement, None
+    return improvement, min(mann_whitney(list(zip(scores.T, baseline.T, strict=True))))

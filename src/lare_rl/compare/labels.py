@@ -1,0 +1,152 @@
+"""The rows of a comparison: which runs belong to one label, and in what the runs of different labels differ."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
+from typing import Any
+
+from lare_rl.compare.results import group_pairs
+from lare_rl.config.effective import effective_settings
+from lare_rl.credit.methods import find_method
+from lare_rl.runs.config_file import Config
+from lare_rl.runs.directory import Run
+
+__all__ = ["Difference", "find_differences", "find_origin_differences", "label_runs"]
+
+IGNORED_SETTINGS = {"seed", "seeds", "draw", "steps", "evaluate_every", "evaluation_episodes"}
+"""Settings that do not distinguish methods."""
+
+ORIGINS: Mapping[str, Callable[[Config], str]] = {
+    "version of LaRe": lambda config: config.lare,
+    "version of JAX": lambda config: config.versions["jax"],
+    "machine": lambda config: config.machine,
+}
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Something in which runs differ, such as a setting."""
+
+    name: str
+    methods: Mapping[str, tuple[str, ...]]
+    """The methods by value."""
+
+    def __str__(self) -> str:
+        values = "; ".join(f"{value}: {', '.join(methods)}" for value, methods in self.methods.items())
+        return f"{self.name} ({values})"
+
+
+def label_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Group runs by label.
+
+    The label is the method, the algorithm if a task has several, and the settings in which runs of a method differ on a task.
+    Runs with equal labels are distinguished by their functions and, if two of them have a seed in common, by their directories.
+    """
+    settings = [_effective_settings(run) for run in runs]
+    values_by_setting = group_pairs(
+        ((run.config.task.name, name, values["method"], values["algorithm"]), str(values[name]))
+        for run, values in zip(runs, settings, strict=True)
+        for name in values.keys() - _ignored_settings(values)
+    )
+    distinguishing = {key[1:] for key, group in values_by_setting.items() if len(set(group)) > 1}
+    algorithms = {(run.config.task.name, values["algorithm"]) for run, values in zip(runs, settings, strict=True)}
+    several_algorithms = len(algorithms) > len({task for task, _ in algorithms})
+
+    def label(values: Mapping[str, Any]) -> str:
+        method, algorithm = values["method"], values["algorithm"]
+        names = [name for name in values if (name, method, algorithm) in distinguishing]
+        return ", ".join(
+            [method, *([algorithm] if several_algorithms else []), *(f"{name} {values[name]}" for name in names)]
+        )
+
+    groups = group_pairs((label(values), run) for run, values in zip(runs, settings, strict=True))
+    for split in (_split_by_function, _split_by_directory):
+        groups = {name: members for label, group in groups.items() for name, members in split(label, group).items()}
+    return groups
+
+
+def find_differences(runs: Sequence[Run]) -> list[Difference]:
+    """Return the settings, apart from the method, in which runs of one algorithm differ, and differences of latent functions."""
+    by_setting = group_pairs(
+        (name, (str(settings[name]), settings["method"]))
+        for settings, other in permutations(map(_effective_settings, runs), 2)
+        if settings["algorithm"] == other["algorithm"]
+        for name in settings.keys() & other.keys() - _ignored_settings(settings) - {"method"}
+        if settings[name] != other[name]
+    )
+    differences = [_make_difference(name, pairs) for name, pairs in sorted(by_setting.items())]
+    return differences + _find_function_differences(runs)
+
+
+def find_origin_differences(runs: Sequence[Run]) -> list[Difference]:
+    """Return the versions and machines, if runs were trained by several."""
+    differences = (
+        _make_difference(name, ((get_value(run.config), run.config.settings.method) for run in runs))
+        for name, get_value in ORIGINS.items()
+    )
+    return [difference for difference in differences if len(difference.methods) > 1]
+
+
+def _effective_settings(run: Run) -> dict[str, Any]:
+    return effective_settings(run.config.settings, run.config.task)
+
+
+def _ignored_settings(settings: Mapping[str, Any]) -> set[str]:
+    """Return the settings that do not distinguish methods. The number of steps does if step sizes are annealed over it."""
+    return IGNORED_SETTINGS - {"steps"} if settings.get(f"{settings['algorithm']}.anneal") else IGNORED_SETTINGS
+
+
+def _make_difference(name: str, pairs: Iterable[tuple[str, str]]) -> Difference:
+    """Return a difference from pairs of value and method."""
+    methods = {value: tuple(dict.fromkeys(group)) for value, group in group_pairs(pairs).items()}
+    return Difference(name, methods)
+
+
+def _function_name(run: Run) -> str:
+    return " ".join(digest[:8] for digest in run.config.function_sha256)
+
+
+def _find_function_differences(runs: Sequence[Run]) -> list[Difference]:
+    """Return the tasks on which methods were trained with different latent functions of one kind and draw."""
+    by_place = group_pairs(
+        (
+            (run.config.task.name, method.phi_kind, settings.draw, settings.candidates),
+            (_function_name(run), method.name),
+        )
+        for run, settings, method in (
+            (run, run.config.settings, find_method(run.config.settings.method)) for run in runs
+        )
+        if method.needs_phi
+    )
+    differences = (_make_difference(f"phi on {task}", pairs) for (task, *_), pairs in by_place.items())
+    return [difference for difference in differences if len(set(difference.methods.values())) > 1]
+
+
+def _split_by_function(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Split runs with equal settings by their latent functions, unless these differ only from draw to draw."""
+    draws = [(run.config.task.name, run.config.settings.draw) for run in runs]
+    functions = {(draw, run.config.function_sha256) for draw, run in zip(draws, runs, strict=True)}
+    if len(functions) == len(set(draws)):
+        return {label: list(runs)}
+    return group_pairs((f"{label}, phi {_function_name(run)}", run) for run in runs)
+
+
+def _split_by_directory(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Split runs with equal settings and functions if two of them have the same task, draw and seed: the method was trained twice.
+
+    The labels end in the part of the path in which these two differ.
+    """
+    paths = [run.directory.resolve().parts for run in runs]
+    seeds = [
+        {(run.config.task.name, run.config.settings.draw, seed) for seed in run.config.settings.all_seeds}
+        for run in runs
+    ]
+    depths = [
+        next((depth for depth, names in enumerate(zip(*pair, strict=False)) if names[0] != names[1]), None)
+        for pair, (first, second) in zip(combinations(paths, 2), combinations(seeds, 2), strict=True)
+        if first & second
+    ]
+    if not depths or None in depths:
+        return {label: list(runs)}
+    depth = min(depth for depth in depths if depth is not None)
+    return group_pairs((f"{label}, {path[depth]}", run) for run, path in zip(runs, paths, strict=True))

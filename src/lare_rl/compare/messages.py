@@ -1,0 +1,105 @@
+"""What a comparison says in sentences: their templates, and the rules that choose them."""
+
+import math
+from collections.abc import Iterable, Iterator
+
+from lare_rl.compare.comparison import Comparison
+from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
+from lare_rl.runs.metric_names import RETURN
+from lare_rl.util.findings import Finding, render
+
+__all__ = ["MESSAGES", "find_min_p", "find_score_meaning", "find_small_samples", "to_text"]
+
+MIN_CERTAIN_P = 0.025
+"""If p cannot be lower than this, the reader is told."""
+
+MESSAGES = {
+    # Runs and tables (`collect.py`).
+    "no_evaluation": "{run} has no evaluation yet, and is left out.",
+    "no_metric": "{run} has no {metric}, and is left out.",
+    "unfinished": "{run} has only reached step {step:,} of {steps:,}: no run is compared at a later step.",
+    "untrained": "{run}: {reason}",
+    "mean_over_agents": "Returns are means over the agents. --metric {metric} compares their sums.",
+    "other_task": "{source} has the task {task}, which is left out, because the runs have {tasks}.",
+    "other_steps": "{source} has no {metric} of {label} at step {step:,} for every seed: no run is compared there.",
+    "differ": "The runs differ in {differences}.",
+    "origin": "Runs: {facts}.",
+    "lare_version": "LaRe {value}",
+    "jax_version": "JAX {value}",
+    "machine": "{value}",
+    "evaluation_episodes": "{value} episodes in each evaluation",
+    # Scores.
+    "scores": "Scores are {metric} on {task} {when}.",
+    "scaled_scores": "Scores are {metric} {when}, scaled linearly between two fixed returns: {scales}.",
+    "scale": "{task} (0 is {random:g}, 1 is {trained:g})",
+    "true_returns": "true returns",
+    "at_step": "at step {step:,}",
+    "at_last_step": "at step {step:,}, the last at which all runs were evaluated",
+    "late": "averaged over the evaluations after three quarters of {step:,} steps",
+    # Few runs.
+    "few_seeds": "The bootstrap's interval of {count} seeds can only be their range, which contains the true median in "
+    "{coverage:.0%} of cases, not in 95%.",
+    "few_draws": "The bootstrap's interval of {count} draws can only be their range, which contains the true median in "
+    "{coverage:.0%} of cases, not in 95%.",
+    "few_over_tasks": "Intervals of two or three seeds, or draws, are too narrow: they contain the true median in less than 95% of "
+    "cases.",
+    "min_p": "With these few runs, p is at least {p:.2g}.",
+    # Legends.
+    "columns": "IQM: interquartile mean over seeds and tasks; of fewer than four scores it is the mean. sd: standard deviation over "
+    "the seeds (n - 1). Minus baseline: the IQM minus that of the baseline, the first method; its interval is too narrow for two or "
+    "three seeds. Above baseline: the probability that a run scores more than a run of the baseline; without an interval if it is 0 "
+    "or 1 on every task. Neither is computed for a single seed. If the score is an error or a loss, a low probability is good. p: "
+    "the probability that chance wins at least as many pairs of runs or, if fewer than half were won, loses at least as many (exact "
+    "Mann-Whitney test; one-sided: a two-sided p is twice as large). If a method has several draws of the language model, the mean "
+    "over the draws of a seed counts as one run.",
+    "intervals": "Intervals: stratified bootstrap over the seeds, {repetitions} repetitions; in the column with draws, over the draws "
+    "of the language model.",
+    "curves": "Lines: IQM over the seeds. Bands: its 95% intervals.",
+    "over_tasks": "All tasks: each run is compared with the runs on the same task.",
+    "no_overall_table": "There is no table over all tasks: it needs the same baseline, and another method, on every task with equally "
+    "many seeds.",
+}
+
+
+def to_text(findings: Iterable[Finding]) -> str:
+    """Return findings as one paragraph."""
+    return " ".join(render(finding, MESSAGES) for finding in findings)
+
+
+def find_score_meaning(comparison: Comparison) -> Finding:
+    """Return what the scores are, at which step."""
+    when = "late" if comparison.late else "at_step" if comparison.step else "at_last_step"
+    values = {
+        "metric": Finding("true_returns") if comparison.metric == RETURN else comparison.metric,
+        "when": Finding(when, {"step": comparison.last_step}),
+    }
+    if not comparison.normalised:
+        return Finding("scores", {**values, "task": comparison.tasks[0]})
+    scales = (Finding("scale", {"task": task, **REFERENCE_RETURNS[task]._asdict()}) for task in comparison.tasks)
+    return Finding("scaled_scores", {**values, "scales": tuple(scales)})
+
+
+def find_small_samples(comparison: Comparison) -> Iterator[Finding]:
+    """Yield which intervals are too narrow.
+
+    The bootstrap's interval of n = 2 or 3 values is their range: one sample in n^n has the lowest value n times, which is more than
+    2.5% of the samples. The range contains the median with probability 1 - 2^(1 - n).
+    """
+    counts = {
+        "few_seeds": sorted({row.n_seeds for row in comparison.rows} & {2, 3}),
+        "few_draws": sorted({row.n_draws for row in comparison.rows} & {2, 3}),
+    }
+    if comparison.normalised and any(counts.values()):
+        yield Finding("few_over_tasks")
+    else:
+        for code, few in counts.items():
+            for count in few:
+                yield Finding(code, {"count": count, "coverage": 1 - 2.0 ** (1 - count)})
+
+
+def find_min_p(comparison: Comparison) -> Iterator[Finding]:
+    """Yield the lowest possible p, if it is not low."""
+    n_seeds = comparison.rows[0].n_seeds
+    n_splits = [math.comb(n_seeds + row.n_seeds, row.n_seeds) for row in comparison.rows if row.p_value is not None]
+    if n_splits and (min_p := max(n_splits) ** -len(comparison.tasks)) > MIN_CERTAIN_P:
+        yield Finding("min_p", {"p": min_p})

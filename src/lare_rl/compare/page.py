@@ -1,0 +1,119 @@
+"""The page of a comparison: its tables, and the figures that the authors of rliable recommend."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from html import escape
+from pathlib import Path
+
+from lare_rl.compare.bootstrap import REPETITIONS, Estimate
+from lare_rl.compare.comparison import Comparison, compare_over_tasks, compare_tasks
+from lare_rl.compare.messages import MESSAGES, find_min_p, find_score_meaning, find_small_samples, to_text
+from lare_rl.compare.results import Results
+from lare_rl.report import figures
+from lare_rl.report.html import render_note, render_table, write_page
+from lare_rl.runs.metric_names import RETURN
+from lare_rl.util.findings import Finding, render
+from lare_rl.util.statistics import format_plus_minus
+
+__all__ = ["OVERALL_HEADER", "comparison_table", "describe", "overall_table", "write_comparisons"]
+
+HEADER = ("method", "seeds", "IQM [95%]", "mean ± sd", "minus baseline [95%]", "above baseline [95%]", "p")
+DRAWS_HEADER = ("draws", "mean [95%], draws")
+OVERALL_HEADER = ("all tasks", "seeds", "above baseline [95%]", "p")
+
+
+def write_comparisons(
+    results: Sequence[Results],
+    out: Path,
+    metric: str = RETURN,
+    findings: Iterable[Finding] = (),
+    step: int | None = None,
+    late: bool = False,
+) -> list[Comparison]:
+    """Compare results (`compare_tasks`), and write the page, with the findings about the results at its end.
+
+    Raises:
+        LareError: the results cannot be compared, or the file cannot be written.
+    """
+    comparisons = compare_tasks(results, metric, step, late)
+    tasks = ", ".join(task for comparison in comparisons for task in comparison.tasks)
+    title = f"{tasks}: {len({result.label for result in results})} methods"
+    notes = [f"Note: {render(finding, MESSAGES)}" for finding in findings]
+    if origin := _find_origin(results):
+        notes.append(render(origin, MESSAGES))
+    write_page(out, title, "\n".join([f"<h1>{escape(title)}</h1>", *_body(comparisons), *map(render_note, notes)]))
+    return comparisons
+
+
+def describe(comparison: Comparison) -> str:
+    """Return what the scores are, and what so few runs cannot show."""
+    return to_text([find_score_meaning(comparison), *find_small_samples(comparison), *find_min_p(comparison)])
+
+
+def comparison_table(comparison: Comparison) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return the header and the rows of the table. It has columns for draws if a method has several."""
+    several_draws = any(row.n_draws > 1 for row in comparison.rows)
+    rows = [
+        (
+            row.label if number else f"{row.label} (baseline)",
+            str(row.n_seeds),
+            str(row.iqm),
+            format_plus_minus(row.mean, row.std),
+            *map(_format_cell, (row.difference, row.improvement, row.p_value)),
+            *((str(row.n_draws), _format_cell(row.draw_mean)) if several_draws else ()),
+        )
+        for number, row in enumerate(comparison.rows)
+    ]
+    return (*HEADER, *DRAWS_HEADER) if several_draws else HEADER, rows
+
+
+def overall_table(comparisons: Sequence[Comparison]) -> list[tuple[str, ...]]:
+    """Return the rows of the table over all tasks, under `OVERALL_HEADER`. It has none if there is nothing to compare."""
+    return [
+        (
+            row.label if number else f"{row.label} (baseline)",
+            str(row.n_seeds),
+            *map(_format_cell, (row.improvement, row.p_value)),
+        )
+        for number, row in enumerate(compare_over_tasks(comparisons))
+    ]
+
+
+def _format_cell(value: Estimate | float | None) -> str:
+    if value is None:
+        return "-"
+    return str(value) if isinstance(value, Estimate) else f"{value:.2g}"
+
+
+def _find_origin(results: Sequence[Results]) -> Finding | None:
+    """Return what all runs share of their versions, machines and evaluations."""
+    configs = [result.config for result in results if result.config is not None]
+    values = {
+        "lare_version": {config.lare for config in configs},
+        "jax_version": {config.versions["jax"] for config in configs},
+        "machine": {config.machine for config in configs},
+        "evaluation_episodes": {config.settings.evaluation_episodes for config in configs},
+    }
+    facts = tuple(Finding(code, {"value": min(group)}) for code, group in values.items() if len(group) == 1)
+    return Finding("origin", {"facts": facts}) if facts else None
+
+
+def _body(comparisons: Sequence[Comparison]) -> Iterator[str]:
+    level = 2 if len(comparisons) == 1 else 3
+    for comparison in comparisons:
+        if len(comparisons) > 1:
+            yield f"<h2>{escape(comparison.tasks[0])}</h2>"
+        header, rows = comparison_table(comparison)
+        yield render_table(header, rows, range(1, len(header)))
+        yield render_note(describe(comparison))
+        score = (
+            comparison.metric if comparison.metric != RETURN else "score" if comparison.normalised else "true return"
+        )
+        yield f"<h{level}>Learning</h{level}>"
+        yield figures.draw_bands(comparison.curves, "environment steps", f"IQM of the {score}", steps=True)
+        yield render_note(MESSAGES["curves"])
+        yield f"<h{level}>Performance profiles</h{level}>"
+        yield figures.draw_bands(comparison.profiles, f"x ({score})", "share of runs that score more")
+    if rows := overall_table(comparisons):
+        yield "<h2>All tasks</h2>"
+        yield render_table(OVERALL_HEADER, rows, range(1, len(OVERALL_HEADER)))
+    yield render_note(to_text([Finding("columns"), Finding("intervals", {"repetitions": REPETITIONS})]))

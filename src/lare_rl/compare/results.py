@@ -1,0 +1,127 @@
+"""The values of a metric to compare: of runs, and of tables with the results of other programs.
+
+A table is a CSV file with the columns `method`, `task`, `seed`, `step` and the metric (`evaluation/return` by default). Other
+columns are ignored.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from lare_rl.errors import LareError, did_you_mean, short_repr
+from lare_rl.runs.config_file import Config
+from lare_rl.runs.directory import Run
+from lare_rl.util.safe_io import read_text
+
+__all__ = ["Results", "group_pairs", "read_results_table", "read_run_results"]
+
+_Key = TypeVar("_Key", bound=Hashable)
+_Value = TypeVar("_Value")
+_Number = TypeVar("_Number", int, float)
+
+MAX_TABLE_BYTES = 1 << 28
+COLUMNS = ("method", "task", "seed", "step")
+
+
+@dataclass(frozen=True)
+class Results:
+    """The values of a metric in one run, or of one method and task in a table."""
+
+    label: str
+    """The row of the comparison: the method, and what distinguishes it from other rows."""
+    source: Path
+    """The run directory or the table."""
+    task: str
+    draw: int
+    curves: Mapping[int, Mapping[int, float]]
+    """The values, by seed and step."""
+    config: Config | None = None
+    """The configuration of a run; None for a table."""
+
+
+def group_pairs(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
+    """Group the second elements of pairs by the first ones, in order."""
+    groups: dict[_Key, list[_Value]] = {}
+    for key, value in pairs:
+        groups.setdefault(key, []).append(value)
+    return groups
+
+
+def read_run_results(runs: Mapping[str, Sequence[Run]], metric: str) -> list[Results]:
+    """Read the values of a metric in runs, which are given by label. Raises `LareError` if a run has no values."""
+    results = []
+    for label, run in ((label, run) for label, group in runs.items() for run in group):
+        lines = [line for line in run.metrics() if line.get(metric) is not None]
+        if not lines:
+            raise LareError(f"{run.directory} has no {metric} yet: leave it out, or compare another metric")
+        curves: dict[int, dict[int, float]] = {seed: {} for seed in run.seeds}
+        for line in lines:
+            curves[line["seed"]][line["step"]] = float(line[metric])
+        results.append(
+            Results(
+                label=label,
+                source=run.directory,
+                task=run.config.task.name,
+                draw=run.config.settings.draw,
+                curves=curves,
+                config=run.config,
+            )
+        )
+    return results
+
+
+def read_results_table(path: Path, metric: str) -> list[Results]:
+    """Read the curves of each method and task in a table.
+
+    Raises:
+        LareError: the file cannot be read, a column is missing, or a line is not valid.
+    """
+    rows = csv.DictReader(io.StringIO(read_text(path, MAX_TABLE_BYTES), newline=""), restkey="")
+    try:
+        _check_columns(path, rows.fieldnames or (), metric)
+        curves = _read_curves(path, rows, metric)
+    except csv.Error as error:
+        raise LareError(f"{path} is not a CSV table: {error}") from error
+    if not curves:
+        raise LareError(f"{path} has no row with a value of {metric}")
+    return [Results(method, path, task, draw=0, curves=values) for (method, task), values in curves.items()]
+
+
+def _check_columns(path: Path, header: Sequence[str], metric: str) -> None:
+    columns = (*COLUMNS, metric)
+    for name in columns:
+        if name not in header:
+            hint = did_you_mean(name, header)
+            raise LareError(f"{path} has no column {name!r}{hint}: a table of results needs {', '.join(columns)}")
+
+
+def _read_curves(path: Path, rows: csv.DictReader, metric: str) -> dict[tuple[str, str], dict[int, dict[int, float]]]:
+    """Return the values by method and task, seed, and step."""
+    curves: dict[tuple[str, str], dict[int, dict[int, float]]] = {}
+    for row in rows:
+        if not row[metric]:  # a row with other metrics
+            continue
+        where = f"{path}, line {rows.line_num}"
+        method, task = row["method"], row["task"]
+        if not (method and task):
+            raise LareError(f"{where} has no method or no task")
+        seed, step = (_parse(f"{where}: {name}", row[name], int, "whole") for name in ("seed", "step"))
+        curve = curves.setdefault((method, task), {}).setdefault(seed, {})
+        if step in curve:
+            raise LareError(f"{where} is a second row of {method} on {task} with seed {seed} at step {step}")
+        curve[step] = _parse(f"{where}: {metric}", row[metric], float, "finite")
+    return curves
+
+
+def _parse(where: str, text: str | None, convert: Callable[[str], _Number], kind: str) -> _Number:
+    try:
+        value = convert(text or "")
+        if math.isfinite(value):
+            return value
+    except (ValueError, OverflowError):
+        pass
+    raise LareError(f"{where} {short_repr(text)} is not a {kind} number")

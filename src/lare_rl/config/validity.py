@@ -1,0 +1,58 @@
+"""Which method and decoder settings go together, and with which task: the rules of `lare_rl.train` and of `CreditAssigner`."""
+
+from lare_rl.credit.basis import MAX_RAW_FEATURES
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.methods import Fit, Method, Reward
+from lare_rl.errors import LareError
+from lare_rl.tasks.spec import FactorInputs
+
+__all__ = ["check_credit"]
+
+
+def check_credit(
+    method: Method,
+    credit: CreditSettings,
+    *,
+    n_agents: int,
+    n_raw_features: int,
+    factor_inputs: FactorInputs = "after",
+    team_level: bool = False,
+    fixed_length: bool = False,
+    scale_rewards: bool = False,
+) -> None:
+    """Raise `LareError` if a method or the settings of its decoder are impossible for a task.
+
+    Args:
+        method: how credit is assigned.
+        credit: the settings of the decoder.
+        n_agents: the number of agents.
+        n_raw_features: entries of an observation (of the global state, if `team_level`) and of the actions with it.
+        factor_inputs: which observations of a step phi reads.
+        team_level: whether credit is assigned to the team's global state instead of each agent.
+        fixed_length: whether every episode has the same number of steps.
+        scale_rewards: whether rewards are divided by the size of returns.
+    """
+    name = method.name
+    if method.reward is Reward.DESIGNED and factor_inputs == "both":
+        raise LareError(f"{name} is one reward for each step: set judges to 'before' or 'after', not to 'both'")
+    if scale_rewards and method.has_proxy_rewards and not method.calibrated:
+        raise LareError(f"scale_rewards divides by the size of returns, and rewards of {name} are not in their unit")
+    if method.single_agent_only and n_agents > 1:
+        raise LareError(f"{name} assigns credit to a single agent, and the task has {n_agents} agents")
+    if method.multi_agent_only and n_agents == 1:
+        raise LareError(f"{name} assigns credit among agents, and the task has a single agent")
+    if method.multi_agent_only and team_level:
+        raise LareError(f"{name} assigns credit among agents, and the task is judged from the global state")
+    if method.needs_whole_episodes and not fixed_length:
+        raise LareError(f"{name} reads whole episodes of one length: use it with `lare_rl.train` on particle tasks")
+    if "drawn_steps" in method.settings and not fixed_length and credit.steps < credit.drawn_steps:
+        raise LareError(
+            f"the decoder has steps = {credit.steps}, less than drawn_steps = {credit.drawn_steps} of one episode: use more steps"
+        )
+    if method.fit is Fit.EVIDENCE and not method.needs_phi and n_raw_features > MAX_RAW_FEATURES:
+        raise LareError(
+            f"{name} fits a weight to each of at most {MAX_RAW_FEATURES} raw features, and the task has {n_raw_features}: "
+            "use lare-bayes, which fits weights to factors, or rrdu, a network"
+        )
+    if method.decoder == "diaster" and not credit.hidden:
+        raise LareError(f"{name} needs a hidden layer: the decoder has hidden = ()")

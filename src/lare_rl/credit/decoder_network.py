@@ -1,0 +1,55 @@
+"""The interface of decoders: networks from the inputs of a step to its proxy reward."""
+
+import math
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare_rl.credit.basis import Basis
+
+__all__ = ["DecoderNetwork", "DecoderOutput", "DecoderShape"]
+
+
+class DecoderOutput(NamedTuple):
+    """A decoder's output for some steps."""
+
+    r_hat: Float[Array, "rows *agents"]
+    penalty: Float[Array, "rows *agents"]
+    """The mean of the penalty over the agents that are alive is added to the loss."""
+
+
+@runtime_checkable
+class DecoderNetwork(Protocol):
+    """A decoder, which is an `equinox.Module`.
+
+    A decoder for `Fit.DECODER_LOSS` has another method, `loss`, as in `diaster.py`.
+    """
+
+    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> DecoderOutput:
+        """Return the proxy rewards of some steps.
+
+        Args:
+            features: the inputs at each step.
+            key: the random key of an update of the decoder. Without a key, the output is what the algorithm is trained on.
+        """
+        ...
+
+
+class DecoderShape(NamedTuple):
+    """The sizes that a decoder is made for."""
+
+    basis: Basis
+    """The inputs, and the features that a closed-form decoder computes from them."""
+    max_steps: int
+    """The number of steps of the longest episode."""
+    n_agents: int
+
+    @property
+    def n_inputs(self) -> int:
+        """The number of inputs of a step."""
+        return self.basis.n_inputs
+
+    @property
+    def gain(self) -> float:
+        """The factor of the output of decoders for several agents (see `decomposition.py`)."""
+        return 1.0 if self.n_agents == 1 else math.sqrt(self.max_steps * self.n_agents)

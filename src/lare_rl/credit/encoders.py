@@ -1,0 +1,102 @@
+"""The inputs of a decoder, as data: an encoder is a tuple of names.
+
+    factors              z = phi(s, a), the output of the latent function
+    observation          s, before the action
+    action               a, as the policy's networks see it
+    next_observation     s', after the action
+    observation_change   s - s'
+    scored_observation   s, s' or both, as the task's `judges` says
+
+The size of a decoder's input, and the input itself in NumPy, in JAX and in an exported graph, all follow from this tuple. If credit
+is assigned to whole teams, `observation` is the global state and `action` holds the actions of all agents.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from lare_rl.tasks.spec import FactorInputs
+
+__all__ = [
+    "FACTORS",
+    "FACTORS_AND_SCORED",
+    "NEXT_OBSERVATION_ACTION",
+    "OBSERVATION_ACTION",
+    "RAW",
+    "SCORED",
+    "Encoder",
+    "input_arrays",
+    "input_size",
+]
+
+_SCORED_OBSERVATIONS = {
+    "before": ("observation",),
+    "after": ("next_observation",),
+    "both": ("observation", "next_observation"),
+}
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """What a decoder reads of a step."""
+
+    names: tuple[str, ...]
+    names_of_many_agents: tuple[str, ...] | None = None
+    """Another tuple for tasks with several agents. None means the same one."""
+
+    def inputs(self, judges: FactorInputs = "after", *, single_agent: bool = True) -> tuple[str, ...]:
+        """Return the names of the inputs, with `scored_observation` replaced by the observations that a task names."""
+        names = self.names if single_agent or self.names_of_many_agents is None else self.names_of_many_agents
+        return tuple(
+            name
+            for group in names
+            for name in (_SCORED_OBSERVATIONS[judges] if group == "scored_observation" else (group,))
+        )
+
+    @property
+    def has_factors(self) -> bool:
+        """Whether the inputs contain the factors of a latent function."""
+        return "factors" in self.names
+
+    @property
+    def has_raw_features(self) -> bool:
+        """Whether the inputs contain anything else than factors."""
+        return self.names != ("factors",)
+
+    @property
+    def depends_on_judges(self) -> bool:
+        """Whether the raw features depend on which observations the task's `judges` names."""
+        return "scored_observation" in self.names
+
+
+RAW = Encoder(("observation", "action", "observation_change"), ("next_observation",))
+"""As published for RD and RRD."""
+OBSERVATION_ACTION = Encoder(("observation", "action"))
+NEXT_OBSERVATION_ACTION = Encoder(("next_observation", "action"))
+SCORED = Encoder(("scored_observation", "action"))
+FACTORS = Encoder(("factors",))
+FACTORS_AND_SCORED = Encoder(("factors", "scored_observation", "action"))
+
+
+def input_size(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> int:
+    """Return how many numbers the inputs have.
+
+    Args:
+        inputs: names, from `Encoder.inputs`.
+        sizes: the sizes of `factors`, `observation` and `action`.
+    """
+    same_size = {"next_observation": "observation", "observation_change": "observation"}
+    return sum(sizes[same_size.get(name, name)] for name in inputs)
+
+
+def input_arrays(inputs: tuple[str, ...], step: Mapping[str, Any]) -> list[Any]:
+    """Return the arrays to concatenate, in order. They may be of NumPy, of JAX, or nodes of a graph.
+
+    Args:
+        inputs: names, from `Encoder.inputs`.
+        step: the arrays `factors`, `observation`, `action` and `next_observation`, as far as the inputs need them.
+    """
+    return [
+        step["observation"] - step["next_observation"] if name == "observation_change" else step[name]
+        for name in inputs
+    ]

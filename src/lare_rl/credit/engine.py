@@ -1,0 +1,241 @@
+"""The rewards that credit assignment pays for steps: one engine for the trainer, `CreditAssigner`, logs and explanations.
+
+A `CreditSpec` says what is fitted to what. With a decoder (`decomposition.py`) and the scale of R/T, the functions here turn steps
+into the rewards that an algorithm is trained on:
+
+    proxy reward       r_hat of each agent, by the method
+    training reward    + optimism,  averaged over the agents if the method shares credit,  0 for agents that are not alive,
+                       divided by the scale of R/T if that is asked for
+
+Batches have an axis of agents, of length 1 for a single agent. For credit to whole teams it has length 1 too.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from lare_rl.credit import closed_form, decomposition
+from lare_rl.credit.basis import Basis
+from lare_rl.credit.closed_form import ClosedForm
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decomposition import CreditBatch, Decomposition
+from lare_rl.credit.encoders import input_size
+from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
+from lare_rl.credit.methods import Method, Reward
+from lare_rl.credit.returns import add_to_sums
+from lare_rl.credit.score_type import ScoreType, score_types_to_fit
+from lare_rl.envs.interface import alive_mean
+from lare_rl.nn.normalise import RunningMeanStd, Scale, min_max_scale, root_mean_square
+from lare_rl.tasks.spec import FactorInputs
+
+__all__ = [
+    "CreditSpec",
+    "ExplanationState",
+    "StepBatch",
+    "add_to_explanation",
+    "agent_shares",
+    "credit_spec",
+    "explain_returns",
+    "init_decoder",
+    "init_explanation",
+    "proxy_rewards",
+    "scale_and_mask",
+    "training_rewards",
+]
+
+
+@dataclass(frozen=True)
+class CreditSpec:
+    """What is fitted to what: the static part of credit assignment for one team."""
+
+    method: Method
+    settings: CreditSettings
+    inputs: tuple[str, ...]
+    """The names of the decoder's inputs (`encoders.py`)."""
+    sizes: tuple[tuple[str, int], ...]
+    """The sizes of `factors`, `observation` and `action`."""
+    score_types: tuple[int, ...]
+    """The score types that are fitted."""
+    max_steps: int
+    agents: int
+    """The number of proxy rewards of a step."""
+    scale_rewards: bool = False
+    """Whether training rewards are divided by the running root mean square of R/T."""
+
+    @cached_property
+    def basis(self) -> Basis:
+        """The features that a closed-form decoder computes from a row of inputs."""
+        sizes = dict(self.sizes)
+        n_factors = sizes["factors"] if "factors" in self.inputs else 0
+        n_raw = input_size(tuple(name for name in self.inputs if name != "factors"), sizes)
+        return Basis(n_factors, n_raw, extended=self.method.extended_basis)
+
+
+def credit_spec(
+    method: Method,
+    settings: CreditSettings,
+    sizes: Mapping[str, int],
+    *,
+    judges: FactorInputs,
+    single_agent: bool,
+    agents: int,
+    max_steps: int,
+    fixed_length: bool,
+    scale_rewards: bool,
+) -> CreditSpec:
+    """Return the spec of a method for one team.
+
+    Args:
+        method: the method.
+        settings: the settings of its decoder.
+        sizes: the sizes of `factors`, `observation` (the state, for credit to whole teams) and `action`.
+        judges: which observations the task names.
+        single_agent: whether the task has a single agent.
+        agents: the number of proxy rewards of a step.
+        max_steps: the number of steps of the longest episode.
+        fixed_length: whether all episodes have the same length. A sum and a mean are then the same.
+        scale_rewards: whether training rewards are divided by the running root mean square of R/T.
+    """
+    encoder = method.encoder
+    inputs = () if encoder is None else encoder.inputs(judges, single_agent=single_agent)
+    score_types = score_types_to_fit(settings, fixed_length) if "score" in method.settings else (ScoreType.SUM,)
+    return CreditSpec(
+        method=method,
+        settings=settings,
+        inputs=inputs,
+        sizes=tuple(sizes.items()),
+        score_types=score_types,
+        max_steps=max_steps,
+        agents=agents,
+        scale_rewards=scale_rewards,
+    )
+
+
+def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> Decomposition | None:
+    """Return an untrained decoder. Return None for a method that fits nothing."""
+    if spec.method.reward is not Reward.PROXY:
+        return None
+    return decomposition.init(
+        key,
+        spec.basis,
+        spec.method,
+        spec.settings,
+        max_steps=spec.max_steps,
+        n_agents=spec.agents,
+        score_types=spec.score_types,
+    )
+
+
+class StepBatch(NamedTuple):
+    """Steps, and facts about their episodes."""
+
+    features: Float[Array, "*batch agents features"]
+    """The decoder's inputs."""
+    length: Int[Array, "*batch"]
+    """T of the step's episode; an estimate while it is running."""
+    mean_reward: Float[Array, "*batch"]
+    """R/T of the step's episode."""
+    finished: Bool[Array, "*batch"]
+    """Whether the step's episode has ended."""
+
+
+def proxy_rewards(
+    decoder: Decomposition | None, scale: Scale, steps: StepBatch, spec: CreditSpec, *, optimistic: bool = False
+) -> Float[Array, "*batch agents"]:
+    """Return r_hat of each agent, in the unit of the true rewards if the method's rewards have one.
+
+    Args:
+        decoder: the decoder; None for a method that has none.
+        scale: the scale of R/T.
+        steps: the steps.
+        spec: the spec that the decoder was made for.
+        optimistic: add the optimism that the settings ask for.
+    """
+    match spec.method.reward:
+        case Reward.DESIGNED:
+            return steps.features[..., 0]
+        case Reward.UNIFORM:
+            # The return of a running episode is not known yet.
+            share = jnp.where(steps.finished, min_max_scale(scale, steps.mean_reward), 0.5)
+            return jnp.broadcast_to(share[..., None], steps.features.shape[:-1])
+    assert decoder is not None
+    rows = steps.features.reshape(-1, *steps.features.shape[-2:])
+    with_optimism = optimistic and decomposition.is_optimistic(spec.method, spec.settings)
+    compute = decomposition.optimistic_rewards if with_optimism else decomposition.proxy_rewards
+    r_hat = compute(decoder, rows, spec.settings, steps.length.ravel())
+    return r_hat.reshape(steps.features.shape[:-1])
+
+
+def training_rewards(
+    decoder: Decomposition | None,
+    scale: Scale,
+    steps: StepBatch,
+    spec: CreditSpec,
+    alive: Bool[Array, "*batch team"],
+) -> Float[Array, "*batch team"]:
+    """Return the rewards that an algorithm is trained on, for each agent of the team.
+
+    Args:
+        decoder: the decoder; None for a method that has none.
+        scale: the scale of R/T.
+        steps: the steps.
+        spec: the spec that the decoder was made for.
+        alive: which agents acted.
+    """
+    r_hat = jnp.broadcast_to(proxy_rewards(decoder, scale, steps, spec, optimistic=True), alive.shape)
+    if spec.method.shared:
+        r_hat = jnp.broadcast_to(alive_mean(r_hat, alive)[..., None], alive.shape)
+    return scale_and_mask(r_hat, scale, alive, scale_rewards=spec.scale_rewards)
+
+
+def scale_and_mask(
+    reward: Float[Array, "*batch team"], scale: Scale, alive: Bool[Array, "*batch team"], *, scale_rewards: bool
+) -> Float[Array, "*batch team"]:
+    """Return rewards with 0 for agents that are not alive, divided by the scale of R/T if `scale_rewards` is true."""
+    reward = jnp.where(alive, reward, 0)
+    return reward / root_mean_square(scale) if scale_rewards else reward
+
+
+def agent_shares(alive: Any) -> Any:
+    """Return each agent's share of the team's reward: 1/n for each of n agents that are alive, else 0.
+
+    Arrays are [*batch agents], of NumPy or of JAX.
+    """
+    return (alive / alive.sum(axis=-1, keepdims=True).clip(1)).astype(np.float32)
+
+
+class ExplanationState(NamedTuple):
+    """SufficientStatistics over episodes and over steps, from which returns are explained."""
+
+    closed_form: ClosedForm
+    steps: StepStatistics
+
+
+def init_explanation(statistics: RunningMeanStd, basis: Basis) -> ExplanationState:
+    """Return empty sums.
+
+    Args:
+        statistics: mean and deviation of the inputs, by which they are standardised.
+        basis: the features that explain the returns.
+    """
+    closed = closed_form.reset_statistics(closed_form.init(basis, 1), statistics)
+    return ExplanationState(closed, empty_step_statistics(basis))
+
+
+def add_to_explanation(state: ExplanationState, episodes: CreditBatch) -> ExplanationState:
+    """Add whole episodes to the sums. Call this with float64 enabled."""
+    decoder = state.closed_form.decoder
+    rows = decomposition.valid_rows(episodes)
+    steps = add_steps(state.steps, decoder.features(episodes.features), rows, decoder.basis)
+    return ExplanationState(add_to_sums(state.closed_form, episodes), steps)
+
+
+def explain_returns(state: ExplanationState, score_type: Int[Array, ""]) -> Explanation:
+    """Explain the returns of the episodes in the sums by their features. Call this with float64 enabled."""
+    closed = state.closed_form
+    return explain(closed_form.to_float64(closed.sufficient_statistics), state.steps, score_type, closed.decoder.basis)

@@ -1,0 +1,70 @@
+"""Errors of environments as `LareError`s of one line. An environment is foreign code, which may raise or return anything."""
+
+import contextlib
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from lare_rl.errors import LareError, short_repr
+
+__all__ = ["EnvOutputError", "as_lare_error", "one_line_errors", "read_measure", "to_float"]
+
+
+class EnvOutputError(LareError):
+    """An environment returned a value that cannot be used for training."""
+
+    env_index: int | None = None
+    """The index of the environment, if several run in lockstep."""
+
+
+def as_lare_error(message: str, error: BaseException, hint: str = "") -> LareError:
+    """Return `message`, the first line of the error, and the hint as a `LareError`. Return a `LareError` unchanged."""
+    if isinstance(error, LareError):
+        return error
+    logging.getLogger(__name__).debug("%s", message, exc_info=error)
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return LareError(f"{message}: {lines[0]}{hint}")
+
+
+@contextlib.contextmanager
+def one_line_errors(message: str, make_hint: Callable[[BaseException], str] = lambda _: "") -> Iterator[None]:
+    """Turn every error of a block into a `LareError` that begins with `message`.
+
+    This includes `SystemExit`, which some programs raise when a window is closed. Otherwise an interrupted run would look complete.
+    """
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        raise as_lare_error(message, error, make_hint(error)) from error
+
+
+def to_float(value: Any) -> float:
+    """Return a value as a float.
+
+    Raises:
+        ValueError: the value is not a number. The message is a predicate.
+    """
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"is {short_repr(value)}, which is not a number") from None
+
+
+def read_measure(infos: Iterable[Mapping[Any, Any]], name: str) -> float:
+    """Return a measure of the task from the last step's `info`: the mean over the agents that report it.
+
+    Raises:
+        LareError: it is missing, or is not a number.
+    """
+    infos = list(infos)
+    try:
+        values = [to_float(info[name]) for info in infos if name in info]
+    except ValueError as error:
+        raise LareError(f"the measure {name!r} in the last step's info {error}") from None
+    if not values:
+        keys = ", ".join(sorted({str(key) for info in infos for key in info}))
+        content = f"has only {keys}" if keys else "is empty (was the episode cut at max_episode_steps?)"
+        raise LareError(f"the task has the measure {name!r}, but the last step's info {content}")
+    return float(np.mean(values))

@@ -1,0 +1,91 @@
+"""Gymnasium's MuJoCo environments with other rewards than their descriptions suggest.
+
+The language model reads the description of the original task, so the recorded replies of the original task are used. Dynamics,
+episode starts and ends are those of the original task.
+
+Hidden rewards, for HalfCheetah-v4 (v0 = 2 m/s) and Walker2d-v4 (v0 = 1 m/s). v is the forward velocity after the step (entry 8 of
+the observation), theta the angle of the front or left foot (entry 7), and a the action:
+
+    Target        r = exp(-(v - v0)^2) - 0.02 |a|^2        a target speed
+    Threshold     r = 1[v > v0] - 0.02 |a|^2               a minimum speed
+    Saturating    r = tanh(v) - 0.05 |a|^2                 faster is better, with a diminishing gain
+    Foot          r = v - 0.1 |a|^2 + theta                an entry that no factor depends on
+
+Sparse reward, for HalfCheetah-v4: 1 at the end of an episode that travels further than 500 m, else 0.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import WrapperSpec
+from gymnasium.utils import RecordConstructorArgs
+
+__all__ = ["HIDDEN_REWARDS", "TARGET_SPEEDS", "HiddenReward", "SparseDistanceReward", "register"]
+
+FOOT_ANGLE, VELOCITY = 7, 8
+"""The indices of both entries in the observation."""
+TARGET_SPEEDS = {"HalfCheetah": 2.0, "Walker2d": 1.0}
+"""v0 (m/s)."""
+
+HIDDEN_REWARDS: dict[str, Callable[[np.ndarray, float, float], float]] = {
+    "Target": lambda next_obs, effort, v0: np.exp(-((next_obs[VELOCITY] - v0) ** 2)) - 0.02 * effort,
+    "Threshold": lambda next_obs, effort, v0: float(next_obs[VELOCITY] > v0) - 0.02 * effort,
+    "Saturating": lambda next_obs, effort, _: np.tanh(next_obs[VELOCITY]) - 0.05 * effort,
+    "Foot": lambda next_obs, effort, _: next_obs[VELOCITY] - 0.1 * effort + next_obs[FOOT_ANGLE],
+}
+"""Functions from the next observation, the effort |a|^2 and v0 to the reward."""
+
+
+class HiddenReward(gymnasium.Wrapper, RecordConstructorArgs):
+    """Replaces the reward by one of `HIDDEN_REWARDS`."""
+
+    def __init__(self, env: gymnasium.Env, reward: str, v0: float):
+        RecordConstructorArgs.__init__(self, reward=reward, v0=v0)
+        gymnasium.Wrapper.__init__(self, env)
+        self.compute_reward, self.v0 = HIDDEN_REWARDS[reward], v0
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        next_obs, _, terminated, truncated, info = self.env.step(action)
+        reward = self.compute_reward(next_obs, float(np.sum(np.square(action))), self.v0)
+        return next_obs, float(reward), terminated, truncated, info
+
+
+class SparseDistanceReward(gymnasium.Wrapper, RecordConstructorArgs):
+    """Replaces the reward: 1 at the end of an episode that has travelled further than `distance` metres, else 0.
+
+    This is the fully sparse task of the LaRe paper, appendix F.6: I(final travel distance > 500). The published code requires a
+    summed forward reward above 1000 instead, which corresponds to 50 m at 0.05 s a step.
+    """
+
+    def __init__(self, env: gymnasium.Env, distance: float = 500.0):
+        RecordConstructorArgs.__init__(self, distance=distance)
+        gymnasium.Wrapper.__init__(self, env)
+        self.distance = distance
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, _, terminated, truncated, info = self.env.step(action)
+        success = (terminated or truncated) and info["x_position"] > self.distance
+        return observation, float(success), terminated, truncated, info
+
+
+def register() -> None:
+    """Register the environments with Gymnasium. Further calls change nothing."""
+    _register("lare/HalfCheetahSparse-v4", "HalfCheetah-v4", SparseDistanceReward, distance=500.0)
+    for body, v0 in TARGET_SPEEDS.items():
+        for reward in HIDDEN_REWARDS:
+            _register(f"lare/{body}{reward}-v4", f"{body}-v4", HiddenReward, reward=reward, v0=v0)
+
+
+def _register(name: str, original: str, wrapper: type[gymnasium.Wrapper], **kwargs: Any) -> None:
+    if name in gymnasium.registry:
+        return
+    spec = gymnasium.registry[original]
+    # Gymnasium applies additional wrappers outside the time limit, so that they see the end of the episode.
+    gymnasium.register(
+        name,
+        entry_point=spec.entry_point,
+        max_episode_steps=spec.max_episode_steps,
+        additional_wrappers=(WrapperSpec(wrapper.__name__, f"{__name__}:{wrapper.__name__}", kwargs),),
+    )

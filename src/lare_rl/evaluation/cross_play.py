@@ -1,0 +1,86 @@
+"""Matches between the teams of two runs."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare_rl.envs.families import make_env
+from lare_rl.envs.interface import JaxEnv, Team, team_mean
+from lare_rl.errors import LareError
+from lare_rl.runs.directory import Run
+from lare_rl.training.collect_device import unroll_on_device
+from lare_rl.training.compiled import policy_function, training_module
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.static_config import TrainConfig
+
+__all__ = ["Match", "combine_policies", "cross_play"]
+
+
+class Match(NamedTuple):
+    """The first team of one run against the second team of another."""
+
+    first: Run
+    second: Run
+    returns: Float[np.ndarray, "first_seeds second_seeds"]
+    """The first team's mean return, for each pair of seeds."""
+
+
+def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
+    """Let the first team of each run play against the second team of each: four matches, all from the same initial states.
+
+    Raises:
+        LareError: the runs are not of one task with two teams, or `episodes` is less than 1.
+    """
+    if episodes < 1:
+        raise LareError(f"episodes = {episodes}: at least one is needed")
+    tasks = {run.config.task.name for run in runs}
+    if len(tasks) > 1 or len(runs[0].config.task.teams) != 2:
+        raise LareError(
+            f"cross-play needs two runs of one task in which two teams learn, and these are of {', '.join(sorted(tasks))}"
+        )
+    env = make_env(runs[0].config.task)
+    if not isinstance(env, JaxEnv):
+        env.close()
+        raise LareError(f"cross-play is for environments in JAX, and {runs[0].config.task.name} steps on the host")
+    configs_and_actors = [_load_actors(run) for run in runs]
+    config = configs_and_actors[0][0]
+    play_match = jax.jit(partial(_play_match, env, n_episodes=episodes, config=config))
+    matches = []
+    for first_run, (_, first_actors) in zip(runs, configs_and_actors, strict=True):
+        for second_run, (_, second_actors) in zip(runs, configs_and_actors, strict=True):
+            returns = [
+                [float(play_match(first, second, jax.random.key(0))) for second in second_actors]
+                for first in first_actors
+            ]
+            matches.append(Match(first=first_run, second=second_run, returns=np.array(returns)))
+    return matches
+
+
+def _load_actors(run: Run) -> tuple[TrainConfig, list[Any]]:
+    """Load the actor of each seed, with an axis of one seed."""
+    state = load_learner(run)
+    actors = training_module(state.config).get_actor(state.learner, run.config.settings.steps, state.config)
+    return state.config, [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], actors) for i in range(len(run.seeds))]
+
+
+def _play_match(
+    env: JaxEnv, first: Any, second: Any, key: PRNGKeyArray, n_episodes: int, config: TrainConfig
+) -> Float[Array, ""]:
+    """Return the mean over episodes of the first team's return R."""
+    team = config.env.teams[0]
+    policy = partial(combine_policies, policy=policy_function(config, greedy=False), team=team)
+    batch = unroll_on_device(env, (first, second), key[None], n_episodes, config, greedy=False, act=policy)
+    reward = team_mean(batch.steps.next_timestep.reward, batch.steps.timestep.alive, team)
+    return jnp.mean(jnp.sum(reward * batch.mask, axis=0))
+
+
+def combine_policies(
+    actors: tuple[Any, Any], memory: Any, *inputs: Any, policy: Any, team: Team
+) -> tuple[Float[Array, "seeds envs agents action"], Any]:
+    """Return the first team's actions by the first actor, and all other actions by the second. Neither has a memory."""
+    first, second = (policy(actor, memory, *inputs)[0] for actor in actors)
+    return jnp.where((jnp.arange(first.shape[-2]) < team.stop)[:, None], first, second), memory

@@ -1,0 +1,131 @@
+"""New episodes of a run's policy, with the credit of each agent, for films, credit maps and statistics."""
+
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from lare_rl.data import replay
+from lare_rl.data.trajectory import Trajectory
+from lare_rl.envs.families import make_env, make_host_env
+from lare_rl.envs.interface import HostEnv, JaxEnv
+from lare_rl.envs.workers import LocalVecEnv
+from lare_rl.runs.directory import Run
+from lare_rl.training.collect_device import unroll_on_device
+from lare_rl.training.compiled import compile_functions, training_module
+from lare_rl.training.evaluation import EpisodeBatch
+from lare_rl.training.factors import compute_host_factors
+from lare_rl.training.learner import Learner, store_with_factors
+from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
+from lare_rl.training.static_config import TrainConfig
+from lare_rl.training.streams import Stream, episode_seed
+from lare_rl.training.unroll_host import HostPolicy, record_on_host
+
+__all__ = ["Rollout", "compute_proxy_rewards", "roll_out", "unroll_policy"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rollout:
+    """Whole episodes of the first seed's policy."""
+
+    config: TrainConfig
+    steps: Trajectory
+    """[time episodes ...]."""
+    mask: Bool[np.ndarray, "time episodes"]
+    """Whether the episode had not ended before the step."""
+    factors: Float[np.ndarray, "time episodes rows factors"]
+    proxy_reward: Float[np.ndarray, "time episodes agents"] | None
+    """By the decoders of the last checkpoint. None for a method without proxy rewards."""
+    state: Any
+    """The states after each step, if the environment is made of pure functions."""
+
+    @property
+    def reward(self) -> Float[np.ndarray, "time episodes agents"]:
+        """The true rewards."""
+        return np.asarray(self.steps.next_timestep.reward)
+
+    @property
+    def credit(self) -> Float[np.ndarray, "time episodes agents"]:
+        """The proxy rewards or, for a method without any, the true rewards."""
+        return self.reward if self.proxy_reward is None else self.proxy_reward
+
+    def select_episode(self, values: Any, episode: int = 0) -> Any:
+        """Return the values of one episode, [time ...], until its end. `values` are arrays [time episodes ...]."""
+        length = int(self.mask[:, episode].sum())
+        return jax.tree.map(lambda leaf: leaf[:length, episode], values)
+
+
+def roll_out(run: Run, n_episodes: int = 1, *, random: bool = False, key: int = 0) -> Rollout:
+    """Play episodes with the noise of training, or with random actions.
+
+    Args:
+        run: the run, which must have a checkpoint.
+        n_episodes: the number of episodes.
+        random: whether to play random actions.
+        key: the random key of an environment of pure functions.
+    """
+    state = load_learner(run)
+    config, learner = state.config, state.learner
+    actor = training_module(config).get_actor(
+        jax.tree.map(lambda leaf: leaf[:1], learner), run.config.settings.steps, config
+    )
+    if random:
+        actor = jax.tree.map(jnp.zeros_like, actor)  # networks of zeros have no preference
+    env = make_env(run.config.task)
+    if isinstance(env, HostEnv):
+        env.close()
+        batch = _unroll_on_host(run, config, actor, n_episodes)
+    else:
+        batch = unroll_policy(env, config, actor, n_episodes, key)
+    factors = compute_host_factors(run, config, batch.steps)
+    has_proxy = config.method.has_proxy_rewards
+    return Rollout(
+        config=config,
+        steps=batch.steps,
+        mask=batch.mask,
+        factors=factors,
+        proxy_reward=compute_proxy_rewards(select_seed(learner), batch.steps, factors, config) if has_proxy else None,
+        state=batch.state,
+    )
+
+
+def unroll_policy(env: JaxEnv, config: TrainConfig, actor: Any, n_episodes: int, key: int) -> EpisodeBatch:
+    """Play whole episodes of a single seed's actor in one compiled call. The batch has no axis of seeds."""
+    unroll = jax.jit(partial(unroll_on_device, env, n_episodes=n_episodes, config=config, greedy=False))
+    return _drop_seed_axis(unroll(actor, jax.random.key(key)[None]))
+
+
+def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) -> EpisodeBatch:
+    seeds = run.seeds[:1]
+    policy = HostPolicy(compile_functions(config), config, actor, seeds, n_episodes, greedy=False)
+    episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in range(n_episodes)]
+    with closing(LocalVecEnv([partial(make_host_env, run.config.task)] * n_episodes)) as envs:
+        return _drop_seed_axis(record_on_host(envs, policy, seeds, episode_seeds))
+
+
+def _drop_seed_axis(batch: EpisodeBatch) -> EpisodeBatch:
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], batch)
+
+
+def compute_proxy_rewards(
+    learner: Learner, steps: Trajectory, factors: Float[np.ndarray, "time episodes rows factors"], config: TrainConfig
+) -> Float[np.ndarray, "time episodes agents"]:
+    """Compute the proxy rewards of whole episodes by the decoders of a single seed."""
+    n_steps, n_episodes = np.shape(steps.next_timestep.terminated)
+    # Rewards are computed from stored steps, so a new replay stores these episodes alone.
+    buffer = replay.init_replay(config.columns, n_episodes, 2 * n_steps + 2, len(config.env.teams))
+
+    @jax.jit
+    def compute(steps: Trajectory, factors: Array) -> Array:
+        filled = store_with_factors(learner._replace(replay=buffer), steps, factors, config).replay
+        stored = replay.read(filled, replay.newest_steps(filled, n_steps))
+        return jnp.swapaxes(rewards(stored, RewardState(learner.credit, learner.scale), config), 0, 1)
+
+    return np.asarray(compute(jax.tree.map(jnp.asarray, steps), jnp.asarray(factors)))

@@ -1,0 +1,112 @@
+"""Shows the steps of another library's environments to a `CreditAssigner`."""
+
+from collections.abc import Hashable, Sequence
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from jaxtyping import Int
+
+from lare_rl.assigner.assigner import CreditAssigner
+from lare_rl.assigner.layout import make_layout
+from lare_rl.errors import LareError, short_repr
+
+__all__ = ["CREDIT_STEP", "Pay", "StepRecorder", "check_assigner", "check_capacity", "check_pay"]
+
+CREDIT_STEP = "credit_step"
+"""The key under which the number of a step is stored, for `CreditAssigner.rewards_at`."""
+
+Pay = Literal["proxy", "environment"]
+"""The reward that `step` of a wrapper returns: r_hat, or the environment's."""
+
+
+class StepRecorder:
+    """Shows steps to an assigner, in the form that it takes.
+
+    If the environment and the assigner have the same spaces, values are passed on unchanged. If the assigner only has the sizes of
+    observations and actions, from a task file, values become rows of numbers.
+    """
+
+    def __init__(
+        self,
+        credit: CreditAssigner,
+        observation_space: gymnasium.Space,
+        action_space: gymnasium.Space,
+        env_ids: Sequence[Hashable],
+        agents: int = 1,
+    ):
+        """Create a recorder.
+
+        Args:
+            credit: the assigner.
+            observation_space: the space of one agent in one environment.
+            action_space: the space of one agent in one environment.
+            env_ids: a key for each environment, which no other environment of the assigner has.
+            agents: the number of agents in an environment.
+
+        Raises:
+            LareError: the assigner was made for other sizes, or another number of agents.
+        """
+        check_assigner(credit, agents)
+        self.credit, self.env_ids = credit, env_ids
+        self.observation_layout = make_layout(observation_space, "observation_space")
+        self.action_layout = make_layout(action_space, "action_space")
+        for name, layout, expected in (
+            ("observation", self.observation_layout, credit.config.observation),
+            ("action", self.action_layout, credit.config.action),
+        ):
+            if layout.size != expected.size:
+                raise LareError(
+                    f"{name}s of the environment are rows of {layout.size} numbers, and the assigner was made for {expected.size}"
+                )
+        self._same_observations = self.observation_layout == credit.config.observation
+        self._same_actions = self.action_layout == credit.config.action
+
+    def add(
+        self,
+        observation: Any,
+        action: Any,
+        next_observation: Any,
+        reward: Any,
+        terminated: Any,
+        truncated: Any,
+        **options: Any,
+    ) -> Int[np.ndarray, " environments"]:
+        """Show one step of each environment, and return their numbers: `CreditAssigner.add`."""
+        if not self._same_observations:
+            observation = self.observation_layout.rows(observation, "observation")
+            next_observation = self.observation_layout.rows(next_observation, "next_observation")
+        if not self._same_actions:
+            action = self.action_layout.rows(action, "action")
+        return self.credit.add(
+            observation, action, next_observation, reward, terminated, truncated, env_ids=self.env_ids, **options
+        )
+
+    def drop(self, env_index: int) -> None:
+        """Give up the running episode of an environment, which was reset."""
+        self.credit.drop(self.env_ids[env_index])
+
+
+def check_assigner(credit: object, agents: int = 1) -> None:
+    """Raise `LareError` if `credit` is not an assigner for this number of agents."""
+    if not isinstance(credit, CreditAssigner):
+        raise LareError(f"credit must be a CreditAssigner, and is {short_repr(credit)}")
+    if credit.config.agents != agents:
+        raise LareError(
+            f"the assigner was made for agents={credit.config.agents}, and the environment has {agents}: create it with agents={agents}"
+        )
+
+
+def check_capacity(credit: CreditAssigner, n_steps: int) -> None:
+    """Raise `LareError` if an assigner keeps fewer steps than a buffer."""
+    capacity = credit.store.capacity
+    if capacity < n_steps:
+        raise LareError(
+            f"the assigner keeps {capacity} steps, and the buffer {n_steps}: create it with capacity={n_steps}"
+        )
+
+
+def check_pay(pay: str) -> None:
+    """Raise `LareError` if `pay` is unknown."""
+    if pay not in ("proxy", "environment"):
+        raise LareError(f"pay = {pay!r} must be 'proxy' or 'environment'")

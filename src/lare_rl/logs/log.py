@@ -1,0 +1,117 @@
+"""Logs: Minari and Hugging Face data sets, directories of .npz files, Parquet files, and arrays."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from lare_rl.errors import LareError, short_repr
+from lare_rl.logs.episode import LoggedEpisode, LogLayout, RelabelledEpisode, infer_layout, parse_episode
+from lare_rl.logs.output import check_output
+from lare_rl.tasks.spec import TaskSpec, require_role
+
+__all__ = ["Log", "open_log"]
+
+
+class Log(ABC):
+    """A log, which is read as a stream, more than once. It is never in memory as a whole, except for a log of arrays."""
+
+    name: str
+    """The path or the id, for messages."""
+    layout: LogLayout
+    n_episodes: int | None = None
+    """The number of episodes; None if it is unknown."""
+
+    @abstractmethod
+    def read(self) -> Iterator[tuple[str, Mapping[str, Any], Any]]:
+        """Yield the name, the arrays and the contents (see `parse_episode`) of each episode, in order."""
+
+    @abstractmethod
+    def write(
+        self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str
+    ) -> str | Path:
+        """Write the log with r_hat as rewards, and the original rewards as `paid`, completely or not at all.
+
+        Args:
+            out: a path, or an id.
+            episodes: the episodes in order. They are consumed as they are written.
+            overwrite: replace `out` if it exists.
+            comment: a sentence about the new rewards, for formats with a description.
+
+        Returns:
+            The path or the id.
+        """
+
+    def episodes(self) -> Iterator[LoggedEpisode]:
+        """Yield all episodes, in order. Raises `LareError` at the first damaged one."""
+        for name, values, contents in self.read():
+            yield parse_episode(name, values, self.layout, contents)
+
+    def check_output(self, out: str | Path, overwrite: bool) -> None:
+        """Raise `LareError` if `out` cannot be written."""
+        check_output(Path(out), overwrite)
+
+    def infer_layout(self, role: TaskSpec | None) -> LogLayout:
+        """Infer the layout from the first episode. Raises `LareError` for an empty log."""
+        for name, values, _ in self.read():
+            return infer_layout(name, values, role)
+        raise LareError(f"{self.name} has no episode")
+
+
+def open_log(source: Any, task: TaskSpec | None = None) -> Log:
+    """Open a log by its path, its Minari id, or as an object.
+
+    Args:
+        source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
+            flat arrays by name (as in D4RL), or a list of episodes, each a mapping of arrays.
+        task: has the time limit, and the number of choices if observations or actions are whole numbers.
+
+    Raises:
+        LareError: the log does not exist, is not a log, or its first episode is damaged.
+    """
+    role = None if task is None else require_role(task)
+    # Each format is imported when it is needed, because the libraries of most formats are optional.
+    if isinstance(source, Mapping):
+        from lare_rl.logs.arrays import FlatLog
+
+        return FlatLog(source, role)
+    if hasattr(source, "iterate_episodes"):
+        from lare_rl.logs.minari import MinariLog
+
+        return MinariLog(source, role)
+    if isinstance(source, str | Path):
+        return _open_path(source, role)
+    if isinstance(source, Iterable) and not isinstance(source, bytes):
+        from lare_rl.logs.arrays import ListLog
+
+        return ListLog(source, role)
+    raise LareError(
+        f"{short_repr(source)} is not a log: give a path, a Minari id, arrays by name, or a list of episodes"
+    )
+
+
+def _open_path(source: str | Path, role: TaskSpec | None) -> Log:
+    path = Path(source)
+    if path.is_file() and path.suffix.lower() in (".csv", ".tsv", ".txt", ".json", ".jsonl"):
+        raise LareError(
+            f"{path} is text, which cannot be read: write the log as .npz or Parquet (docs/logs.md, Formats)"
+        )
+    if path.is_file() or any(path.glob("*.parquet")):
+        from lare_rl.logs.parquet import ParquetLog
+
+        return ParquetLog(path, role)
+    if any((path / name).exists() for name in ("state.json", "dataset_dict.json")):
+        from lare_rl.logs.huggingface import HuggingFaceLog
+
+        return HuggingFaceLog(path, role)
+    if path.is_dir():
+        from lare_rl.logs.npz import NpzLog
+
+        return NpzLog(path, role)
+    if isinstance(source, Path) or source.endswith((".parquet", "/")):
+        raise LareError(f"{source} does not exist")
+    try:
+        from lare_rl.logs.minari import MinariLog, load_dataset
+    except LareError as error:
+        raise LareError(f"no file or directory {source} exists. If it is the id of a data set: {error}") from error
+    return MinariLog(load_dataset(source), role)

@@ -1,0 +1,155 @@
+"""What an index means: x[:, 1:3], x[:, None], x[np.arange(batch), i].
+
+Fixed indices move positions as NumPy would move numbers. Computed indices become an array of positions, which `take` reads.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from lare_rl.phi.batch import BatchSize, Shaped
+from lare_rl.phi.builder import current_builder
+from lare_rl.phi.graph import all_positions
+from lare_rl.phi.limits import RefusedError
+
+__all__ = ["ALL", "computed_positions", "fixed_index", "index_entries", "is_mask", "masked_index", "overwrite"]
+
+ALL = slice(None)
+
+
+def is_mask(entry: Any) -> bool:
+    """Return whether an entry of an index is an array of truth values."""
+    return getattr(entry, "kind", None) == "bool"
+
+
+def index_entries(array: Shaped, items: Sequence[Any]) -> list[Any]:
+    """Return an index as an entry for each axis, and None for each new one: slices, integers, arrays of integers."""
+    entries: list[Any] = []
+    for item in items:
+        if isinstance(item, slice):
+            entries.append(_read_slice(item))
+        elif item is None or item is ...:
+            entries.append(item)
+        elif hasattr(item, "is_row_number"):
+            if item.constant is None:
+                entries.append(item)
+            else:
+                entries.extend(item.constant.nonzero() if item.kind == "bool" else [_check_integers(item).constant])
+        elif isinstance(item, (bool, float)):
+            raise IndexError(f"{item} is not an index: an index is an integer, a slice or an array of integers")
+        else:
+            entries.append(operator.index(item))
+    n_axes = sum(entry.ndim if is_mask(entry) else 1 for entry in entries if entry is not None and entry is not ...)
+    ellipses = [i for i, entry in enumerate(entries) if entry is ...]
+    if n_axes > array.ndim or len(ellipses) > 1:
+        raise IndexError(f"too many indices for an array of the shape {array.shape}")
+    i = ellipses[0] if ellipses else len(entries)
+    return [*entries[:i], *[ALL] * (array.ndim - n_axes), *entries[i + 1 :]]
+
+
+def _read_slice(entry: slice) -> slice:
+    stop = None if isinstance(entry.stop, BatchSize) and entry.start in (None, 0) else entry.stop
+    return slice(*(None if end is None else operator.index(end) for end in (entry.start, stop, entry.step)))
+
+
+def fixed_index(array: Shaped, entries: Sequence[Any]) -> tuple[Callable[[np.ndarray], np.ndarray], int | None]:
+    """Return what an index does to positions, and where the batch axis then is. NumPy finds it on an array without numbers."""
+    axes = [entry for entry in entries if entry is not None]
+    if array.batch_axis is not None and axes[array.batch_axis] not in (ALL, slice(0, None), slice(0, None, 1)):
+        raise RefusedError(
+            "E-ROWS", f"an index into the batch axis of the shape {array.shape} takes one row for all: write x[:, i]"
+        )
+    # An axis of length 0 marks the batch axis; without one, it is behind all others.
+    at = array.ndim if array.batch_axis is None else array.batch_axis
+    shape, index = [*array.row_shape[:at], 0, *array.row_shape[at + 1 :]], tuple(entries)
+    result = np.empty(shape)[index if array.batch_axis is not None else (*index, ALL)].shape
+    if result.count(0) > 1:
+        raise IndexError(f"a slice is empty: it lies beyond the end of an axis of the shape {array.shape}")
+    current_builder().check_size([size or 1 for size in result])
+    batch_axis = None if array.batch_axis is None else result.index(0)
+    return lambda positions: np.asarray(positions[index]), batch_axis
+
+
+def masked_index(array: Shaped, entries: Sequence[Any]) -> tuple[Any, ...]:
+    """Return the index of all numbers that the mask in front of an index may select."""
+    mask = entries[0]
+    if mask.batch_axis != array.batch_axis or mask.row_shape != array.row_shape[: mask.ndim]:
+        raise IndexError(f"a mask of the shape {mask.shape} does not fit an array of the shape {array.shape}")
+    if not all(isinstance(entry, (int, slice)) for entry in entries[1:]):
+        raise RefusedError("E-NUMPY", "an index with a mask may contain integers and slices only")
+    return (ALL,) * mask.ndim + tuple(entries[1:])
+
+
+def computed_positions(array: Shaped, entries: Sequence[Any], as_array: Callable[[Any], Any]) -> Any:
+    """Return the array of the positions of x[np.arange(batch), i, 2:4] in a row.
+
+    Each row reads its own numbers, or those of a constant. A computed index beyond the end of an axis stands for the last entry.
+    """
+    at_arrays = [i for i, entry in enumerate(entries) if not isinstance(entry, slice) and entry is not None]
+    apart = at_arrays != list(range(at_arrays[0], at_arrays[-1] + 1))
+    first = (
+        -1 if apart else at_arrays[0]
+    )  # if slices are between arrays, the axes of the arrays come first in the result
+    computed = as_array(0)
+    before: list[np.ndarray] = []
+    behind: list[np.ndarray] = []
+    axes = iter(range(array.ndim))
+    for i, entry in enumerate(entries):
+        axis = None if entry is None else next(axes)
+        size, stride = (1, 0) if axis is None else (array.row_shape[axis], math.prod(array.row_shape[axis + 1 :]))
+        if axis is not None and axis == array.batch_axis:
+            if entry is None or not getattr(entry, "is_row_number", False) or size > 1:
+                raise RefusedError(
+                    "E-ROWS",
+                    "an index that differs from row to row begins with np.arange(batch): x[np.arange(len(x)), i]",
+                )
+            computed = as_array(np.zeros(entry.row_shape, int)).reshaped(entry.row_shape, entry.batch_axis) + computed
+        elif isinstance(entry, slice) or entry is None:
+            (behind if i > first else before).append(np.arange(size)[entry or ALL] * stride)
+        else:
+            computed = _clamp(as_array(entry), size) * stride + computed
+    sizes = [len(steps) for steps in before], [len(steps) for steps in behind]
+    current_builder().check_size((*sizes[0], *computed.row_shape, *sizes[1]))
+    offsets = sum(np.meshgrid(*before, *behind, indexing="ij"), np.zeros((), int))
+    offsets = np.reshape(offsets, (*sizes[0], *[1] * computed.ndim, *sizes[1]))
+    shape = *[1] * len(before), *computed.row_shape, *[1] * len(behind)
+    batch_axis = None if computed.batch_axis is None else len(before) + computed.batch_axis
+    return computed.reshaped(shape, batch_axis).copy() + offsets
+
+
+def overwrite(old: int, positions: int, values: int) -> int:
+    """Return the node of an array after writing at computed positions. Of values at equal positions, the last one stays."""
+    builder = current_builder()
+    shape, count = builder.nodes[old].shape, math.prod(builder.nodes[positions].shape)
+    size = math.prod(shape)
+    values = builder.flatten(values)
+    hits = builder.elementwise("equal", builder.reshape(positions, (count, 1)), builder.constant(np.arange(size)[None]))
+    backwards = builder.gather(hits, all_positions((count, size))[::-1])
+    last = builder.elementwise("subtract", builder.constant(count - 1), builder.reduce("argmax", backwards, (0,)))
+    old = builder.flatten(old)
+    new = builder.where(builder.reduce("any", hits, (0,)), builder.take(values, last), old)
+    return builder.reshape(new, shape)
+
+
+def _clamp(index: Any, size: int) -> Any:
+    """Return an index counted from the start of an axis. A computed index beyond the end stands for the last entry."""
+    values = _check_integers(index).constant
+    if values is not None and not (-size <= values.min() and values.max() < size):
+        raise IndexError(f"an index is out of bounds for an axis of length {size}")
+    nodes = current_builder().nodes
+    node = nodes[index.node]
+    if node.op in ("argmin", "argmax", "argsort") and nodes[node.inputs[0]].shape[node.option] <= size:
+        return index
+    index = index.apply("where", index < 0, index + size, index)
+    return index.apply("minimum", index.apply("maximum", index, 0), size - 1)
+
+
+def _check_integers(index: Any) -> Any:
+    if index.kind != "int":
+        raise IndexError("an index must be made of integers: convert it with astype(int)")
+    return index

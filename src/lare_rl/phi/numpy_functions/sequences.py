@@ -1,0 +1,133 @@
+"""Functions along one axis: cumulative sums, differences, gradients, integrals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lare_rl.phi.arrays import Array, as_array, broadcast, concatenate, elementwise
+from lare_rl.phi.builder import current_builder
+from lare_rl.phi.indices import ALL
+from lare_rl.phi.numpy_functions.reductions import along, flatten_constant
+from lare_rl.phi.numpy_functions.registry import (
+    array_functions,
+    as_numbers,
+    numpy_function,
+    require_constant,
+)
+
+
+def scan(op: str, x: Array, axis: Any) -> Array:
+    """Apply cumsum, cumprod, sort or argsort along an axis."""
+    x = x if axis is not None or x.ndim == 1 else flatten_constant(x)
+    (at,) = x.row_axes(0 if axis is None else axis)
+    return Array(current_builder().scan(op, x.node, at), x.batch_axis)
+
+
+array_functions(
+    {
+        "cumsum cumulative_sum": lambda a, axis=None: scan("cumsum", a, axis),
+        "cumprod cumulative_prod": lambda a, axis=None: scan("cumprod", a, axis),
+        "nancumsum": lambda a, axis=None: scan("cumsum", elementwise("where", elementwise("isnan", a), 0, a), axis),
+        "add.accumulate": lambda array, axis=0: scan("cumsum", array, axis),
+        "multiply.accumulate": lambda array, axis=0: scan("cumprod", array, axis),
+    }
+)
+
+
+def _register_accumulation(ufunc: str) -> None:
+    """maximum.accumulate and its like, by doubling: after k turns, an entry knows the 2^k before it."""
+
+    def accumulate(array: Array, axis: Any = 0) -> Any:
+        (at,) = array.row_axes(axis)
+        size, shift = array.row_shape[at], 1
+        while shift < size:
+            before = [max(i - shift, 0) for i in range(size)]
+            array = elementwise(ufunc, array, array[(*(ALL,) * at, before)])
+            shift *= 2
+        return array
+
+    numpy_function(f"{ufunc}.accumulate")(accumulate)
+
+
+for _ufunc in ("maximum", "minimum", "fmax", "fmin", "logical_and", "logical_or"):
+    _register_accumulation(_ufunc)
+
+
+@numpy_function()
+def diff(a: Array, n: int = 1, axis: int = -1, prepend: Any = None, append: Any = None) -> Any:
+    (at,) = a.row_axes(axis)
+    edge = (*a.row_shape[:at], 1, *a.row_shape[at + 1 :])
+    ends = [
+        x if x is a or x is None or as_array(x).ndim else broadcast(as_array(x), edge, a.batch_axis)
+        for x in (prepend, a, append)
+    ]
+    a = (
+        concatenate([as_array(x) for x in ends if x is not None], at)
+        if prepend is not None or append is not None
+        else a
+    )
+    op = "not_equal" if a.kind == "bool" else "subtract"
+    for _ in range(n):
+        a = elementwise(op, a[(*(ALL,) * at, slice(1, None))], a[(*(ALL,) * at, slice(None, -1))])
+    return a
+
+
+@numpy_function()
+def gradient(f: Array, *varargs: Any, axis: Any = None, edge_order: int = 1) -> Any:
+    """Central differences inside, and one-sided differences at the ends."""
+    axes = f.row_axes(axis)
+    spacings = [as_array(x) for x in (varargs if len(varargs) == len(axes) else (varargs or (1.0,)) * len(axes))]
+    slopes = [
+        _gradient_along(as_numbers(f), at, spacing, edge_order) for at, spacing in zip(axes, spacings, strict=True)
+    ]
+    return slopes[0] if isinstance(axis, int) or len(slopes) == 1 else slopes
+
+
+def _gradient_along(f: Array, at: int, spacing: Array, edge_order: int) -> Any:
+    size = f.row_shape[at]
+    if size < edge_order + 1:
+        raise ValueError(f"np.gradient needs at least {edge_order + 1} numbers along its axis")
+
+    def entries(index: Any) -> Any:
+        return f[(*(ALL,) * at, index)]
+
+    x = [float(v) for v in require_constant(spacing, "the spacing of np.gradient").ravel()]
+    x = [i * x[0] for i in range(size)] if len(x) == 1 else x
+    shape = [-1 if i == at else 1 for i in range(f.ndim)]
+
+    def column(values: list[float]) -> Array:
+        return as_array(values).reshaped(shape, None)
+
+    before, behind = [x[i] - x[i - 1] for i in range(1, size - 1)], [x[i + 1] - x[i] for i in range(1, size - 1)]
+    pieces = [entries(slice(0, 1)), *([entries(slice(1, -1))] if size > 2 else []), entries(slice(-1, None))]
+    pieces[0] = (entries(slice(1, 2)) - entries(slice(0, 1))) / (x[1] - x[0])
+    pieces[-1] = (entries(slice(-1, None)) - entries(slice(-2, -1))) / (x[-1] - x[-2])
+    if size > 2:
+        inner = [
+            (-d1 / (d0 * (d0 + d1)), (d1 - d0) / (d0 * d1), d0 / (d1 * (d0 + d1)))
+            for d0, d1 in zip(before, behind, strict=True)
+        ]
+        w_before, w_middle, w_behind = (column([weights[i] for weights in inner]) for i in range(3))
+        pieces[1] = (
+            entries(slice(None, -2)) * w_before + entries(slice(1, -1)) * w_middle + entries(slice(2, None)) * w_behind
+        )
+    if edge_order == 2:
+        h = x[1] - x[0]
+        pieces[0] = (-1.5 * entries(slice(0, 1)) + 2.0 * entries(slice(1, 2)) - 0.5 * entries(slice(2, 3))) / h
+        pieces[-1] = (0.5 * entries(slice(-3, -2)) - 2.0 * entries(slice(-2, -1)) + 1.5 * entries(slice(-1, None))) / h
+    return concatenate(pieces, at)
+
+
+@numpy_function("trapezoid", "trapz")
+def trapezoid(y: Array, x: Any = None, dx: Any = 1.0, axis: int = -1) -> Any:
+    (at,) = y.row_axes(axis)
+    width = as_array(dx)
+    if x is not None:
+        x = as_array(x)
+        width = diff(x, 1, 0 if x.ndim == 1 else at)
+        width = width[(..., *(None,) * (y.ndim - 1 - at))] if x.ndim == 1 and y.ndim > 1 else width
+    both = elementwise("add", y[(*(ALL,) * at, slice(1, None))], y[(*(ALL,) * at, slice(None, -1))])
+    return along("sum", elementwise("multiply", width, elementwise("divide", both, 2.0)), at)
+
+
+array_functions({"ediff1d": lambda ary: diff(flatten_constant(ary))})

@@ -1,0 +1,177 @@
+"""Functions of lists and the like: len, sorted, zip, and those of `itertools`, `functools` and `operator`."""
+
+import ast
+import functools
+import itertools
+import math
+import operator
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from lare_rl.phi.arrays import Array
+from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.meter import check_key
+from lare_rl.phi.python_functions.registry import BUILTINS, builtin, varies
+from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.text import format_value
+from lare_rl.phi.values import Bound, Class, Iterator, Set, Symbol
+
+ADDITION = Symbol("operator.add")
+
+
+@builtin("len")
+def len_(_: Runtime, x: Any) -> Any:
+    if isinstance(x, Array) and x.ndim:
+        return x.shape[0]
+    if isinstance(x, Class):
+        return len([name for name in x.attributes if not name.startswith("_")])
+    if isinstance(x, (list, tuple, dict, range, str)):
+        return len(x)
+    raise TypeError("len() of a value without entries")
+
+
+@builtin("range")
+def range_(runtime: Runtime, *ends: Any) -> range:
+    result = range(*(operator.index(end) for end in ends))
+    runtime.meter.pay_for_list(len(result))
+    return result
+
+
+@builtin("sum", "math.fsum")
+def sum_(runtime: Runtime, values: Any, start: Any = 0) -> Any:
+    return functools.reduce(lambda x, y: runtime.binary(ast.Add(), x, y), runtime.items(values), start)
+
+
+def _register_extreme(name: str, function: Callable[..., Any]) -> None:
+    def extreme(runtime: Runtime, *values: Any, key: Any = None, **default: Any) -> Any:
+        items = runtime.items(values[0]) if len(values) == 1 else values
+        if varies(items):
+            hint = f"use np.{name}imum, or np.{name} along axis=1"
+            raise RefusedError("E-FLOW", f"{name}() of numbers that differ from row to row: {hint}")
+        return function(items, key=_sort_key(runtime, key), **default)
+
+    builtin(name)(extreme)
+
+
+_register_extreme("max", max)
+_register_extreme("min", min)
+
+
+@builtin("sorted")
+def sorted_(runtime: Runtime, values: Any, *, key: Any = None, reverse: Any = False) -> list[Any]:
+    items = list(runtime.items(values))
+    if varies(items):
+        raise RefusedError("E-FLOW", "sorted() of numbers that differ from row to row: use np.sort along axis=1")
+    return sorted(items, key=_sort_key(runtime, key), reverse=bool(reverse))
+
+
+def _sort_key(runtime: Runtime, key: Any) -> Callable[[Any], Any] | None:
+    def sort_key(item: Any) -> Any:
+        value = runtime.call(key, [item], {})
+        runtime.meter.pay_for_all_within([value])
+        return value
+
+    return None if key is None else sort_key
+
+
+@builtin("dict", "collections.OrderedDict")
+def dict_(runtime: Runtime, values: Any = (), **more: Any) -> dict[Any, Any]:
+    if isinstance(values, dict):
+        runtime.meter.pay_for_list(len(values))
+        return dict(values) | more
+    return {check_key(key): value for key, value in map(runtime.items, runtime.items(values))} | more
+
+
+@builtin("filter")
+def filter_(runtime: Runtime, function: Any, values: Any) -> Iterator:
+    def keep(item: Any) -> bool:
+        return runtime.truth(item if function is None else runtime.call(function, [item], {}))
+
+    return Iterator(filter(keep, runtime.items(values)))
+
+
+@builtin("next")
+def next_(_: Runtime, iterator: Any, *default: Any) -> Any:
+    if not isinstance(iterator, Iterator) or not (iterator or default):
+        raise TypeError("next() of a value that is no iterator, or has no further entries")
+    return iterator.pop(0) if iterator else default[0]
+
+
+def _map(runtime: Runtime, function: Any, argument_lists: Iterable[Sequence[Any]]) -> Iterator:
+    return Iterator(runtime.call(function, list(args), {}) for args in argument_lists)
+
+
+def _make(convert: Callable[[Sequence[Any]], Any]) -> Callable[..., Any]:
+    """Return the function that makes a list or the like of the entries of its argument."""
+    return lambda runtime, values=(): convert(runtime.meter.pay_for_list(runtime.items(values)))
+
+
+def _make_set(values: Sequence[Any]) -> Set:
+    return Set(dict.fromkeys(map(check_key, values)))
+
+
+BUILTINS |= {
+    "list": _make(list),
+    "tuple": _make(tuple),
+    "set": _make(_make_set),
+    "frozenset": _make(_make_set),
+    "iter": _make(Iterator),
+    "reversed": _make(lambda values: Iterator(list(values)[::-1])),
+    "all": lambda runtime, values: all(map(runtime.truth, runtime.items(values))),
+    "any": lambda runtime, values: any(map(runtime.truth, runtime.items(values))),
+    "enumerate": lambda runtime, values, start=0: Iterator(enumerate(runtime.items(values), operator.index(start))),
+    "zip": lambda runtime, *values, strict=False: Iterator(zip(*map(runtime.items, values), strict=bool(strict))),
+    "map": lambda runtime, f, *values: _map(runtime, f, zip(*map(runtime.items, values), strict=False)),
+    "itertools.starmap": lambda runtime, f, values: _map(runtime, f, map(runtime.items, runtime.items(values))),
+    "slice": lambda _, *ends: slice(*ends),
+    "print": lambda _, *values, **more: None,
+    "str": lambda runtime, value="": format_value(runtime.meter, value, ""),
+    "repr": lambda runtime, value: format_value(runtime.meter, value, ""),
+    "format": lambda runtime, value, spec="": format_value(runtime.meter, value, spec),
+    "functools.partial": lambda runtime, function, *args, **kwargs: Bound(
+        lambda *more, **keywords: runtime.call(function, [*args, *more], kwargs | keywords)
+    ),
+    "functools.reduce": lambda runtime, function, values, *initial: functools.reduce(
+        lambda x, y: runtime.call(function, [x, y], {}), runtime.items(values), *initial
+    ),
+    "itertools.accumulate": lambda runtime, values, function=ADDITION, **initial: Iterator(
+        itertools.accumulate(runtime.items(values), lambda x, y: runtime.call(function, [x, y], {}), **initial)
+    ),
+    "operator.itemgetter": lambda runtime, *keys: Bound(
+        lambda x: runtime.item(x, keys[0]) if len(keys) == 1 else tuple(runtime.item(x, key) for key in keys)
+    ),
+    "operator.attrgetter": lambda runtime, name: Bound(lambda x: runtime.attribute(x, name)),
+}
+
+
+def _register_itertool(name: str, count: Callable[..., int]) -> None:
+    """Register a function of itertools. `count` returns the length of its result, which is paid for first."""
+
+    def results(runtime: Runtime, *args: Any, **kwargs: Any) -> Iterator:
+        many = len(args) > 20 or any(isinstance(x, int) and x > 20 for x in (*args, *kwargs.values()))
+        if many and name not in ("chain", "islice", "repeat"):
+            raise RefusedError("E-COST", f"itertools.{name} of more than 20 entries at a time")
+        plain = [x if isinstance(x, int) or x is None else list(runtime.items(x)) for x in args]
+        runtime.meter.pay_for_list(count(*plain, **kwargs))
+        return Iterator(getattr(itertools, name)(*plain, **kwargs))
+
+    builtin(f"itertools.{name}")(results)
+
+
+_register_itertool("chain", lambda *x: sum(map(len, x)))
+_register_itertool("pairwise", len)
+_register_itertool("combinations", lambda x, r: math.comb(len(x), r) * max(r, 1))
+_register_itertool("combinations_with_replacement", lambda x, r: math.comb(len(x) + r, r) * max(r, 1))
+_register_itertool("permutations", lambda x, r=None: math.perm(min(len(x), 30), r) * 20)
+_register_itertool(
+    "product", lambda *x, repeat=1: math.prod(map(len, x)) ** operator.index(repeat) * (len(x) * repeat or 1)
+)
+_register_itertool("islice", lambda x, *ends: len(x))
+_register_itertool("repeat", lambda x, times: max(times, 0))
+_register_itertool("zip_longest", lambda *x, fillvalue=None: len(x) * max(map(len, x)))
+
+
+@builtin("np.ndindex")
+def ndindex(runtime: Runtime, *shape: Any) -> Iterator:
+    sizes = shape[0] if len(shape) == 1 and isinstance(shape[0], (tuple, list)) else shape
+    return BUILTINS["itertools.product"](runtime, *(range_(runtime, size) for size in sizes))

@@ -1,0 +1,110 @@
+"""Functions of numbers: float, round, and those of `math`."""
+
+import ast
+import functools
+import math
+import operator
+import re
+from collections.abc import Callable
+from typing import Any
+
+from lare_rl.phi.arrays import Array
+from lare_rl.phi.batch import BatchSize
+from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.meter import check_number
+from lare_rl.phi.numpy_functions import call_numpy
+from lare_rl.phi.operand import Operand
+from lare_rl.phi.python_functions.registry import BUILTINS, builtin, varies
+from lare_rl.phi.runtime import Runtime
+
+SAME_IN_NUMPY = {
+    "fabs": "abs", "pow": "power", "atan2": "arctan2", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
+}  # fmt: skip
+OPERATORS: dict[str, type[ast.operator]] = {
+    "add": ast.Add, "sub": ast.Sub, "mul": ast.Mult, "truediv": ast.Div, "floordiv": ast.FloorDiv, "mod": ast.Mod,
+    "pow": ast.Pow, "and_": ast.BitAnd, "or_": ast.BitOr, "xor": ast.BitXor, "matmul": ast.MatMult,
+}  # fmt: skip
+
+
+def _register_conversion(name: str, text: str, convert: Callable[[Any], Any]) -> None:
+    """Register float or int. A text must match the pattern `text`."""
+
+    def number(_: Runtime, x: Any = 0) -> Any:
+        if isinstance(x, BatchSize):
+            x.refuse()
+        if varies([x]):
+            raise RefusedError("E-FLOW", f"{name}() of numbers that differ from row to row: use astype({name})")
+        if isinstance(x, str) and not re.fullmatch(text, x, re.IGNORECASE):
+            raise TypeError(f"{name}() of {x[:40]!r}")
+        if not isinstance(x, (bool, int, float, str, Array)):
+            raise TypeError(f"{name}() of a value that is no number")
+        return check_number(convert(x))
+
+    builtin(name)(number)
+
+
+_register_conversion("float", r"\s*[-+]?(\d{1,30}\.?\d{0,30}([eE][-+]?\d{1,3})?|inf|infinity|nan)\s*", float)
+_register_conversion("int", r"\s*[-+]?\d{1,18}\s*", int)
+
+
+@builtin("round")
+def round_(_: Runtime, x: Any, ndigits: Any = None) -> Any:
+    if isinstance(x, Operand):
+        return call_numpy("round", [x, ndigits or 0], {})
+    return round(x) if ndigits is None else round(x, max(-30, min(operator.index(ndigits), 30)))
+
+
+@builtin("divmod")
+def divmod_(_: Runtime, x: Any, y: Any) -> Any:
+    return call_numpy("divmod", [x, y], {}) if isinstance(x, Operand) or isinstance(y, Operand) else divmod(x, y)
+
+
+def _register_math(name: str) -> None:
+    def compute(runtime: Runtime, *args: Any, **kwargs: Any) -> Any:
+        if varies(args):
+            numpy_name = SAME_IN_NUMPY.get(name, name)
+            raise RefusedError("E-FLOW", f"math.{name} takes one number, not an array: use np.{numpy_name}")
+        numbers = [
+            [float(item) for item in runtime.items(x)]
+            if isinstance(x, (list, tuple))
+            else (x if isinstance(x, int) else float(x))
+            for x in args
+        ]
+        return check_number(getattr(math, name)(*numbers, **{key: float(x) for key, x in kwargs.items()}))
+
+    builtin(f"math.{name}")(compute)
+
+
+for _name in (
+    "acos acosh asin asinh atan atan2 atanh ceil copysign cos cosh degrees erf erfc exp expm1 fabs floor fmod gamma hypot isfinite "
+    "isinf isnan isclose lgamma log log10 log1p log2 modf pow radians sin sinh sqrt tan tanh trunc remainder dist gcd lcm"
+).split():
+    _register_math(_name)
+
+
+@builtin("math.factorial")
+def factorial(_: Runtime, n: Any) -> int:
+    return check_number(math.factorial(min(operator.index(n), 21)))  # 21! is too large
+
+
+@builtin("math.comb")
+def comb(_: Runtime, n: Any, k: Any) -> int:
+    n, k = operator.index(n), operator.index(k)
+    # Of 2k or more things, k >= 34 can be chosen in more ways than an integer may count.
+    return check_number(math.comb(n, min(k, n - k, 34) if 0 <= k <= n else k))
+
+
+def _operator(op: type[ast.operator]) -> Callable[..., Any]:
+    return lambda runtime, x, y: runtime.binary(op(), x, y)
+
+
+BUILTINS |= {
+    "abs": lambda _, x: abs(x),
+    "pow": _operator(ast.Pow),
+    "bool": lambda runtime, x=False: runtime.truth(x),
+    "math.prod": lambda runtime, values, start=1: functools.reduce(
+        lambda x, y: runtime.binary(ast.Mult(), x, y), runtime.items(values), start
+    ),
+    "operator.neg": lambda _, x: -x,
+    **{f"operator.{name}": _operator(op) for name, op in OPERATORS.items()},
+}

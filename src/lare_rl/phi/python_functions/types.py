@@ -1,0 +1,111 @@
+"""Functions of types and attributes: isinstance, getattr, namedtuple, types of numbers, errors."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from lare_rl.phi.arrays import as_array
+from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.meter import check_text
+from lare_rl.phi.numpy_functions.registry import KIND_OF_DTYPE, astype, dtype_kind, dtype_name
+from lare_rl.phi.python_functions.registry import BUILTINS, builtin
+from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.text import format_value
+from lare_rl.phi.values import Bound, Class, Function, Instance, Symbol, value_type
+
+_EXCEPTIONS: list[type[Exception]] = [
+    Exception, ValueError, TypeError, IndexError, KeyError, LookupError, ZeroDivisionError, ArithmeticError, AttributeError,
+    AssertionError, RuntimeError, NotImplementedError, OverflowError, FloatingPointError, NameError,
+]  # fmt: skip
+ERRORS = {cls.__name__: [base.__name__ for base in cls.__mro__] for cls in _EXCEPTIONS}
+"""The errors that a program can raise and catch, and the classes above them."""
+
+_SEQUENCE = ["collections.abc.Sequence", "typing.Sequence", "collections.abc.Iterable", "typing.Iterable"]
+_REAL = ["numbers.Number", "numbers.Real"]
+_PARENTS = {
+    "bool": ["int", *_REAL, "numbers.Integral"], "int": [*_REAL, "numbers.Integral"], "float": _REAL, "list": _SEQUENCE,
+    "tuple": _SEQUENCE, "dict": ["collections.abc.Mapping", "typing.Mapping"], "function": ["collections.abc.Callable"],
+}  # fmt: skip
+"""The types above a type."""
+
+
+@builtin("isinstance")
+def isinstance_(_: Runtime, value: Any, classes: Any) -> bool:
+    classes = classes if isinstance(classes, tuple) else (classes,)
+    if isinstance(value, Instance):
+        return any(cls in classes for cls in (value.cls, *value.cls.bases)) or Symbol("object") in classes
+    name = value_type(value).name
+    names = (name, "object", *_PARENTS.get(name, ()))
+    return any(isinstance(cls, Symbol) and cls.name in names for cls in classes)
+
+
+@builtin("hasattr")
+def hasattr_(runtime: Runtime, value: Any, name: str) -> bool:
+    """Return whether a value has an attribute. No code of the program is carried out to find out."""
+    runtime.meter.pay(len(name) + 100)
+    if isinstance(value, Instance):
+        return name in value.attributes or value.cls.has(name) or value.cls.has("__getattr__")
+    if isinstance(value, Class):
+        return value.has(name)
+    try:
+        runtime.attribute(value, name)
+    except (RefusedError, AttributeError):
+        return False
+    return True
+
+
+@builtin("getattr")
+def getattr_(runtime: Runtime, value: Any, name: str, *default: Any) -> Any:
+    if default and not hasattr_(runtime, value, name):
+        return default[0]
+    return runtime.attribute(value, check_text(name))
+
+
+@builtin("collections.namedtuple")
+def namedtuple(runtime: Runtime, name: str, names: Any, defaults: Any = ()) -> Class:
+    fields = names.replace(",", " ").split() if isinstance(names, str) else list(runtime.items(names))
+    values = list(runtime.items(defaults))
+    attributes = dict(zip(fields[len(fields) - len(values) :], values, strict=True))
+    return Class(name, attributes, fields=fields, is_tuple=True)
+
+
+@builtin("np.finfo", "np.iinfo")
+def finfo(_: Runtime, dtype: Any) -> Any:
+    name = dtype_name(dtype)
+    if dtype_kind(dtype) == "int":
+        return np.iinfo(np.int32 if "32" in name else np.int64)
+    return np.finfo(np.float64 if name in ("float", "float64", "double", "f8") else np.float32)
+
+
+@builtin("np.issubdtype")
+def issubdtype(_: Runtime, dtype: Any, kind: Any) -> bool:
+    names = [dtype_name(dtype), dtype_name(kind)]
+    return names[1] in ("number", "generic") or KIND_OF_DTYPE.get(names[0]) == KIND_OF_DTYPE.get(names[1], "")
+
+
+@builtin("np.vectorize", "np.frompyfunc")
+def vectorize(runtime: Runtime, function: Any, *_: Any, **__: Any) -> Bound:
+    return Bound(lambda *args, **kwargs: runtime.call(function, [as_array(x) for x in args], kwargs))
+
+
+def _conversion(dtype: str) -> Callable[..., Any]:
+    return lambda _, x=0: astype(x, dtype)
+
+
+BUILTINS |= {
+    "type": lambda _, value: value.cls if isinstance(value, Instance) else value_type(value),
+    "object": lambda _: Instance(Class("object", {})),
+    "callable": lambda _, value: isinstance(value, (Function, Bound, Class)) or getattr(value, "name", "") in BUILTINS,
+    "types.SimpleNamespace": lambda _, **attributes: Instance(Class("SimpleNamespace", {}), attributes),
+    "dataclasses.field": lambda runtime, *, default=None, default_factory=None, **_: (
+        default if default_factory is None else runtime.call(default_factory, [], {})
+    ),
+    "np.dtype": lambda _, dtype: Symbol(f"np.{dtype_name(dtype)}") if dtype_kind(dtype) else None,
+    "np.isscalar": lambda _, value: isinstance(value, (bool, int, float, str)),
+    **{f"np.{name}": _conversion(name) for name in KIND_OF_DTYPE if name.isidentifier() and len(name) > 2},
+    **{
+        name: lambda runtime, *message: " ".join(format_value(runtime.meter, x, "") for x in message)[:200]
+        for name in ERRORS
+    },
+}

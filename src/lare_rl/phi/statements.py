@@ -1,0 +1,272 @@
+"""Statements of a program. Each kind of statement has one rule; all other kinds are refused.
+
+Conditions and loops cannot depend on the numbers of a row, so all of them have been carried out when the graph is complete.
+"""
+
+import ast
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from lare_rl.phi.arrays import Array
+from lare_rl.phi.attributes import imported_names
+from lare_rl.phi.classes import decorate, make_class
+from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.meter import check_key
+from lare_rl.phi.python_functions import ERRORS
+from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.text import format_value
+from lare_rl.phi.values import (
+    PYTHON_ERRORS,
+    BreakSignal,
+    Class,
+    ContinueSignal,
+    Instance,
+    ProgramError,
+    ReturnSignal,
+    Scope,
+    Set,
+    Symbol,
+    type_name,
+)
+
+__all__ = ["assign", "run_statements"]
+
+IGNORED_MANAGERS = {Symbol("np.errstate"), Symbol("np.printoptions"), Symbol("warnings.catch_warnings")}
+_KEYWORDS = {"AsyncFunctionDef": "async def", "AsyncFor": "async for", "AsyncWith": "async with", "TryStar": "except*"}
+
+
+def run_statements(runtime: Runtime, statements: Iterable[ast.stmt], scope: Scope) -> None:
+    for statement in statements:
+        runtime.line = runtime.builder.line = statement.lineno
+        runtime.meter.pay()
+        _execute(runtime, statement, scope)
+
+
+def _execute(runtime: Runtime, statement: ast.stmt, scope: Scope) -> None:
+    match statement:
+        case ast.Expr(value=value):
+            runtime.evaluate(value, scope)
+        case ast.Assign(targets=targets, value=value):
+            result = runtime.evaluate(value, scope)
+            for target in targets:
+                runtime.assign(target, result, scope)
+        case ast.AnnAssign(target=target, value=value):
+            if isinstance(target, ast.Name) and scope.kind == "class":
+                scope.setdefault("__annotations__", []).append(target.id)
+            if value is not None:
+                runtime.assign(target, runtime.evaluate(value, scope), scope)
+        case ast.AugAssign():
+            _augment(runtime, statement, scope)
+        case ast.Return(value=value):
+            raise ReturnSignal(None if value is None else runtime.evaluate(value, scope))
+        case ast.If(test=test, body=body, orelse=orelse):
+            runtime.run(body if runtime.truth(runtime.evaluate(test, scope)) else orelse, scope)
+        case ast.For(target=target, iter=iterable, body=body, orelse=orelse):
+            items = runtime.items(runtime.evaluate(iterable, scope))
+            _loop(runtime, (runtime.assign(target, item, scope) for item in items), body, orelse, scope)
+        case ast.While(test=test, body=body, orelse=orelse):
+            turns = iter(lambda: runtime.truth(runtime.evaluate(test, scope)), False)
+            _loop(runtime, turns, body, orelse, scope)
+        case ast.FunctionDef():
+            value = decorate(runtime, runtime.define(statement, scope), statement.decorator_list, scope)
+            scope.assign(statement.name, value)
+        case ast.ClassDef():
+            value = decorate(runtime, make_class(runtime, statement, scope), statement.decorator_list, scope)
+            scope.assign(statement.name, value)
+        case ast.Try():
+            _try(runtime, statement, scope)
+        case ast.With(items=managers, body=body):
+            for manager in managers:
+                call = manager.context_expr
+                function = runtime.evaluate(call.func if isinstance(call, ast.Call) else call, scope)
+                if function not in IGNORED_MANAGERS or manager.optional_vars is not None:
+                    raise RefusedError("E-PYTHON", "with is available for np.errstate only")
+            runtime.run(body, scope)
+        case ast.Import() | ast.ImportFrom():
+            for name, value in imported_names(statement):
+                scope.assign(name, value)
+        case ast.Assert(test=test, msg=message):
+            _assert(runtime, test, message, scope)
+        case ast.Raise(exc=error):
+            _raise(runtime, error, scope)
+        case ast.Delete(targets=targets):
+            for target in targets:
+                _delete(runtime, target, scope)
+        case ast.Global(names=names):
+            scope.elsewhere |= dict.fromkeys(names, runtime.module)
+        case ast.Nonlocal(names=names):
+            scope.elsewhere |= {name: _scope_with(name, scope.parent) for name in names}
+        case ast.Pass():
+            pass
+        case ast.Break():
+            raise BreakSignal
+        case ast.Continue():
+            raise ContinueSignal
+        case _:
+            name = type(statement).__name__
+            raise RefusedError("E-PYTHON", f"the statement {_KEYWORDS.get(name, name.lower())} is not available")
+
+
+def _loop(
+    runtime: Runtime, turns: Iterable[Any], body: Sequence[ast.stmt], orelse: Sequence[ast.stmt], scope: Scope
+) -> None:
+    for _ in turns:
+        runtime.meter.pay()
+        try:
+            runtime.run(body, scope)
+        except ContinueSignal:
+            continue
+        except BreakSignal:
+            return
+    runtime.run(orelse, scope)
+
+
+# --- assignments --------------------------------------------------------------------------------------------------------
+
+
+def assign(runtime: Runtime, target: ast.expr, value: Any, scope: Scope) -> None:
+    match target:
+        case ast.Name(id=name):
+            scope.assign(name, value)
+        case ast.Tuple(elts=targets) | ast.List(elts=targets):
+            items = list(runtime.items(value))
+            starred = next((i for i, item in enumerate(targets) if isinstance(item, ast.Starred)), None)
+            if starred is not None:
+                end = len(items) - (len(targets) - starred - 1)
+                items = [*items[:starred], items[starred:end], *items[end:]]
+            if len(items) != len(targets):
+                raise ValueError(f"{len(items)} values are unpacked into {len(targets)} names")
+            for item, entry in zip(targets, items, strict=True):
+                runtime.assign(item.value if isinstance(item, ast.Starred) else item, entry, scope)
+        case ast.Subscript(value=container, slice=index):
+            _set_item(runtime, runtime.evaluate(container, scope), runtime.evaluate(index, scope), value)
+        case ast.Attribute(value=owner_node, attr=name):
+            owner = runtime.evaluate(owner_node, scope)
+            if not isinstance(owner, (Instance, Class)):
+                raise RefusedError(
+                    "E-PYTHON", f".{name} cannot be assigned: only attributes of the program's own classes can"
+                )
+            owner.attributes[name] = value
+        case _:
+            raise RefusedError("E-PYTHON", f"nothing can be assigned to {type(target).__name__.lower()}")
+
+
+def _set_item(runtime: Runtime, container: Any, index: Any, value: Any) -> None:
+    runtime.meter.pay_for_all_within([index, value])
+    if isinstance(container, dict) and not isinstance(container, Set):
+        container[check_key(index)] = value
+    elif isinstance(container, Array) or (isinstance(container, list) and not isinstance(index, slice)):
+        container[index] = value
+    else:
+        raise TypeError(f"nothing can be written into a {type_name(container)}")
+
+
+def _augment(runtime: Runtime, statement: ast.AugAssign, scope: Scope) -> None:
+    """Carry out `x += y`. As in NumPy, an array is changed in place, and so are its views."""
+    target, container, index = statement.target, None, None
+    if isinstance(target, ast.Subscript):
+        container, index = runtime.evaluate(target.value, scope), runtime.evaluate(target.slice, scope)
+        old = runtime.item(container, index)
+    else:
+        old = runtime.evaluate(target, scope)
+    operand = runtime.evaluate(statement.value, scope)
+    if isinstance(old, list) and isinstance(statement.op, ast.Add):
+        items = list(runtime.items(operand))
+        runtime.meter.pay_for_list(len(old) + len(items))
+        old.extend(items)
+        return
+    new = runtime.binary(statement.op, old, operand)
+    if isinstance(target, ast.Subscript):
+        _set_item(runtime, container, index, new)
+    elif isinstance(old, Array) and old.ndim:
+        if isinstance(new, Array) and new.kind == "float" != old.kind:
+            raise TypeError("an array of integers or truth values cannot take fractions in place: use x = x + y")
+        old[...] = new
+    else:
+        runtime.assign(target, new, scope)
+
+
+def _delete(runtime: Runtime, target: ast.expr, scope: Scope) -> None:
+    match target:
+        case ast.Name(id=name) if name in scope:
+            del scope[name]
+        case ast.Subscript(value=container, slice=index):
+            owner, key = runtime.evaluate(container, scope), runtime.evaluate(index, scope)
+            if not isinstance(owner, (dict, list)):
+                raise TypeError(f"entries of a {type_name(owner)} cannot be deleted")
+            del owner[check_key(key) if isinstance(owner, dict) else key]
+        case _:
+            raise NameError("a name that is not defined cannot be deleted")
+
+
+def _scope_with(name: str, scope: Scope | None) -> Scope:
+    while scope is not None and name not in scope:
+        scope = scope.parent
+    if scope is None:
+        raise NameError(name)
+    return scope
+
+
+# --- errors -------------------------------------------------------------------------------------------------------------
+
+
+def _try(runtime: Runtime, statement: ast.Try, scope: Scope) -> None:
+    """Carry out `try`. Only what Python and NumPy would raise can be caught; after `RefusedError`, nothing is carried out."""
+    try:
+        _try_without_finally(runtime, statement, scope)
+    except (*PYTHON_ERRORS, ReturnSignal, BreakSignal, ContinueSignal):
+        runtime.run(statement.finalbody, scope)
+        raise
+    runtime.run(statement.finalbody, scope)
+
+
+def _try_without_finally(runtime: Runtime, statement: ast.Try, scope: Scope) -> None:
+    try:
+        runtime.run(statement.body, scope)
+    except PYTHON_ERRORS as error:
+        handler = next((h for h in statement.handlers if _catches(runtime, h, error, scope)), None)
+        if handler is None:
+            raise
+        if handler.name is not None:
+            scope.assign(handler.name, error.message if isinstance(error, ProgramError) else type(error).__name__)
+        runtime.run(handler.body, scope)
+    else:
+        runtime.run(statement.orelse, scope)
+
+
+def _catches(runtime: Runtime, handler: ast.ExceptHandler, error: Exception, scope: Scope) -> bool:
+    if handler.type is None:
+        return True
+    caught = runtime.evaluate(handler.type, scope)
+    symbols = [cls for cls in (caught if isinstance(caught, tuple) else (caught,)) if isinstance(cls, Symbol)]
+    classes = [cls.__name__ for cls in type(error).__mro__]
+    if isinstance(error, ProgramError):
+        classes = ERRORS.get(error.name, [error.name, "Exception"])
+    return any(symbol.name.rpartition(".")[2] in classes for symbol in symbols)
+
+
+def _assert(runtime: Runtime, test: ast.expr, message: ast.expr | None, scope: Scope) -> None:
+    """Carry out `assert`. A condition that differs from row to row is left out, as under `python -O`."""
+    try:
+        passed = runtime.truth(runtime.evaluate(test, scope))
+    except RefusedError as refusal:
+        if refusal.code not in ("E-FLOW", "E-ROWS"):
+            raise
+        return
+    if not passed:
+        raise ProgramError("AssertionError", "" if message is None else _message_text(runtime, message, scope))
+
+
+def _raise(runtime: Runtime, error: ast.expr | None, scope: Scope) -> None:
+    name, message = "Exception", ""
+    if isinstance(error, ast.Call):
+        message = " ".join(_message_text(runtime, arg, scope) for arg in error.args if not isinstance(arg, ast.Starred))
+        error = error.func
+    if error is not None:
+        cls = runtime.evaluate(error, scope)
+        name = cls.name if isinstance(cls, (Symbol, Class)) else name
+    raise ProgramError(name, message)
+
+
+def _message_text(runtime: Runtime, node: ast.expr, scope: Scope) -> str:
+    return format_value(runtime.meter, runtime.evaluate(node, scope), "")[:200]

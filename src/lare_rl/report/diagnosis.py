@@ -1,0 +1,214 @@
+"""The diagnosis of a run: whether it learned, whether its proxy rewards explain the score, and what to do next.
+
+A rule looks at the summary of a run and returns a finding or None. Rules stand in groups, and each group reports the finding of its
+first rule that has one. The sentences are in `messages.py`.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
+from lare_rl.report.run_summary import CLEAR_ERRORS, LITTLE_R2, MIN_EVALUATIONS, RunSummary
+from lare_rl.util.findings import Finding
+from lare_rl.util.statistics import sample_std
+
+__all__ = ["diagnose"]
+
+HIGH_R2 = 0.8
+"""Proxy rewards explain nearly all of the score if R^2 of the returns is higher."""
+EVALUATION_STDS = 3
+"""An evaluation of one seed is better than random actions if it exceeds their mean by this number of standard deviations."""
+STUCK_FRACTION = 0.05
+"""A policy is stuck if its last returns differ by less than this fraction of the standard deviation of random actions' returns."""
+FALL_FRACTION = 0.15
+"""The return has fallen if it lost more than this fraction of its best gain."""
+BETTER_FRACTION = 0.1
+"""The best evaluation is mentioned if it exceeds the last one by more than this fraction of the final gain."""
+
+Rule = Callable[[RunSummary], Finding | None]
+
+
+def diagnose(run: RunSummary) -> list[Finding]:
+    """Return the findings about a run, the most important first."""
+    if finding := _first_finding(_FATAL_RULES, run):
+        return [finding]
+    return [finding for rules in _RULES if (finding := _first_finding(rules, run))]
+
+
+def _first_finding(rules: Sequence[Rule], run: RunSummary) -> Finding | None:
+    return next((finding for rule in rules if (finding := rule(run))), None)
+
+
+def _no_return(run: RunSummary) -> Finding | None:
+    return None if len(run.final_returns) else Finding("no_return")
+
+
+def _untrained(run: RunSummary) -> Finding | None:
+    return Finding("untrained", {"reason": run.untrained}) if run.untrained else None
+
+
+def _equal_returns(run: RunSummary) -> Finding | None:
+    returns = np.concatenate([run.returns[np.isfinite(run.returns)], run.random_returns])
+    equal = len(run.random_returns) > 1 and np.ptp(returns) == 0
+    return Finding("equal_returns", {"return_": run.final_return}) if equal else None
+
+
+def _outcome(run: RunSummary) -> Finding:
+    """Report whether the final policies are better than random actions and than the policies before training."""
+    std, seeds = sample_std(run.final_returns), Finding("over_seeds", {"n_seeds": run.n_seeds})
+    reached = {
+        "return_": run.final_return,
+        "std": Finding("std", {"std": std}) if std else None,
+        "steps": int(run.steps[-1]),
+        "seeds": seeds if run.n_seeds > 1 else None,
+    }
+    if not len(run.random_returns):
+        return Finding("outcome_unknown", {"reached": Finding("reached", reached)})
+    initial = run.initial_returns
+    baseline = {
+        "return_": run.random_mean,
+        "std": sample_std(run.random_returns),
+        "n_episodes": len(run.random_returns),
+        "initial": None if initial is None else Finding("initial_policies", {"returns": tuple(map(float, initial))}),
+    }
+    values = {"reached": Finding("reached", reached), "baseline": Finding("baseline", baseline)}
+    if run.has_learned:
+        return Finding("learned", values)
+    if run.n_seeds_learned:
+        return Finding("some_seeds_learned", values | {"n_learned": run.n_seeds_learned, "n_seeds": run.n_seeds})
+    if run.final_return < run.random_mean - CLEAR_ERRORS * run.gain_error:
+        return Finding("worse_than_random", values)
+    if run.may_have_learned:
+        return Finding("may_beat_initial_policy" if run.beats_random() else "may_beat_random", values)
+    return Finding("not_learned", values)
+
+
+def _episodic_comparison(run: RunSummary) -> Finding | None:
+    """Compare with training on the return of the episode alone, whose standard error is taken to be as large."""
+    if run.episodic_return is None:
+        return None
+    difference, bound = run.final_return - run.episodic_return, CLEAR_ERRORS * run.final_difference_error
+    code = "like_episodic" if abs(difference) <= bound else "above_episodic" if difference > 0 else "below_episodic"
+    return Finding(code, {"return_": run.episodic_return})
+
+
+def _proxy_rewards(run: RunSummary) -> Finding | None:
+    """Report how much of the score the proxy rewards explain."""
+    if run.return_r2 is None:
+        return None
+    outdated = run.return_r2 < LITTLE_R2 and not run.explains_little
+    r2 = run.median_r2 if outdated and run.median_r2 is not None else run.return_r2
+    inputs = "raw_features" if not run.sees_factors else "all_inputs" if run.sees_raw_features else "factors"
+    values = {
+        "inputs": Finding(inputs),
+        "amount": Finding("little" if r2 < LITTLE_R2 else "nearly_all" if r2 > HIGH_R2 else "a_part"),
+        "r2": r2,
+    }
+    return (
+        Finding("decoder_is_outdated", values | {"last_r2": run.return_r2})
+        if outdated
+        else Finding("explained", values)
+    )
+
+
+def _explains_little(run: RunSummary) -> Finding | None:
+    if not run.explains_little:
+        return None
+    cause, remedy = ("bad_phi", "replace_phi") if run.sees_factors else ("bad_raw_features", "write_phi")
+    values = {"cause": Finding(cause), "remedy": Finding(remedy, {"task": run.task})}
+    if not run.uses_gradient:
+        return Finding("explains_little", values)
+    return Finding("try_closed_form", values | {"method": "lare-bayes" if run.sees_factors else "bayes"})
+
+
+def _is_rising(run: RunSummary) -> Finding | None:
+    if run.trend is None:
+        return None
+    previous, last, change = run.trend
+    quarter = run.mean_returns[-max(2, len(run.mean_returns) // 4) :]
+    if last - previous <= max(change, run.final_error) or quarter[-1] - quarter[0] <= change / 2:
+        return None
+    return Finding("is_rising", {"directory": run.directory, "steps": 2 * int(run.steps[-1])})
+
+
+def _one_seed_was_better(run: RunSummary) -> Finding | None:
+    """Report the best evaluation of any seed, if it beats random actions and the final mean does not."""
+    if not len(run.random_returns) or run.beats_random():
+        return None
+    seed_index, best = np.unravel_index(np.nanargmax(run.trained_returns), run.returns.shape)
+    return_ = float(run.trained_returns[seed_index, best])
+    if return_ <= run.random_mean + EVALUATION_STDS * run.random_std:
+        return None
+    return Finding(
+        "one_seed_was_better", {"step": int(run.steps[best]), "return_": return_, "directory": run.directory}
+    )
+
+
+def _has_fallen(run: RunSummary) -> Finding | None:
+    """Report the best evaluation, if the last quarter is clearly below it."""
+    if run.trend is None:
+        return None
+    _, last, change = run.trend
+    step, best = run.best_evaluation
+    start = run.random_mean if len(run.random_returns) else float(np.nanmean(run.returns[:, 0]))
+    if len(run.random_returns) and best <= start + CLEAR_ERRORS * run.gain_error:
+        return None
+    if best - last <= max(FALL_FRACTION * abs(best - start), 2 * change, CLEAR_ERRORS * run.final_difference_error):
+        return None
+    return Finding("has_fallen", {"step": step, "return_": best, "directory": run.directory})
+
+
+def _is_stuck(run: RunSummary) -> Finding | None:
+    """Report a policy that is no better than random actions and repeats one behaviour."""
+    if not len(run.random_returns) or run.beats_random():
+        return None
+    if run.n_saturated:
+        seeds = Finding("saturated_seeds", {"n_saturated": run.n_saturated, "n_seeds": run.n_seeds})
+        return Finding("is_stuck", {"cause": Finding("saturated", {"seeds": seeds if run.n_seeds > 1 else None})})
+    ranges = np.ptp(run.returns[:, -MIN_EVALUATIONS:], axis=1)
+    if len(run.steps) < MIN_EVALUATIONS or np.any(ranges >= STUCK_FRACTION * sample_std(run.random_returns)):
+        return None
+    return Finding("is_stuck", {"cause": Finding("repeats_behaviour", {"n_evaluations": MIN_EVALUATIONS})})
+
+
+def _needs_training(run: RunSummary) -> Finding | None:
+    """Recommend more training to a policy that has not learned, and say if credit is not what limits it."""
+    if not len(run.random_returns) or run.has_learned:
+        return None
+    values: dict[str, Finding | None] = {"limit": None, "evaluate": None, "phi": None}
+    if (run.return_r2 or 0) > HIGH_R2:
+        agents, rule = Finding("among_agents"), Finding("own_rule")
+        limit = {"agents": agents if run.many_agents else None, "rule": rule if run.is_own_task else None}
+        values["limit"] = Finding("algorithm_is_limit", limit)
+        if not run.sees_factors:
+            values["phi"] = Finding("products_need_phi", {"n_features": MAX_PAIRED_RAW_FEATURES})
+    if run.may_have_learned and not run.beats_random():
+        values["evaluate"] = Finding("evaluate_more", {"directory": run.directory})
+    return Finding("needs_training", values)
+
+
+def _needs_baseline(run: RunSummary) -> Finding | None:
+    """Recommend a baseline for a policy that has learned a task of the user's own."""
+    if not run.is_own_task or not run.has_learned:
+        return None
+    step, return_ = run.best_evaluation
+    best = Finding("best_evaluation", {"step": step, "return_": return_, "directory": run.directory})
+    is_better = return_ - run.final_return > BETTER_FRACTION * (run.final_return - run.random_mean)
+    return Finding("needs_baseline", {"best": best if is_better else None})
+
+
+def _single_seed(run: RunSummary) -> Finding | None:
+    return Finding("single_seed") if run.n_seeds == 1 else None
+
+
+_FATAL_RULES: tuple[Rule, ...] = (_no_return, _untrained, _equal_returns)
+"""Rules whose finding stands alone."""
+_RULES: tuple[tuple[Rule, ...], ...] = (
+    (_outcome,),
+    (_episodic_comparison,),
+    (_proxy_rewards,),
+    (_explains_little, _is_rising, _one_seed_was_better, _has_fallen, _is_stuck, _needs_training, _needs_baseline),
+    (_single_seed,),
+)
+"""Groups of rules. Each group reports one finding."""

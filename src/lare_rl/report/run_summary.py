@@ -1,0 +1,168 @@
+"""What the diagnosis of a run needs to know about it, and the statistics of this summary."""
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from lare_rl.util.statistics import grouped_standard_error, sample_std, standard_error
+
+__all__ = ["CLEAR_ERRORS", "LITTLE_R2", "MIN_ERROR", "MIN_EVALUATIONS", "POSSIBLE_ERRORS", "RunSummary"]
+
+CLEAR_ERRORS, POSSIBLE_ERRORS = 2, 1
+"""A difference is clear, or possible, if it exceeds this number of its standard errors."""
+SEED_STDS = 2
+"""A seed has learned if its final return exceeds the mean of random actions by this number of deviations of their returns."""
+MIN_ERROR = 1e-9
+"""The smallest standard error. With it, equal returns do not differ."""
+LITTLE_R2 = 0.1
+"""Proxy rewards explain next to nothing of the score if R^2 of the returns is lower."""
+MIN_EVALUATIONS = 5
+"""With fewer evaluations, nothing is said about a trend."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSummary:
+    """What the diagnosis needs to know about a run."""
+
+    steps: Float[np.ndarray, " evaluations"]
+    returns: Float[np.ndarray, "seeds evaluations"]
+    """True returns, means over the episodes of an evaluation."""
+    random_returns: Float[np.ndarray, " episodes"] = field(default_factory=lambda: np.zeros(0))
+    """True returns of random actions. Empty if they are unknown."""
+    initial_returns: Float[np.ndarray, " seeds"] | None = None
+    """The returns of the policies before their first update, or None if they were not evaluated."""
+    episode_error: float = 0.0
+    """The standard error of the mean final return, from episode to episode of the last evaluation."""
+    episodic_return: float | None = None
+    """The final return of another run, which was trained on the return of the episode alone. None without such a run."""
+    return_r2: float | None = None
+    """R^2 of the last returns, predicted before anything was fitted to them. None if the method predicts none."""
+    median_r2: float | None = None
+    """The median of `return_r2` over all evaluations and seeds."""
+    sees_factors: bool = False
+    """Whether the decoder's inputs include the factors of phi."""
+    sees_raw_features: bool = True
+    """Whether the decoder's inputs include observations and actions."""
+    many_agents: bool = False
+    uses_gradient: bool = False
+    """Whether the decoder is trained by gradient descent. It may then not have converged yet."""
+    untrained: str | None = None
+    """Why the policy was never updated, or None if it was."""
+    warmup: int = 0
+    """The number of environment steps before the first update."""
+    n_saturated: int = 0
+    """The number of seeds whose final policy chooses the same action, at its bounds, in all states."""
+    directory: str = "RUN"
+    task: str = "TASK"
+    """The name of a shipped task, or a placeholder for a task file, which ends in `.toml`."""
+
+    @property
+    def n_seeds(self) -> int:
+        return len(self.returns)
+
+    @property
+    def is_own_task(self) -> bool:
+        return self.task.endswith(".toml")
+
+    @cached_property
+    def mean_returns(self) -> Float[np.ndarray, " evaluations"]:
+        """The mean over the seeds at each evaluation."""
+        return np.nanmean(self.returns, axis=0)
+
+    @cached_property
+    def trained_returns(self) -> Float[np.ndarray, "seeds evaluations"]:
+        """The returns, with -inf before the first update of a policy."""
+        return np.where(self.steps > self.warmup, self.returns, -np.inf)
+
+    @cached_property
+    def final_returns(self) -> Float[np.ndarray, " finite_seeds"]:
+        """The seeds' returns at the last evaluation, as far as they are finite."""
+        return self.returns[np.isfinite(self.returns[:, -1]), -1]
+
+    @property
+    def final_return(self) -> float:
+        return float(self.final_returns.mean())
+
+    @property
+    def final_error(self) -> float:
+        """The standard error of the final return: from seed to seed or from episode to episode, whichever is larger."""
+        return grouped_standard_error(self.final_returns, self.episode_error)
+
+    @property
+    def final_difference_error(self) -> float:
+        """The standard error of the difference between the final return and another one with an equal error."""
+        return math.sqrt(2) * self.final_error
+
+    @property
+    def random_mean(self) -> float:
+        return float(self.random_returns.mean())
+
+    @property
+    def random_std(self) -> float:
+        return max(sample_std(self.random_returns), MIN_ERROR)
+
+    @property
+    def gain_error(self) -> float:
+        """The standard error of the difference between the final return and the mean return of random actions."""
+        return max(math.hypot(standard_error(self.random_returns), self.final_error), MIN_ERROR)
+
+    def beats_random(self, n_errors: int = CLEAR_ERRORS) -> bool:
+        """Return whether the final return exceeds that of random actions by more than `n_errors` standard errors."""
+        return bool(len(self.random_returns) and self.final_return > self.random_mean + n_errors * self.gain_error)
+
+    def beats_initial_policy(self, n_errors: int = CLEAR_ERRORS) -> bool:
+        """Return whether the mean gain of the seeds since before training exceeds `n_errors` of its standard errors."""
+        if self.initial_returns is None:
+            return True
+        gains = self.returns[:, -1] - self.initial_returns
+        error = grouped_standard_error(gains, max(math.sqrt(2) * self.episode_error, MIN_ERROR))
+        return bool(np.nanmean(gains) > n_errors * error)
+
+    @property
+    def has_learned(self) -> bool:
+        return self.beats_random() and self.beats_initial_policy()
+
+    @property
+    def may_have_learned(self) -> bool:
+        return (
+            self.beats_random(POSSIBLE_ERRORS) and self.beats_initial_policy(POSSIBLE_ERRORS) and not self.has_learned
+        )
+
+    @property
+    def n_seeds_learned(self) -> int:
+        """The number of seeds that end above random actions, and clearly above their own return before training."""
+        threshold: Any = self.random_mean + SEED_STDS * self.random_std
+        if self.initial_returns is not None:
+            seed_error = math.sqrt(2 * self.n_seeds) * self.episode_error
+            threshold = np.maximum(threshold, self.initial_returns + CLEAR_ERRORS * seed_error)
+        return int(np.sum(self.returns[:, -1] > threshold))
+
+    @cached_property
+    def best_evaluation(self) -> tuple[int, float]:
+        """Step and value of the highest mean over the seeds."""
+        means = np.nanmean(self.trained_returns, axis=0)
+        best = int(np.nanargmax(means))
+        return int(self.steps[best]), float(means[best])
+
+    @cached_property
+    def trend(self) -> tuple[float, float, float] | None:
+        """The means of the last two quarters of the evaluations, and the typical change from one evaluation to the next.
+
+        None if there are too few evaluations.
+        """
+        if len(self.steps) < MIN_EVALUATIONS:
+            return None
+        n_quarter = len(self.steps) // 4
+        half = self.mean_returns[-2 * n_quarter :]
+        change = np.nanmedian(np.abs(np.diff(half)))
+        return float(half[:n_quarter].mean()), float(half[n_quarter:].mean()), float(change)
+
+    @property
+    def explains_little(self) -> bool:
+        """Whether proxy rewards explain next to nothing of the returns, neither at the end nor in most evaluations."""
+        r2s = [r2 for r2 in (self.return_r2, self.median_r2) if r2 is not None]
+        return self.return_r2 is not None and max(r2s) < LITTLE_R2

@@ -1,0 +1,93 @@
+"""config.json of a run: every setting, the task, the versions, and the hashes of the latent functions."""
+
+import os
+import platform
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+
+from lare_rl.config.migrate import FORMAT, migrate
+from lare_rl.config.settings import ResolvedSettings
+from lare_rl.envs.families import load_env_spec
+from lare_rl.errors import CheckedModel, LareError
+from lare_rl.latent.function import LatentFunction
+from lare_rl.tasks.spec import TaskSpec
+from lare_rl.util.files import write_atomically
+from lare_rl.util.provenance import code_version
+from lare_rl.util.safe_io import read_json, read_text
+
+__all__ = ["CONFIG", "Config", "make_config", "read_config", "write_config"]
+
+CONFIG = "config.json"
+
+MAX_CONFIG_BYTES = 8 << 20
+
+VERSIONED_PACKAGES = ("jax", "optax", "gymnasium", "mujoco", "numpy")
+"""Packages that results depend on."""
+
+
+class Config(CheckedModel):
+    """config.json."""
+
+    format: int
+    lare: str
+    """Version of the package, and the commit in a checkout."""
+    settings: ResolvedSettings
+    task: TaskSpec
+    task_sha256: str
+    longest_episode: int
+    """The environment's time limit."""
+    function_sha256: tuple[str, ...]
+    """Hashes of the latent functions: one for each team, empty for a method without phi."""
+    versions: dict[str, str]
+    machine: str
+    ended_at: tuple[int, ...] = ()
+    """The number of steps of the run before each time that it was extended."""
+
+
+def make_config(task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction]) -> Config:
+    """Return everything that a new run depends on."""
+    return Config(
+        format=FORMAT,
+        lare=code_version(),
+        settings=settings,
+        task=task,
+        task_sha256=task.digest,
+        longest_episode=load_env_spec(task).max_steps,
+        function_sha256=tuple(function.digest for function in functions),
+        versions={name: version(name) for name in VERSIONED_PACKAGES} | {"python": platform.python_version()},
+        machine=f"{platform.system()} {platform.machine()}, {_describe_cores()}, {jax.default_backend()}",
+    )
+
+
+def _describe_cores() -> str:
+    # XLA divides sums among the cores that the process may use, and this decides how they are rounded.
+    n_cores = os.cpu_count() or 1
+    n_usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else n_cores
+    return f"{n_usable} of {n_cores} cores" if n_usable < n_cores else f"{n_cores} cores"
+
+
+def write_config(directory: Path, config: Config) -> None:
+    """Write config.json. Raises `LareError` if it cannot be written."""
+    text = config.model_dump_json(indent=1) + "\n"
+    write_atomically(directory / CONFIG, lambda file: file.write(text.encode()))
+
+
+def read_config(directory: Path) -> Config:
+    """Read config.json, of this or an earlier version.
+
+    Raises:
+        LareError: the directory is not a run, or its configuration is not valid.
+    """
+    path = directory / CONFIG
+    if not path.is_file():
+        raise LareError(f"{directory} is not a run: there is no {CONFIG} in it")
+    try:
+        values = read_json(read_text(path, MAX_CONFIG_BYTES))
+        if not isinstance(values, dict):
+            raise LareError("it is JSON, but not an object")
+        return Config(**migrate(values))
+    except (LareError, OSError, ValueError, TypeError) as error:
+        raise LareError(f"{path}: {error}") from error

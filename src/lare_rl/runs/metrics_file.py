@@ -1,0 +1,93 @@
+"""metrics.jsonl of a run: one JSON object in each line, for each seed and evaluation."""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lare_rl.errors import LareError
+from lare_rl.util.safe_io import read_json, read_text
+
+__all__ = ["append_metrics", "read_metrics", "truncate_metrics"]
+
+METRICS = "metrics.jsonl"
+
+MAX_METRICS_BYTES = 512 << 20
+
+MAX_INTEGER = 2**53
+"""A larger whole number may change when it becomes a float."""
+
+MAX_PARSED_FILES = 32
+
+_parsed: dict[Path, tuple[tuple[int, ...], list[dict[str, Any]]]] = {}
+"""The state and the lines of the files that were read last. A report reads the metrics of a run twenty times."""
+
+
+def read_metrics(directory: Path) -> list[dict[str, Any]]:
+    """Return every complete line of a run's metrics.jsonl, in order. The lines are shared: do not change them.
+
+    Raises:
+        LareError: the file cannot be read, or a line is not valid.
+    """
+    path = (directory / METRICS).absolute()
+    if not path.exists():
+        return []
+    stat = path.stat()
+    state = stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns
+    cached = _parsed.pop(path, None)
+    lines = cached[1] if cached is not None and cached[0] == state else _parse(directory / METRICS)
+    _parsed[path] = state, lines
+    if len(_parsed) > MAX_PARSED_FILES:
+        del _parsed[next(iter(_parsed))]
+    return list(lines)
+
+
+def append_metrics(directory: Path, lines: Sequence[dict[str, Any]]) -> int:
+    """Append lines to metrics.jsonl, and return the new size of the file in bytes."""
+    path = directory / METRICS
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write("".join(json.dumps(line) + "\n" for line in lines))
+            file.flush()
+            os.fsync(file.fileno())
+            return file.tell()
+    except OSError as error:
+        raise LareError(f"{path} cannot be written: {error.strerror or error}; the last checkpoint is whole") from error
+
+
+def truncate_metrics(directory: Path, n_bytes: int) -> None:
+    """Remove the lines that were written after a checkpoint. Resumed training writes them again.
+
+    Raises:
+        LareError: lines from before the checkpoint are missing.
+    """
+    path = directory / METRICS
+    size = path.stat().st_size if path.exists() else 0
+    if size < n_bytes:
+        raise LareError(f"{path} has {size} bytes, and the checkpoint needs {n_bytes}: was it copied during training?")
+    if size > n_bytes:
+        os.truncate(path, n_bytes)
+
+
+def _parse(path: Path) -> list[dict[str, Any]]:
+    lines = []
+    for number, text in enumerate(read_text(path, MAX_METRICS_BYTES).split("\n")[:-1], start=1):
+        try:
+            line = read_json(text)
+        except ValueError as error:
+            raise LareError(f"{path} is damaged: {error} in line {number}") from error
+        if not _is_evaluation(line):
+            raise LareError(f"{path} is damaged: line {number} is no evaluation")
+        lines.append(line)
+    return lines
+
+
+def _is_evaluation(line: Any) -> bool:
+    """Return whether a value is a step, a seed, and numbers by name."""
+    return (
+        isinstance(line, dict)
+        and all(type(line.get(name)) is int and 0 <= line[name] <= MAX_INTEGER for name in ("step", "seed"))
+        and all(value is None or type(value) in (int, float) for value in line.values())
+        and all(abs(value) <= MAX_INTEGER for value in line.values() if type(value) is int)
+    )

@@ -1,0 +1,85 @@
+"""Gradient updates of the decoders: which steps an update reads, and the update."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare_rl.credit import descent
+from lare_rl.credit.decomposition import CreditBatch, Decomposition
+from lare_rl.credit.methods import Fit
+from lare_rl.data import replay
+from lare_rl.data.replay import Replay
+from lare_rl.data.sampling import CreditSample, sample_drawn, sample_packed, sample_padded
+from lare_rl.training.decoder_inputs import episode_batch
+from lare_rl.training.learner import Learner
+from lare_rl.training.rewards import team_metrics
+from lare_rl.training.static_config import TrainConfig
+
+__all__ = ["fit_decoders", "fit_repeatedly", "sample_credit"]
+
+CHUNK_ROWS = 2400
+"""About how many rows each chunk of a decoder's gradient is computed from. More rows do not fit into the cache, and fewer make the
+matrix products inefficient. On one core, 256 episodes of six agents at once took 1.5 times as long."""
+
+
+def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditSample | None:
+    """Draw the steps that each of some updates of the decoders reads. Return None for a method without such updates."""
+    fit, settings, longest = config.method.fit, config.credit, config.env.max_steps
+    if fit is None or not config.method.uses_gradient:
+        return None
+    if fit is Fit.DECODER_LOSS:
+        return sample_padded(buffer, key, updates, settings.episodes, longest)
+    if fit.samples_steps:
+        count = max(1, settings.steps // (longest if config.env.fixed_length else settings.drawn_steps))
+        return sample_drawn(buffer, key, updates, count, min(settings.drawn_steps, longest))
+    if config.env.fixed_length:
+        return sample_padded(buffer, key, updates, max(1, settings.steps // longest), longest)
+    return sample_packed(buffer, key, updates, settings.steps, longest)
+
+
+def fit_decoders(
+    decoders: tuple[Decomposition, ...], buffer: Replay, sample: CreditSample, key: PRNGKeyArray, config: TrainConfig
+) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
+    """Update every team's decoder once."""
+    steps = replay.read(buffer, sample.steps)
+    keys = jax.random.split(key, len(decoders))
+    updates = [
+        _update_decoder(decoder, episode_batch(steps, sample, config, i), keys[i], config)
+        for i, decoder in enumerate(decoders)
+    ]
+    return tuple(decoder for decoder, _ in updates), team_metrics([metrics for _, metrics in updates], config)
+
+
+def _update_decoder(
+    decoder: Decomposition, batch: CreditBatch, key: PRNGKeyArray, config: TrainConfig
+) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    """Take one gradient step. The gradient of a large batch of equally long episodes is computed in chunks."""
+    assert config.method.fit is not None
+    n_rows, n_episodes = batch.features[..., 0].size, len(batch.length)
+    n_chunks = 1
+    if config.env.fixed_length and n_rows > CHUNK_ROWS:
+        chunk_episodes = max(1, CHUNK_ROWS * n_episodes // n_rows)
+        divisors = (n for n in range(1, n_episodes + 1) if n_episodes % n == 0)
+        n_chunks = min(n for n in divisors if n_episodes // n <= chunk_episodes)
+    if n_chunks == 1:
+        return descent.update(decoder, batch, key, config.method.fit, config.credit)
+    # Every chunk counts its episodes from 0.
+    batch = batch._replace(episode_index=batch.episode_index % (n_episodes // n_chunks))
+    chunks = jax.tree.map(lambda leaf: leaf.reshape(n_chunks, -1, *leaf.shape[1:]), batch)
+    return descent.update_in_chunks(decoder, chunks, key, config.method.fit, config.credit)
+
+
+def fit_repeatedly(
+    learner: Learner, key: PRNGKeyArray, config: TrainConfig
+) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
+    """Update the decoders `fit_updates` times. Return them, and the mean of each metric."""
+    sample_key, key = jax.random.split(key)
+    samples = sample_credit(learner.replay, sample_key, config.fit_updates, config)
+    if samples is None:
+        return learner.credit, {}
+
+    def body(decoders: tuple[Decomposition, ...], update: tuple[CreditSample, PRNGKeyArray]):
+        return fit_decoders(decoders, learner.replay, *update, config)
+
+    decoders, metrics = jax.lax.scan(body, learner.credit, (samples, jax.random.split(key, config.fit_updates)))
+    return decoders, jax.tree.map(jnp.mean, metrics)

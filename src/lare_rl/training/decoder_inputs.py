@@ -1,0 +1,76 @@
+"""The inputs of the decoders, from the columns of stored steps.
+
+An array of the decoder's inputs has an axis for the team's proxy rewards: one for each agent, or a single one if credit goes to
+whole teams.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.encoders import input_arrays
+from lare_rl.credit.engine import StepBatch, agent_shares
+from lare_rl.data.replay import StoredSteps
+from lare_rl.data.sampling import CreditSample
+from lare_rl.training.static_config import TrainConfig
+
+__all__ = ["alive_agents", "decoder_inputs", "episode_batch", "row_mask", "step_batch"]
+
+
+def decoder_inputs(steps: StoredSteps, config: TrainConfig, team_index: int) -> Float[Array, "*batch rows features"]:
+    """Return the inputs of a team's decoder for some steps."""
+    inputs, rows = config.credit_specs[team_index].inputs, config.team_rows(team_index)
+    columns, next_columns = steps.columns, steps.next_columns
+    arrays = {}
+    if "factors" in inputs:
+        arrays["factors"] = columns["factors"][..., rows, : config.n_factors[team_index]]
+    if "action" in inputs:
+        # A Gaussian may choose an action beyond the bounds. The environment then used the bound.
+        action = jnp.clip(columns["action"], -1, 1)
+        arrays["action"] = action.reshape(*action.shape[:-2], 1, -1) if config.team_level else action[..., rows, :]
+    observed = "state" if config.team_level else "observation"
+    if observed in columns:
+        rows = None if config.team_level else rows
+        arrays["observation"] = columns[observed][..., rows, :]
+        arrays["next_observation"] = next_columns[observed][..., rows, :]
+    return jnp.concatenate(input_arrays(inputs, arrays), axis=-1)
+
+
+def alive_agents(steps: StoredSteps, config: TrainConfig) -> Bool[Array, "*batch agents"]:
+    """Return which agents acted."""
+    if "alive" in steps.columns:
+        return steps.columns["alive"]
+    return jnp.ones((*steps.finished.shape, config.env.n_agents), bool)
+
+
+def row_mask(steps: StoredSteps, config: TrainConfig, team_index: int) -> Bool[Array, "*batch rows"] | None:
+    """Return which rows of a team's decoder inputs count. None means all."""
+    if "alive" not in steps.columns or config.team_level:
+        return None
+    return steps.columns["alive"][..., config.team_rows(team_index)]
+
+
+def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> StepBatch:
+    """Return the steps as the input of a team's `proxy_rewards`."""
+    inputs = config.credit_specs[team_index].inputs
+    has_inputs = bool(inputs)
+    rows = (*steps.finished.shape, config.credit_specs[team_index].agents, 0)
+    return StepBatch(
+        features=decoder_inputs(steps, config, team_index) if has_inputs else jnp.zeros(rows),
+        length=steps.length,
+        mean_reward=steps.mean_reward[..., team_index],
+        finished=steps.finished,
+    )
+
+
+def episode_batch(steps: StoredSteps, sample: CreditSample, config: TrainConfig, team_index: int) -> CreditBatch:
+    """Return the batch that a team's decoder is fitted to, from the sampled steps."""
+    mask, episodes = row_mask(steps, config, team_index), sample.episodes
+    return CreditBatch(
+        features=decoder_inputs(steps, config, team_index),
+        episode_index=sample.episode,
+        length=episodes.length,
+        mean_reward=episodes.mean_reward[..., team_index],
+        mask=episodes.mask,
+        share=None if mask is None else agent_shares(mask),
+    )

@@ -1,0 +1,75 @@
+"""Chooses the latent functions that a run is trained with."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from lare_rl.config.settings import ResolvedSettings
+from lare_rl.credit.closed_form import MAX_SIGNED_FACTORS
+from lare_rl.credit.methods import Fit, Method, Reward, find_method
+from lare_rl.errors import LareError, short_repr
+from lare_rl.latent.design import design
+from lare_rl.latent.function import LatentFunction, check_task, pair_with_roles
+from lare_rl.latent.saved import load_function
+from lare_rl.llm.prompts import N_CANDIDATES
+from lare_rl.tasks.spec import TaskSpec
+
+__all__ = ["FunctionOrPath", "check_draw_unused", "choose_functions"]
+
+FunctionOrPath = LatentFunction | str | Path
+"""A latent function, or the path of its file."""
+
+
+def choose_functions(
+    task: TaskSpec, settings: ResolvedSettings, function: FunctionOrPath | Sequence[FunctionOrPath] | None
+) -> tuple[LatentFunction, ...]:
+    """Return one function for each role of the task: the user's, or those of the shipped recordings.
+
+    It is empty for a method without phi.
+
+    Raises:
+        LareError: a function cannot be used, or the method needs none.
+    """
+    method = find_method(settings.method)
+    if not method.needs_phi:
+        if function is not None:
+            raise LareError(f"{method.name} needs no latent function, and one is given: leave it out")
+        return ()
+    if function is None:
+        design_role = partial(design, kind=method.phi_kind, draw=settings.draw, candidates=settings.candidates)
+        functions = [design_role(role) for role in task.roles]
+    else:
+        check_draw_unused(settings)
+        if not isinstance(function, FunctionOrPath | Sequence):
+            raise LareError(
+                "a latent function must be the path of its file, or come from lare_rl.design or lare_rl.load_function, and is "
+                f"{short_repr(function)}: write its source to a file, which is verified"
+            )
+        pairs = pair_with_roles([function] if isinstance(function, FunctionOrPath) else function, task)
+        functions = [
+            function if isinstance(function, LatentFunction) else load_function(function, role)
+            for function, role in pairs
+        ]
+        for function, role in zip(functions, task.roles, strict=True):
+            check_task(function, role)
+    for function in functions:
+        _check_size(method, function.n_factors(settings.factor_inputs(task)))
+    return tuple(functions)
+
+
+def check_draw_unused(settings: ResolvedSettings) -> None:
+    """Raise `LareError` if settings choose a recorded function, for a run whose function the user gives."""
+    if (settings.draw, settings.candidates) != (0, N_CANDIDATES):
+        raise LareError("draw and candidates choose a recorded function, and a function is given: leave either out")
+
+
+def _check_size(method: Method, n_factors: int) -> None:
+    if method.reward is Reward.DESIGNED and n_factors != 1:
+        raise LareError(
+            f"{method.name} needs a function with one array, the reward, and this one has {n_factors}: "
+            "lare-rl design TASK --kind reward writes one"
+        )
+    if method.fit is Fit.SIGNS and n_factors > MAX_SIGNED_FACTORS:
+        raise LareError(
+            f"{method.name} tries all signs of at most {MAX_SIGNED_FACTORS} factors, and there are {n_factors}"
+        )

@@ -1,0 +1,124 @@
+"""The outer loop of Algorithm 1 of the LaRe paper: iterations, evaluations, checkpoints, and messages for the user."""
+
+import threading
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from lare_rl.config.effective import warmup_warning
+from lare_rl.errors import LareError
+from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN
+from lare_rl.runs.metrics_file import append_metrics
+from lare_rl.training import advice
+from lare_rl.training.explain import describe_returns
+from lare_rl.training.first_fit import FirstFitStoppedError
+from lare_rl.training.progress import Clock, Listener
+from lare_rl.training.session import Session
+from lare_rl.training.unroll_host import DivergedError
+from lare_rl.util.findings import Finding, render
+
+__all__ = ["RunInterruptedError", "run_session"]
+
+
+class RunInterruptedError(LareError):
+    """The user stopped a run. It was saved."""
+
+    status = 130
+
+
+def run_session(session: Session, listeners: Sequence[Listener], stop: threading.Event) -> None:
+    """Run a session to its end.
+
+    Raises:
+        RunInterruptedError: `stop` was set.
+        DivergedError: a policy or a loss is not finite any more.
+    """
+    run, settings = session.run, session.settings
+    clock, explained = Clock(session.step), False
+    returns: list[np.ndarray] = []
+
+    def say(lines: Iterable[str]) -> None:
+        for line in lines:
+            for listener in listeners:
+                listener.on_message(line)
+
+    def report(findings: Iterable[Finding]) -> None:
+        say(render(finding, advice.MESSAGES) for finding in findings)
+
+    while session.step < settings.steps:
+        _advance(session, stop)
+        for listener in listeners:
+            listener.on_step(session.step)
+        if session.step - settings.iteration_steps <= settings.warmup < session.step:
+            report(advice.find_large_observations(run, session.learner.replay, session.config))
+        is_last = session.step == settings.steps
+        if not is_last and session.step % settings.evaluate_every:
+            continue
+        lines = _evaluate(session, clock.measure_rate(session.step))
+        for listener in listeners:
+            listener.on_evaluation(lines)
+        if "critic/loss" in lines[0]:
+            returns.append(np.array([line[RETURN] for line in lines]))
+            report(advice.find_constant_returns(returns))
+        if is_last or not explained:
+            sentences = _explain(session)
+            say(sentences)
+            explained = bool(sentences)
+        if is_last:
+            report(_final_findings(session, lines))
+
+
+def _advance(session: Session, stop: threading.Event) -> None:
+    """Make one iteration, unless the user has asked the run to stop."""
+    hint = f"to continue: lare-rl train --resume {session.run.directory}"
+    if stop.is_set():
+        _check_losses(session)
+        session.save()
+        raise RunInterruptedError(f"stopped at step {session.step} of {session.settings.steps} and saved; {hint}")
+    try:
+        session.advance(stop.is_set)
+    except FirstFitStoppedError:
+        raise RunInterruptedError(f"stopped during the decoder's first fit; {hint}") from None
+
+
+def _evaluate(session: Session, rate: float) -> list[dict[str, Any]]:
+    """Evaluate, and write the metrics and a checkpoint. Return the lines of metrics.jsonl."""
+    lines = session.evaluate(rate)
+    _check_losses(session)
+    session.metrics_bytes = append_metrics(session.run.directory, lines)
+    session.save()
+    return lines
+
+
+def _explain(session: Session) -> list[str]:
+    """Describe how well factors explain the returns. It is empty before the first updates and for too few episodes."""
+    if session.step < session.settings.warmup:
+        return []
+    return describe_returns(session.run, session.learner, session.config)
+
+
+def _final_findings(session: Session, lines: Sequence[dict[str, Any]]) -> list[Finding]:
+    findings = []
+    if ACTOR_SATURATION in lines[0]:
+        saturations = [line[ACTOR_SATURATION] for line in lines]
+        findings += advice.find_saturated_policies(saturations, session.run.seeds)
+    untrained = advice.find_untrained(session.run)
+    if untrained is not None and warmup_warning(session.settings) is None:  # that warning was the first message
+        findings.append(untrained)
+    return findings
+
+
+def _check_losses(session: Session) -> None:
+    """Raise `DivergedError` if a loss is not finite, so that the useless state is not saved."""
+    seeds, metrics = session.run.seeds, session.latest_metrics
+    updates = np.asarray(metrics.get("algorithm/updates", np.ones(len(seeds))))
+    for name in metrics:
+        if not name.startswith(("critic/loss", "credit/loss")):
+            continue
+        for seed, loss, n_updates in zip(seeds, np.asarray(metrics[name]), updates, strict=True):
+            if n_updates and not np.isfinite(loss):
+                raise DivergedError(
+                    f"training diverged: {name} of seed {seed} is not finite at step {session.step}; the last checkpoint is "
+                    "whole"
+                )

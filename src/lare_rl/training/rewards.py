@@ -1,0 +1,96 @@
+"""The rewards that the algorithm is trained on, and how close they are to the true ones."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lare_rl.credit import accuracy, engine
+from lare_rl.credit import prequential as prediction
+from lare_rl.credit.decoder_settings import RECENT_STEPS
+from lare_rl.credit.decomposition import Decomposition
+from lare_rl.credit.methods import Reward
+from lare_rl.data import replay
+from lare_rl.data.replay import StoredSteps
+from lare_rl.envs.interface import team_mean
+from lare_rl.nn.normalise import Scale
+from lare_rl.training.decoder_inputs import alive_agents, step_batch
+from lare_rl.training.learner import Learner
+from lare_rl.training.static_config import TrainConfig
+
+__all__ = ["RewardState", "assess", "proxy_rewards", "rewards", "team_metrics"]
+
+
+class RewardState(NamedTuple):
+    """The decoders and reward scales of all teams: all that is needed to compute rewards."""
+
+    credit: tuple[Decomposition, ...]
+    scale: tuple[Scale, ...]
+
+    def decoder(self, team_index: int) -> Decomposition | None:
+        """Return a team's decoder; None for a method that fits nothing."""
+        return self.credit[team_index] if self.credit else None
+
+
+def rewards(steps: StoredSteps, state: RewardState, config: TrainConfig) -> Float[Array, "*batch agents"]:
+    """Return the rewards that the algorithm is trained on, for each agent. Proxy rewards are those of the current decoders."""
+    alive = alive_agents(steps, config)
+    team_rewards = []
+    for i, team in enumerate(config.env.teams):
+        scale, team_alive = state.scale[i], alive[..., team.agents]
+        if config.method.has_proxy_rewards:
+            batch, spec = step_batch(steps, config, i), config.credit_specs[i]
+            team_rewards.append(engine.training_rewards(state.decoder(i), scale, batch, spec, team_alive))
+            continue
+        is_dense = config.method.reward is Reward.TRUE
+        reward = steps.columns["reward"][..., team.agents] if is_dense else steps.episodic_reward[..., i, None]
+        reward = jnp.broadcast_to(reward, team_alive.shape)
+        team_rewards.append(engine.scale_and_mask(reward, scale, team_alive, scale_rewards=config.scale_rewards))
+    return jnp.concatenate(team_rewards, axis=-1)
+
+
+def proxy_rewards(
+    steps: StoredSteps, state: RewardState, config: TrainConfig, team_index: int
+) -> Float[Array, "*batch rows"]:
+    """Return r_hat of a team, without optimism: one for each of its agents, or one for all if credit goes to whole teams."""
+    batch, spec = step_batch(steps, config, team_index), config.credit_specs[team_index]
+    return engine.proxy_rewards(state.decoder(team_index), state.scale[team_index], batch, spec)
+
+
+def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]:
+    """Compare the newest proxy rewards with the true rewards, over the last steps of every environment."""
+    if not config.method.has_proxy_rewards:
+        return {}
+    buffer = learner.replay
+    # Decoders of whole episodes need whole episodes: those of the newest iteration.
+    count = config.rollout_steps if config.env.fixed_length else max(1, RECENT_STEPS // config.n_envs)
+    index = replay.newest_steps(buffer, min(replay.capacity(buffer) - 1, count))
+    oldest = replay.oldest_transition(buffer)[:, None]
+    is_stored = (index.number >= oldest)[..., None]
+    steps = replay.read(buffer, index._replace(number=jnp.maximum(index.number, oldest)))
+    alive, state = alive_agents(steps, config), RewardState(learner.credit, learner.scale)
+    metrics = []
+    for i, team in enumerate(config.env.teams):
+        reward, mask = steps.columns["reward"][..., team.agents], is_stored & alive[..., team.agents]
+        if config.team_level:
+            reward, mask = team_mean(steps.columns["reward"], alive, team)[..., None], is_stored
+        r_hat = jnp.broadcast_to(proxy_rewards(steps, state, config, i), reward.shape)
+        last = jnp.broadcast_to(steps.last[..., None], reward.shape)
+        metrics.append(
+            accuracy.metrics(
+                r_hat.ravel(), reward.ravel(), last.ravel(), mask.ravel(), calibrated=config.method.calibrated
+            )
+        )
+        if (decoder := state.decoder(i)) is not None:
+            metrics[-1]["credit/return_r2"] = prediction.r2(decoder.predictions)[0]
+            if decoder.score_type_predictions is not None:
+                metrics[-1]["credit/average"] = decoder.is_mean.astype(jnp.float32)
+    return team_metrics(metrics, config)
+
+
+def team_metrics(metrics: list[dict[str, Array]], config: TrainConfig) -> dict[str, Array]:
+    """Return the metrics of the first team; with several teams also those of each team, with the suffix `_<team>`."""
+    if len(metrics) == 1:
+        return metrics[0]
+    named = zip(config.env.teams, metrics, strict=True)
+    return metrics[0] | {f"{name}_{team.name}": value for team, values in named for name, value in values.items()}

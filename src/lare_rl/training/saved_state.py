@@ -1,0 +1,93 @@
+"""The training state of a run's last checkpoint."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.config.replay_size import replay_rows
+from lare_rl.credit.methods import find_method
+from lare_rl.envs.families import load_env_spec
+from lare_rl.errors import LareError
+from lare_rl.runs import checkpoint
+from lare_rl.runs.best_policy import load_best
+from lare_rl.runs.directory import Run
+from lare_rl.training.compile_ahead import learner_shape
+from lare_rl.training.compiled import compile_functions
+from lare_rl.training.learner import Learner
+from lare_rl.training.static_config import TrainConfig
+from lare_rl.util.provenance import code_version
+
+__all__ = ["SavedState", "actor_shape", "load_actor", "load_learner", "make_train_config"]
+
+
+class SavedState(NamedTuple):
+    """The training state of a checkpoint."""
+
+    config: TrainConfig
+    learner: Learner
+    host: dict[str, Any]
+    """Other values, as JSON."""
+    arrays: dict[str, np.ndarray]
+    """Other arrays, by name."""
+
+
+def make_train_config(run: Run) -> TrainConfig:
+    """Return the static configuration of a run's compiled functions."""
+    task, settings, env = run.config.task, run.config.settings, load_env_spec(run.config.task)
+    return TrainConfig(
+        env=env,
+        credit_scope=task.judged_from,
+        factor_inputs=run.factor_inputs,
+        method=find_method(settings.method),
+        algorithm=ALGORITHMS[settings.algorithm],
+        hyperparameters=settings.hyperparameters,
+        credit=settings.credit,
+        scale_rewards=settings.scale_rewards,
+        n_factors=tuple(function.n_factors(run.factor_inputs) for function in run.functions),
+        n_envs=settings.environments,
+        rollout_steps=settings.rollout_steps,
+        capacity=replay_rows(settings, env.max_steps),
+        steps=settings.steps,
+        fit_updates=settings.fit_updates,
+    )
+
+
+def load_learner(run: Run) -> SavedState:
+    """Load the last checkpoint of a run.
+
+    Raises:
+        LareError: there is no checkpoint, it is damaged, or it is of a version of LaRe whose state has another structure.
+    """
+    config = make_train_config(run)
+    try:
+        return SavedState(config, *checkpoint.load(run.checkpoint, learner_shape(config, len(run.seeds))))
+    except LareError as error:
+        if run.config.lare == code_version():
+            raise
+        raise LareError(f"{error}; the run is of LaRe {run.config.lare}, and this is LaRe {code_version()}") from error
+
+
+def load_actor(run: Run, best: bool = False) -> tuple[TrainConfig, Any, Int[np.ndarray, " seeds"]]:
+    """Load the actor of the last checkpoint or, for each seed, of its best evaluation.
+
+    Returns:
+        The configuration, the actor, and the step at which each seed's actor was saved.
+
+    Raises:
+        LareError: no actor has been saved.
+    """
+    if best:
+        config = make_train_config(run)
+        best_policy = load_best(run.checkpoint, actor_shape(config, len(run.seeds)), len(run.seeds))
+        return config, jax.device_put(best_policy.actor), best_policy.step
+    config, learner, host, _ = load_learner(run)
+    return config, compile_functions(config).get_actor(learner, host["step"]), np.full(len(run.seeds), host["step"])
+
+
+def actor_shape(config: TrainConfig, n_seeds: int) -> Any:
+    """Return an actor with shapes instead of arrays."""
+    functions = compile_functions(config)
+    return jax.eval_shape(lambda learner: functions.get_actor(learner, 0), learner_shape(config, n_seeds))

@@ -1,0 +1,177 @@
+"""Plays whole episodes of a policy in environments that step on the host, for evaluations and films."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lare_rl.data.trajectory import Trajectory
+from lare_rl.envs.env_errors import EnvOutputError
+from lare_rl.envs.interface import Timestep, team_mean, to_env_action
+from lare_rl.envs.workers import VecEnv
+from lare_rl.errors import LareError
+from lare_rl.training.compiled import CompiledFunctions, init_memory
+from lare_rl.training.evaluation import EpisodeBatch, Evaluation
+from lare_rl.training.static_config import TrainConfig
+from lare_rl.training.streams import Stream, episode_seed, host_noise, numpy_generator
+
+__all__ = [
+    "DivergedError",
+    "HostPolicy",
+    "add_seed_axis",
+    "check_finite",
+    "evaluate_on_host",
+    "record_on_host",
+    "select_action",
+    "unroll_on_host",
+]
+
+Policy = Callable[[Timestep, Bool[np.ndarray, "seeds envs"]], Float[np.ndarray, "seeds envs agents action"]]
+"""From a timestep, and which episodes have just begun, to the action."""
+
+
+class DivergedError(LareError):
+    """The policy is not finite any more."""
+
+
+class HostPolicy:
+    """The policy of all seeds for whole episodes, all of which begin with its first call. It has the memory of the actors.
+
+    Args:
+        functions: the compiled functions of the run.
+        config: the configuration of the run.
+        actor: the actors of all seeds.
+        seeds: the seeds of the run.
+        n_episodes: the number of episodes of each seed.
+        greedy: whether to act without noise; by default as in evaluations, where only PPO's policy has noise.
+    """
+
+    def __init__(
+        self,
+        functions: CompiledFunctions,
+        config: TrainConfig,
+        actor: Any,
+        seeds: Sequence[int],
+        n_episodes: int,
+        greedy: bool | None = None,
+    ):
+        self._select_action = partial(select_action, functions, config, actor, greedy=greedy)
+        self._memory = init_memory(config, len(seeds), n_episodes)
+        self._rngs = [numpy_generator(seed, Stream.EVALUATION_NOISE, 0) for seed in seeds]
+
+    def __call__(self, timestep: Timestep, episode_start: Bool[np.ndarray, "seeds envs"]) -> np.ndarray:
+        action, self._memory = self._select_action(
+            self._memory, timestep.observation, timestep.available, episode_start, self._rngs
+        )
+        return action
+
+
+def select_action(
+    functions: CompiledFunctions,
+    config: TrainConfig,
+    actor: Any,
+    memory: Any,
+    observation: Float[np.ndarray, "seeds envs agents observation"],
+    available: Bool[np.ndarray, "seeds envs agents action"],
+    episode_start: Bool[np.ndarray, "seeds envs"],
+    rngs: Sequence[np.random.Generator],
+    *,
+    greedy: bool | None = None,
+) -> tuple[Float[np.ndarray, "seeds envs agents action"], Any]:
+    """Select the actions of a policy outside training. `rngs` has a generator for each seed.
+
+    Returns:
+        The actions, and the new memory of the actors.
+    """
+    inputs = actor, memory, observation, available
+    if config.greedy if greedy is None else greedy:
+        action, memory = functions.act(*inputs, None, episode_start)
+    else:
+        shape = (*observation.shape[1:3], config.noise_size)
+        noise = np.stack([host_noise(rng, config.noise, shape) for rng in rngs])
+        action, memory = functions.explore(*inputs, noise, episode_start)
+    return np.asarray(action), memory
+
+
+def unroll_on_host(
+    envs: VecEnv, policy: Policy, seeds: Sequence[int], episode_seeds: Sequence[int]
+) -> Iterator[tuple[Trajectory, Bool[np.ndarray, "seeds episodes"]]]:
+    """Play one episode in each environment, all in lockstep. This is the only loop that plays whole episodes on the host.
+
+    Args:
+        envs: environments: those of the first seed, of the second, and so on.
+        policy: the policy of all seeds.
+        seeds: the seeds of the run.
+        episode_seeds: the random seed of the episode of each environment.
+
+    Yields:
+        The next step of each environment, without the axis of time, and whether its episode had not ended before. The next
+        step overwrites `next_timestep`.
+    """
+    shape = len(seeds), len(episode_seeds) // len(seeds)
+    running, episode_start = np.ones(shape, bool), np.ones(shape, bool)
+    envs.reset(running.ravel(), np.array(episode_seeds))
+    next_timestep = add_seed_axis(envs.batch, shape)
+    while running.any():
+        timestep = jax.tree.map(np.copy, next_timestep)
+        action = policy(timestep, episode_start)
+        check_finite(action, seeds)
+        env_action = to_env_action(action, envs.spec)
+        envs.step(env_action.reshape(-1, *env_action.shape[2:]), running.ravel())
+        steps = Trajectory(timestep=timestep, action=action, env_action=env_action, next_timestep=next_timestep)
+        yield steps, running
+        running, episode_start = running & ~steps.ended, np.zeros(shape, bool)
+
+
+def record_on_host(envs: VecEnv, policy: Policy, seeds: Sequence[int], episode_seeds: Sequence[int]) -> EpisodeBatch:
+    """Play one episode in each environment, and return all steps. The arguments are those of `unroll_on_host`."""
+    steps, masks = [], []
+    for step, running in unroll_on_host(envs, policy, seeds, episode_seeds):
+        steps.append(jax.tree.map(np.copy, step))
+        masks.append(running)
+    return EpisodeBatch(jax.tree.map(lambda *rows: np.stack(rows), *steps), np.stack(masks), None)
+
+
+def evaluate_on_host(envs: VecEnv, policy: Policy, seeds: Sequence[int], n_episodes: int, first: int = 0) -> Evaluation:
+    """Evaluate one episode in each environment, each from a different initial state.
+
+    The initial states depend only on the seed and on the episode's number, which counts from `first`. So every evaluation of a
+    run begins from the same ones, and no training episode does.
+    """
+    numbers = range(first, first + n_episodes)
+    episode_seeds = [episode_seed(seed, Stream.EVALUATION_EPISODES, number) for seed in seeds for number in numbers]
+    spec, shape = envs.spec, (len(seeds), n_episodes)
+    returns, summed_returns = np.zeros((*shape, len(spec.teams))), np.zeros((*shape, len(spec.teams)))
+    lengths = np.zeros(shape, int)
+    measures = {name: np.full(shape, np.nan) for name in spec.measures}
+    try:
+        for step, running in unroll_on_host(envs, policy, seeds, episode_seeds):
+            timestep, next_timestep = step.timestep, step.next_timestep
+            reward = next_timestep.reward.astype(np.float64) * running[..., None]
+            returns += np.stack([team_mean(reward, timestep.alive, team) for team in spec.teams], axis=-1)
+            summed_returns += np.stack([reward[..., team.agents].sum(axis=-1) for team in spec.teams], axis=-1)
+            lengths += running
+            ended = running & step.ended
+            for name, values in measures.items():
+                values[ended] = next_timestep.measures[name][ended]
+    except EnvOutputError as error:
+        where = "" if error.env_index is None else f", in an evaluation of seed {seeds[error.env_index // n_episodes]}"
+        raise EnvOutputError(f"{error}{where}") from None
+    return Evaluation(returns, summed_returns, lengths, measures)
+
+
+def add_seed_axis(timestep: Timestep, shape: tuple[int, int]) -> Timestep:
+    """Return views of the same arrays, by seeds and environments."""
+    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), timestep)
+
+
+def check_finite(action: Float[np.ndarray, "seeds *rest"], seeds: Sequence[int]) -> None:
+    """Raise `DivergedError` if the actions of a seed's policy are not finite."""
+    for seed, action_of_seed in zip(seeds, action, strict=True):
+        if not np.isfinite(action_of_seed).all():
+            raise DivergedError(
+                f"training diverged: the policy of seed {seed} is not finite any more; the last checkpoint is whole"
+            )

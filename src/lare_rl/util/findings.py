@@ -1,0 +1,89 @@
+"""Findings: what a rule has found, as a code and values, and their sentences, which live in one catalogue for each room.
+
+A catalogue is a dictionary from code to template. A template is a text of `str.format` with commands in backticks:
+
+    MESSAGES = {"rising": "The return was still rising at step {step:,} ({return_:score}). Continue with `{command}`."}
+    render(Finding("rising", {"step": 5000, "return_": 12.3, "command": "lare-rl train"}), MESSAGES)
+
+A value may also be a finding, whose template is of the same catalogue, or None, which is rendered as an empty text. The elements
+of a tuple are separated by commas.
+"""
+
+import math
+import re
+import string
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from html import escape
+from typing import Any, Literal
+
+__all__ = ["Catalogue", "Finding", "format_value", "render"]
+
+Catalogue = Mapping[str, str]
+"""The templates of a room, by the codes of its findings."""
+
+_CODE = re.compile(r"`([^`]*)`")
+_MARKDOWN_SPECIAL = re.compile(r"([\\*_|<>\[\]])")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a rule has found. Findings are hashable if their values are."""
+
+    code: str
+    """The key of its sentence in the catalogue of its room."""
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+    def __hash__(self) -> int:
+        return hash((self.code, frozenset(self.values.items())))
+
+
+def render(finding: Finding, catalogue: Catalogue, style: Literal["text", "html", "markdown"] = "text") -> str:
+    """Return a finding's sentence for the terminal (`text`), a page (`html`, escaped), or a Markdown file (`markdown`, escaped).
+
+    Raises:
+        KeyError: the catalogue lacks the code, or the finding lacks a value of its template.
+    """
+    text = _Formatter(catalogue).vformat(catalogue[finding.code], (), finding.values)
+    if style == "html":
+        return _CODE.sub(r"<code>\1</code>", escape(text))
+    if style == "markdown":
+        prose_and_code = re.split(r"(`[^`]*`)", text)
+        return "".join(
+            text if text.startswith("`") else _MARKDOWN_SPECIAL.sub(r"\\\1", text) for text in prose_and_code
+        )
+    return text
+
+
+def format_value(value: Any, spec: str = "") -> str:
+    """Format one value by a spec of `str.format`, or by one of these:
+
+    * `score`: a whole number if it is large, otherwise three digits.
+    * `count NOUN`: the number with its noun, in the singular or the plural, such as `1 episode` and `1,000 episodes`.
+    * `r2`: two decimal places, three near 1.
+    * `error`: one digit, for a standard error.
+    """
+    match spec.split(" ", 1):
+        case ["score"]:
+            return f"{value:,.0f}" if math.isfinite(value) and abs(value) >= 100 else f"{value:.3g}"
+        case ["count", noun]:
+            return f"{value:,} {noun}{'' if value == 1 else 's'}"
+        case ["r2"]:
+            return f"{value:.3f}" if value > 0.99 else f"{value:.2f}"
+        case ["error"]:
+            return f"{value:.1g}" if value >= 0.001 else "less than 0.001"
+    return format(value, spec)
+
+
+class _Formatter(string.Formatter):
+    """Formats values, and findings among them by the same catalogue."""
+
+    def __init__(self, catalogue: Catalogue):
+        self.catalogue = catalogue
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if value is None:
+            return ""
+        if isinstance(value, tuple):
+            return ", ".join(self.format_field(element, format_spec) for element in value)
+        return render(value, self.catalogue) if isinstance(value, Finding) else format_value(value, format_spec)

@@ -1,0 +1,86 @@
+"""Plugins: modules whose import registers methods, decoders, algorithms or environment families.
+
+An installed package names its plugins as entry points:
+
+    [project.entry-points."lare_rl.plugins"]
+    my-methods = "my_package.methods"
+
+The environment variable `LARE_PLUGINS` names further modules, separated by commas: `LARE_PLUGINS=my_methods,my_envs`. Plugins are
+imported when a name is not registered, or when all registered names are listed.
+"""
+
+import os
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Generic, TypeVar
+
+from lare_rl.errors import LareError, did_you_mean
+
+__all__ = ["Registry", "load_plugins"]
+
+T = TypeVar("T")
+
+
+@cache
+def load_plugins() -> None:
+    """Import all plugins. Later calls do nothing.
+
+    Raises:
+        LareError: a plugin cannot be imported.
+    """
+    modules = {entry.name: entry.module for entry in entry_points(group="lare_rl.plugins")}
+    names = filter(None, map(str.strip, os.environ.get("LARE_PLUGINS", "").split(",")))
+    for plugin, module in (modules | {name: name for name in names}).items():
+        try:
+            import_module(module)
+        except Exception as error:  # a plugin's code can raise anything
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise LareError(f"the plugin {plugin!r} cannot be imported: {reason}") from error
+
+
+class Registry(Mapping[str, T], Generic[T]):
+    """Values by name, which plugins can add to: `METHODS = Registry[Method]("method")`."""
+
+    def __init__(self, kind: str):
+        """Create an empty registry.
+
+        Args:
+            kind: the noun for its values in messages, such as "method".
+        """
+        self._kind = kind
+        self._values: dict[str, T] = {}
+
+    def register(self, name: str, value: T) -> None:
+        """Add a value.
+
+        Raises:
+            LareError: another value has this name. Names cannot be reused, because compiled programs are cached by name.
+        """
+        if self._values.setdefault(name, value) != value:
+            raise LareError(f"there is another {self._kind} {name!r}: choose another name")
+
+    def find(self, name: str) -> T:
+        """Return the value of this name.
+
+        Raises:
+            LareError: no value has this name. The message lists all names.
+        """
+        if name in self:
+            return self._values[name]
+        hint = did_you_mean(name, self._values)
+        raise LareError(f"no {self._kind} {name!r}{hint}; the {self._kind}s are {', '.join(self._values)}")
+
+    def __getitem__(self, name: str) -> T:
+        if name not in self._values:
+            load_plugins()
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        load_plugins()
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        load_plugins()
+        return len(self._values)

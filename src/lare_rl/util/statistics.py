@@ -1,0 +1,106 @@
+"""Statistics of a few numbers, such as the returns of some seeds or episodes, and their texts."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+__all__ = [
+    "Band",
+    "column_correlations",
+    "correlation",
+    "format_mean_std",
+    "format_plus_minus",
+    "format_rounded",
+    "grouped_standard_error",
+    "r_squared",
+    "sample_std",
+    "standard_error",
+]
+
+CONSTANT = 1e-10
+"""Values are taken as equal if the sum of their squared deviations is below this fraction of the sum of their squares."""
+
+
+class Band(NamedTuple):
+    """A curve with an interval at each of its points."""
+
+    x: Float[np.ndarray, " points"]
+    value: Float[np.ndarray, " points"]
+    low: Float[np.ndarray, " points"]
+    high: Float[np.ndarray, " points"]
+
+
+def sample_std(values: Float[np.ndarray, " values"]) -> float:
+    """Return the standard deviation with n - 1, or 0 for fewer than two values."""
+    return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+
+def standard_error(values: Float[np.ndarray, " values"]) -> float:
+    """Return the standard error of the mean, or 0 for fewer than two values."""
+    return sample_std(values) / math.sqrt(max(1, len(values)))
+
+
+def grouped_standard_error(group_means: Float[np.ndarray, " groups"], error_within: float) -> float:
+    """Return the standard error of the mean of groups: from group to group, or within groups, whichever is larger.
+
+    Args:
+        group_means: the mean of each group, such as each seed's mean over its episodes.
+        error_within: the standard error of the mean of all values, by their deviations from the means of their groups.
+    """
+    return max(error_within, standard_error(group_means))
+
+
+def correlation(x: Float[np.ndarray, " values"], y: Float[np.ndarray, " values"]) -> float:
+    """Return Pearson's correlation, or NaN if one of the two never varies."""
+    with np.errstate(invalid="ignore"):
+        return float(np.corrcoef(x, y)[0, 1])
+
+
+def column_correlations(
+    columns: Float[np.ndarray, "rows columns"], y: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, " columns"]:
+    """Return Pearson's correlation of each column with `y`, NaN where one of the two never varies."""
+    return np.array([correlation(column, y) for column in columns.T])
+
+
+def r_squared(y: Float[np.ndarray, " values"], predicted: Float[np.ndarray, " values"]) -> tuple[float, float]:
+    """Return R^2 of predictions and its standard error. Both are NaN if `y` never varies or has fewer than two values.
+
+        e_k = (y_k - y_hat_k)^2,   d_k = (y_k - mean y)^2,   R^2 = 1 - sum e / sum d
+        error^2 = n / (n - 1) * sum_k (e_k - (1 - R^2) d_k)^2 / (sum d)^2
+
+    1 - R^2 is a ratio of two means, and the error is that of a linearised ratio (Cochran, Sampling Techniques, 3rd edition, 1977,
+    section 2.11).
+    """
+    if len(y) < 2:
+        return math.nan, math.nan
+    errors, deviations = (y - predicted) ** 2, (y - y.mean()) ** 2
+    if not deviations.sum() > CONSTANT * np.sum(y**2):
+        return math.nan, math.nan
+    ratio = errors.sum() / deviations.sum()
+    variance = np.sum((errors - ratio * deviations) ** 2) / deviations.sum() ** 2
+    return float(1 - ratio), float(np.sqrt(len(y) / (len(y) - 1) * variance))
+
+
+def format_rounded(number: float, spread: float) -> str:
+    """Round a number to three digits of its spread, or to four of its own if the spread is 0; at most six decimal places.
+
+    A number that six places would not show is written with an exponent.
+    """
+    n_digits, size = (2, spread) if spread > 0 else (3, abs(number))
+    n_places = max(n_digits - math.floor(math.log10(size)), 0) if size > 0 else 3
+    if n_places > 6 and 0 < abs(number) < 1e-4:
+        return f"{number:.2e}"
+    return f"{number:.{min(n_places, 6)}f}"
+
+
+def format_plus_minus(mean: float, std: float | None) -> str:
+    """Write a mean and its standard deviation, such as `71.0 ± 1.4`. Without a deviation, write the mean alone."""
+    return format_rounded(mean, 0.0) if std is None else f"{format_rounded(mean, std)} ± {format_rounded(std, std)}"
+
+
+def format_mean_std(values: Float[np.ndarray, " values"]) -> str:
+    """Write the mean ± the standard deviation of some values, or a single value alone."""
+    return format_plus_minus(float(np.mean(values)), sample_std(values) if len(values) > 1 else None)

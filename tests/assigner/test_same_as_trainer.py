@@ -1,0 +1,80 @@
+"""An assigner and the trainer hand the same steps to the same engine: their rewards agree."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from helpers.long_tests import long_case
+from helpers.small_configs import (
+    LENGTHS,
+    ONE_AGENT,
+    ONE_TEAM,
+    add_steps,
+    random_steps,
+    reward_state,
+    small_config,
+    stored_steps,
+    untrained_learner,
+)
+from helpers.toy_envs import toy_spec
+from lare_rl.assigner.assigner import CreditAssigner
+from lare_rl.credit.methods import METHODS
+from lare_rl.training.rewards import rewards
+
+PHI_ENV = replace(ONE_AGENT, observation_size=2, action_size=1, low=ONE_AGENT.low[:, :1], high=ONE_AGENT.high[:, :1])
+"""The sizes that `phi` is for. The bounds are -1 and 1, so that actions need no scaling."""
+
+
+def learn(method, env, phi=None):
+    """Return a learner and an assigner that have learned from the same steps."""
+    judges = "after" if phi is None else toy_spec().judges
+    algorithm = "td3" if env.n_agents == 1 else "ippo"
+    config = small_config(method, algorithm, env, capacity=1000, factor_inputs=judges)
+    credit = CreditAssigner(
+        method,
+        phi,
+        task=None if phi is None else toy_spec(),
+        observation_space=env.observation_size,
+        action_space=env.action_size,
+        settings=config.credit,
+        **({} if env.n_agents == 1 else {"agents": env.n_agents, "max_steps": env.max_steps}),
+    )
+    learner, steps = untrained_learner(config), random_steps(env, lengths=LENGTHS * 6)
+    agent = 0 if env.n_agents == 1 else slice(None)
+    for rows in np.array_split(np.arange(len(steps.ended)), 12):
+        chunk = jax.tree.map(lambda leaf, rows=rows: leaf[rows], steps)
+        observation, action, next_observation, reward = (
+            values[:, 0, agent]
+            for values in (
+                chunk.timestep.observation,
+                chunk.env_action,
+                chunk.next_timestep.observation,
+                chunk.next_timestep.reward,
+            )
+        )
+        factors = None
+        if phi is not None:
+            factors = phi.step_factors(observation, action, next_observation, judges)[:, None, None]
+        learner = add_steps(learner, config, chunk, factors, learn=True)
+        alive = chunk.timestep.alive[:, 0] if env.n_agents > 1 else None
+        never = np.zeros(len(rows), bool)
+        ended, env_ids = chunk.ended[:, 0], [0] * len(rows)
+        credit.add(observation, action, next_observation, reward, never, ended, env_ids=env_ids, alive=alive)
+        credit.rewards_at([])  # the trainer learns after each chunk
+    return learner, config, credit
+
+
+@pytest.mark.parametrize(
+    ("method", "env"), [("lare-bayes", PHI_ENV), ("rd-linear", ONE_TEAM), long_case("ircr", ONE_AGENT)]
+)
+def test_rewards_agree(method, env, phi):
+    learner, config, credit = learn(method, env, phi if METHODS[method].needs_phi else None)
+    expected = np.asarray(rewards(stored_steps(learner), reward_state(learner), config))
+    expected = expected if env.n_agents > 1 else expected[..., 0]
+    r_hat = credit.rewards_at(np.arange(credit.store.steps))
+    np.testing.assert_allclose(r_hat, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+    assert np.abs(expected).max() > 0
+    if learner.credit:
+        assert credit.learner.n_learned == int(learner.n_learned.sum())

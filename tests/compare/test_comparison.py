@@ -1,0 +1,187 @@
+"""Statistics of runs with known answers."""
+
+import json
+
+import numpy as np
+import pytest
+
+from helpers.toy_envs import toy_spec
+from lare_rl.compare import bootstrap
+from lare_rl.compare.bootstrap import Estimate, interquartile_means, load_rliable, probability_of_improvement
+from lare_rl.compare.comparison import compare, compare_over_tasks, compare_tasks
+from lare_rl.compare.labels import label_runs
+from lare_rl.compare.mann_whitney import mann_whitney
+from lare_rl.compare.results import read_run_results
+from lare_rl.errors import LareError
+from lare_rl.runs.directory import Run
+from lare_rl.runs.metric_names import RETURN
+
+
+@pytest.fixture(autouse=True)
+def few_repetitions(monkeypatch):
+    monkeypatch.setattr(bootstrap, "REPETITIONS", 300)
+
+
+def read(runs, metric=RETURN):
+    return read_run_results(label_runs(runs), metric)
+
+
+def test_compare_by_hand(make_run):
+    """The interquartile mean of 8 numbers leaves out the two at either end."""
+    values = [-100.0, 1, 2, 3, 4, 5, 6, 1000]
+    runs = [make_run("a", values), make_run("b", [value + 0.5 for value in values], method="rrdu")]
+    comparison = compare(read(runs))
+    first, second = comparison.rows
+    assert first.iqm.value == pytest.approx(np.mean([2, 3, 4, 5]))
+    assert first.mean == pytest.approx(np.mean(values))
+    assert first.std == pytest.approx(np.std(values, ddof=1))
+    assert first.iqm.low <= first.iqm.value <= first.iqm.high
+    assert (first.improvement, first.difference, first.p_value) == (None, None, None)
+    pairs = [(x + 0.5 > y) + 0.5 * (x + 0.5 == y) for x in values for y in values]
+    assert second.improvement.value == pytest.approx(np.mean(pairs))
+    np.testing.assert_allclose(comparison.curves["dense"].x, [50, 100])
+    np.testing.assert_allclose(comparison.curves["dense"].value, [3.5 / 2, 3.5])
+    profile = comparison.profiles["dense"]
+    np.testing.assert_allclose(profile.value, [np.mean(np.array(values) > x) for x in profile.x])
+    assert compare(read(runs)).rows == comparison.rows  # the bootstrap is deterministic
+
+
+@pytest.mark.parametrize(("n_runs", "n_tasks"), [(1, 1), (3, 1), (3, 2), (8, 3)])
+def test_statistics_are_those_of_rliable(n_runs, n_tasks):
+    random = np.random.default_rng(0)
+    load_rliable()
+    from rliable import metrics
+
+    scores = random.normal(size=(n_runs, n_tasks, 7))
+    expected = [metrics.aggregate_iqm(scores[..., step]) for step in range(7)]
+    np.testing.assert_allclose(interquartile_means(scores), expected)
+    scores, baseline = (random.integers(0, 5, (n, n_tasks)).astype(float) for n in (n_runs, 4))  # with ties
+    expected = metrics.probability_of_improvement(scores, baseline)
+    assert probability_of_improvement(scores, baseline) == pytest.approx(expected)
+
+
+def test_mann_whitney_by_hand():
+    """By the tables of Mann and Whitney: of 3 against 3, all nine pairs 1 in 20, eight or more 2 in 20."""
+    low, high = np.array([1.0, 2, 3]), np.array([4.0, 5, 6])
+    assert mann_whitney([(high, low)]) == pytest.approx((1 / 20, 1))
+    assert mann_whitney([(np.array([3.0, 5, 6]), np.array([1.0, 2, 4]))])[0] == pytest.approx(2 / 20)
+    assert mann_whitney([(low, high)]) == pytest.approx((1, 1 / 20))
+    assert mann_whitney([(high, low), (high, low)])[0] == pytest.approx(1 / 400)
+    assert min(mann_whitney([(low, low)])) > 0.5
+
+
+def test_intervals_contain_true_mean():
+    """Of 10 normal numbers, in most of 60 cases. The bootstrap's intervals of few numbers are a little too narrow."""
+    random = np.random.default_rng(0)
+    n_inside = 0
+    for _ in range(60):
+        (estimate,) = bootstrap.bootstrap(random.normal(size=(10, 1)), lambda scores: np.array([scores.mean()]))
+        n_inside += estimate.low <= 0 <= estimate.high
+    assert 46 <= n_inside <= 60
+
+
+def test_draws_and_seeds(make_run):
+    """Seeds differ by 100, draws by 1, so that the interval over draws is narrow."""
+    runs = [make_run(f"draw{draw}", [draw, draw + 100.0], method="lare-rrdu", draw=draw) for draw in range(3)]
+    (row,) = compare(read(runs)).rows
+    assert (row.n_seeds, row.n_draws) == (2, 3)
+    assert row.draw_mean.value == pytest.approx(51)
+    assert (row.draw_mean.low, row.draw_mean.high) == (pytest.approx(50, abs=0.5), pytest.approx(52, abs=0.5))
+    assert row.iqm.high - row.iqm.low == pytest.approx(100)
+
+
+def test_scaled_scores_of_several_tasks(make_run):
+    runs = [make_run("a", [-44.0, -2.7], "Reacher-v4"), make_run("b", [4600.0, 4600.0], "Walker2d-v4")]
+    (comparison,) = compare_tasks(read(runs))
+    assert comparison.normalised
+    assert comparison.rows[0].mean == pytest.approx(np.mean([0, 1, 1, 1]))
+
+
+def test_tasks_without_common_scale(make_run):
+    """They are compared alone and, by the order of their runs, together."""
+    low, high = [1.0, 2, 3], [4.0, 5, 6]
+    runs = [make_run("a", low), make_run("b", high, method="rd"), make_run("c", high, method="rrd")]
+    runs += [
+        make_run("a", [100 * value for value in low], "Depot"),
+        make_run("b", [100 * value for value in high], "Depot", method="rd"),
+        make_run("c", high[:2], "Depot", method="rrd"),
+    ]
+    comparisons = compare_tasks(read(runs))
+    assert [(comparison.tasks, comparison.rows[0].mean) for comparison in comparisons] == [
+        (("Chase",), 2),
+        (("Depot",), 200),
+    ]
+    first, second = compare_over_tasks(comparisons)  # without rrd, which has fewer seeds on one of the tasks
+    assert (first.label, first.improvement, first.p_value) == ("dense", None, None)
+    assert (second.label, second.n_seeds, second.improvement.value) == ("rd", 3, 1)
+    assert second.p_value == pytest.approx(1 / 400)
+    assert compare_over_tasks(compare_tasks(read(runs[:2] + runs[4:]))) == []  # dense is not on Depot
+    assert compare_over_tasks(comparisons[:1]) == []
+
+
+def test_interval_of_difference(make_run):
+    """Each method scores 0 or 10 more, so that the difference is between 10 less and 10 more than that of the means."""
+    runs = [make_run("a", [0.0, 10.0]), make_run("b", [100.0, 110.0], method="rd"), make_run("c", [1.0], method="rrd")]
+    _, second, single = compare(read(runs)).rows
+    assert second.difference == Estimate(100.0, 90.0, 110.0)
+    assert (single.difference, single.improvement, single.p_value) == (None, None, None)
+    assert single.iqm == Estimate(1.0, 1.0, 1.0)
+    (three,) = compare(read([make_run("d", [1.0, 2.0, 6.0])])).rows
+    assert (three.iqm.low, three.iqm.high) == (1.0, 6.0)
+
+
+def test_step_and_last_quarter(make_run):
+    """The scores at the five evaluations are a fifth, two fifths, ... of the last one."""
+    steps = (20, 40, 60, 80, 100)
+    runs = [make_run("a", [5.0, 15.0], steps=steps), make_run("b", [10.0, 20.0], method="rd", steps=steps)]
+    assert [row.mean for row in compare(read(runs), late=True).rows] == pytest.approx([9.0, 13.5])  # steps 80 and 100
+    early = compare(read(runs), step=60)
+    assert [row.mean for row in early.rows] == pytest.approx([6.0, 9.0])
+    assert list(early.curves["rd"].x) == [20, 40, 60]
+    with pytest.raises(LareError, match=r"at step 50; .*20, 40, 60, 80, 100"):
+        compare(read(runs), step=50)
+
+
+def test_other_metric(make_run):
+    run = make_run("a", [1.0, 3.0])
+    lines = [line | {"credit/error": 2 * line["seed"]} for line in run.metrics()]
+    (run.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert compare(read([run], "credit/error"), "credit/error").rows[0].mean == 1.0
+    lines = [line | ({"credit/error": None} if line["seed"] == 1 else {}) for line in lines]
+    (run.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(LareError, match="Chase/a has no credit/error of seed 1"):
+        compare(read([run], "credit/error"), "credit/error")
+
+
+@pytest.mark.parametrize(
+    ("runs", "metric", "message"),
+    [
+        ([("a", "Chase", {}), ("b", "Reacher-v4", {})], RETURN, "returns of Chase have no common scale"),
+        ([("a", "Walker2d-v4", {}), ("b", "Reacher-v4", {})], "critic/loss", "critic/loss has no common scale"),
+        (
+            [("a", "Walker2d-v4", {}), ("a", "Reacher-v4", {}), ("b", "Reacher-v4", {"seed": 2})],
+            RETURN,
+            "dense has no run on Walker2d-v4 with seed 2",
+        ),
+        (
+            [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": (60, 70)})],
+            RETURN,
+            "Chase/a: 50 to 100; .*Chase/b: 60 to 70",
+        ),
+        (
+            [("a", "Chase", {}), ("b", "Chase", {"seed": 2, "steps": ()})],
+            RETURN,
+            "Chase/b has no evaluation/return yet",
+        ),
+    ],
+)
+def test_bad_runs(runs, metric, message, make_run):
+    with pytest.raises(LareError, match=message):
+        compare(read([make_run(name, [1.0, 2.0], task, **settings) for name, task, settings in runs], metric), metric)
+
+
+def test_two_tasks_with_one_name(make_run):
+    first, second = make_run("a", [1.0]), make_run("b", [2.0], method="rd")
+    second = Run(second.directory, second.config.model_copy(update={"task": toy_spec(judges="after")}), ())
+    with pytest.raises(LareError, match="two different tasks Chase"):
+        compare(read([first, second]))

@@ -1,0 +1,168 @@
+"""The tables, sentences and page of a comparison."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from lare_rl.compare.collect import select_runs
+from lare_rl.compare.comparison import compare
+from lare_rl.compare.labels import label_runs
+from lare_rl.compare.messages import MESSAGES, find_min_p, find_score_meaning, find_small_samples, to_text
+from lare_rl.compare.page import comparison_table, describe, overall_table, write_comparisons
+from lare_rl.compare.results import read_run_results
+from lare_rl.errors import LareError
+from lare_rl.runs.metric_names import RETURN
+
+
+def read(runs):
+    return read_run_results(label_runs(runs), RETURN)
+
+
+def codes(findings):
+    return [finding.code for finding in findings]
+
+
+def test_page_of_several_tasks(make_run, tmp_path):
+    runs = [make_run("a", [-44.0, -2.7], "Reacher-v4"), make_run("b", [4600.0, 4600.0], "Walker2d-v4")]
+    (comparison,) = write_comparisons(read(runs), tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "Reacher-v4 (0 is -44, 1 is -2.7), Walker2d-v4 (0 is 3.4, 1 is 4600)" in page
+    assert page.count("<svg") == 2
+    config = runs[0].config
+    for fact in (
+        f"LaRe {config.lare}",
+        f"JAX {config.versions['jax']}",
+        config.machine,
+        "10 episodes in each evaluation",
+    ):
+        assert fact in page
+    assert find_score_meaning(comparison).code == "scaled_scores"
+
+
+def test_page_of_tasks_without_common_scale(make_run, tmp_path):
+    low, high = [1.0, 2, 3], [4.0, 5, 6]
+    runs = [
+        make_run(name, values, task, method=method)
+        for task in ("Chase", "Depot")
+        for name, values, method in (("a", low, "dense"), ("b", high, "rd"))
+    ]
+    comparisons = write_comparisons(read(runs), tmp_path / "page.html")
+    assert overall_table(comparisons) == [("dense (baseline)", "3", "-", "-"), ("rd", "3", "1.000", "0.0025")]
+    page = (tmp_path / "page.html").read_text()
+    assert re.findall("<h2>(.*?)</h2>", page) == ["Chase", "Depot", "All tasks"]
+    write_comparisons(read([runs[0], runs[3]]), tmp_path / "page.html")
+    assert "All tasks" not in (tmp_path / "page.html").read_text()
+
+
+def test_command(make_run, command, tmp_path):
+    runs = [
+        make_run("a", [1.0, 3.0]),
+        make_run("b", [2.0, 4.0], method="rd"),
+        make_run("c", [7.0, 9.0], "Depot", method="rd"),
+    ]
+    paths = [run.directory for run in runs]
+    status, out, _ = command("compare", *paths)
+    assert status == 0
+    assert MESSAGES["no_overall_table"] in out
+    status, out, _ = command("compare", *paths[:2], "--at", 50, "--late", "--out", tmp_path / "late.html")
+    assert status == 0
+    assert "three quarters of 50 steps" in out
+    assert "three quarters of 50 steps" in (tmp_path / "late.html").read_text()
+
+
+def test_score_meaning(make_run):
+    results = read([make_run("a", [5.0, 15.0])])
+    for options, text in (
+        ({}, "on Chase at step 100, the last"),
+        ({"step": 50}, "on Chase at step 50."),
+        ({"late": True}, "on Chase averaged over the evaluations after three quarters of 100 steps"),
+    ):
+        assert text in to_text([find_score_meaning(compare(results, **options))])
+
+
+def test_comparison_table(make_run):
+    single = compare(read([make_run("a", [-347.3176]), make_run("b", [2.0], method="rd")]))
+    assert comparison_table(single)[1] == [
+        ("dense (baseline)", "1", "-347.3", "-347.3", "-", "-", "-"),
+        ("rd", "1", "2.000", "2.000", "-", "-", "-"),
+    ]
+    assert codes(find_small_samples(single)) == []
+    runs = [make_run(f"draw{draw}", [draw, draw + 100.0], method="lare-rrdu", draw=draw) for draw in range(3)]
+    header, (row,) = comparison_table(compare(read(runs)))
+    assert dict(zip(header, row, strict=True))["draws"] == "3"
+    assert "draws" not in comparison_table(compare(read(runs[:1])))[0]
+
+
+def test_smallest_p(make_run):
+    """Two seeds above two others: one of the six ways to deal four numbers."""
+    runs = [make_run("a", [1.0, 2.0]), make_run("b", [3.0, 4.0], method="rd"), make_run("c", [0.0, 0.5], method="rrdu")]
+    comparison = compare(read(runs))
+    _, better, worse = comparison.rows
+    assert (str(better.improvement), better.p_value) == ("1.000", pytest.approx(1 / 6))
+    assert (str(worse.improvement), worse.p_value) == ("0.000", pytest.approx(1 / 6))
+    header, rows = comparison_table(comparison)
+    assert (header[-1], rows[1][-1]) == ("p", "0.17")
+    (finding,) = find_min_p(comparison)
+    assert finding.values["p"] == pytest.approx(1 / 6)
+    assert describe(comparison).endswith("p is at least 0.17.")
+    many = [make_run("d", [1.0, 2, 3, 4]), make_run("e", [1.0, 2, 3, 4], method="rd")]
+    assert codes(find_min_p(compare(read(many)))) == []
+
+
+@pytest.mark.parametrize(
+    ("tasks", "draws", "expected"),
+    [
+        (["Walker2d-v4"], [[1.0, 2.0, 6.0]], [("few_seeds", 3, 0.75)]),
+        (["Walker2d-v4"], [[1.0, 2.0]], [("few_seeds", 2, 0.5)]),
+        (["Walker2d-v4"], [[1.0] * 4] * 2, [("few_draws", 2, 0.5)]),
+        (["Walker2d-v4"], [[1.0] * 4] * 4, []),
+        (["Walker2d-v4"], [[1.0]], []),
+        (["Walker2d-v4", "Reacher-v4"], [[1.0, 2.0, 3.0]], [("few_over_tasks", None, None)]),
+    ],
+)
+def test_small_samples(tasks, draws, expected, make_run):
+    runs = [
+        make_run(f"draw{draw}", returns, task, method="lare-rd", draw=draw)
+        for task in tasks
+        for draw, returns in enumerate(draws)
+    ]
+    comparison = compare(read(runs))
+    findings = list(find_small_samples(comparison))
+    assert [(finding.code, *map(finding.values.get, ("count", "coverage"))) for finding in findings] == expected
+    assert to_text(findings) in describe(comparison)
+
+
+def test_select_runs(make_run):
+    finished, unfinished, empty = (
+        make_run(name, [1.0], method=method, steps=steps, td3={"warmup": 10})
+        for name, method, steps in (("a", "dense", (50, 100)), ("b", "rd", (25, 50)), ("c", "dense", ()))
+    )
+    selected, findings = select_runs([finished, unfinished, empty])
+    assert [run.directory for run in selected] == [finished.directory, unfinished.directory]
+    assert codes(findings) == ["unfinished", "no_evaluation"]
+    assert "50 of 100" in to_text(findings)
+    with pytest.raises(LareError, match="Chase/c: no run has an evaluation"):
+        select_runs([empty])
+
+
+def test_select_runs_with_metric(make_run):
+    with_error, without = (
+        make_run("a", [1.0], td3={"warmup": 10}),
+        make_run("b", [1.0], method="rd", td3={"warmup": 10}),
+    )
+
+    def write(run, error):
+        lines = [line | {"credit/error": error, "evaluation/summed_return": 1.0} for line in run.metrics()]
+        (run.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+    write(with_error, np.pi)
+    selected, findings = select_runs([with_error, without], "credit/error")
+    assert (selected, codes(findings)) == ([with_error], ["no_metric"])
+    assert codes(select_runs([with_error])[1]) == ["mean_over_agents"]
+    with pytest.raises(LareError, match="'credit/error'; they have critic/loss, evaluation/return"):
+        select_runs([without], "credit/error")
+    write(without, None)
+    with pytest.raises(LareError, match="credit/error yet: it is null"):
+        select_runs([without], "credit/error")

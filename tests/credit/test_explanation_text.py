@@ -1,0 +1,169 @@
+"""What the returns say about the factors, as findings."""
+
+import numpy as np
+import pytest
+
+from lare_rl.credit.explanation import Explanation
+from lare_rl.credit.explanation_text import MESSAGES, explanation_findings, explanation_lines, raw_feature_names
+from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.envs.load import read_task
+from lare_rl.util.findings import Finding, render
+
+FACTORS, RAW_FEATURES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
+BOTH_STATES = ["speed (before)", "speed (after)"]
+WELL_EXPLAINED = {"factors_r2": 0.99, "total_r2": 0.99}
+
+
+def explanation(**changes):
+    values = {
+        "n_episodes": 40,
+        "explains_mean_reward": False,
+        "total_r2": 0.97,
+        "raw_feature_shares": np.zeros(2),
+        "factors_r2": 0.9,
+        "factor_varies": np.array([True, True]),
+        "factor_shares": np.array([0.25, 0.65]),
+        "pair_shares": np.zeros(2),
+        "slope": np.array([1.0, 2.0]),
+        "slope_covariance": np.diag([0.01, 0.01]),
+        "linear_share": np.array([0.81, 1.0]),
+        "residual_correlation": np.array([0.1, -0.8]),
+    }
+    return Explanation(**(values | changes))
+
+
+def find(changes, factors=FACTORS, raw_features=(), score_type=None):
+    return explanation_findings(explanation(**changes), score_type, factors, raw_features)
+
+
+@pytest.mark.parametrize(
+    ("changes", "factors", "raw_features", "codes"),
+    [
+        ({}, FACTORS, RAW_FEATURES, "factors_explain about_factors factor factor high_when_small"),
+        ({}, FACTORS, [], "factors_explain about_factors factor factor"),
+        (
+            {"residual_correlation": np.array([0.5, 0.1])},
+            FACTORS,
+            RAW_FEATURES,
+            "factors_explain about_factors factor factor high_when_large",
+        ),
+        ({"factors_r2": 0.05, "residual_correlation": np.zeros(2)}, FACTORS, [], "factors_explain phi_explains_little"),
+        (WELL_EXPLAINED, FACTORS, RAW_FEATURES, "factors_explain about_factors factor factor"),
+        (
+            {"factors_r2": 0.8, "residual_correlation": np.zeros(2), "raw_feature_shares": np.array([0.02, 0.4])},
+            FACTORS,
+            RAW_FEATURES,
+            "factors_explain about_factors factor factor phi_lacks_features",
+        ),
+        (WELL_EXPLAINED, BOTH_STATES, [], "factors_explain about_factors factor about_states"),
+        (
+            WELL_EXPLAINED | {"factor_varies": np.array([True, False])},
+            BOTH_STATES,
+            [],
+            "factors_explain about_factors factor",
+        ),
+        (
+            WELL_EXPLAINED | {"factor_varies": np.array([True, False])},
+            FACTORS,
+            [],
+            "factors_explain about_factors unknown_factor factor",
+        ),
+        ({}, [], [], "raw_features_explain"),
+        ({"n_episodes": 19}, FACTORS, RAW_FEATURES, ""),
+        ({"total_r2": np.nan}, FACTORS, RAW_FEATURES, "equal_returns"),
+    ],
+)
+def test_codes(changes, factors, raw_features, codes):
+    assert [finding.code for finding in find(changes, factors, raw_features)] == codes.split()
+
+
+def test_shares():
+    values = find({}, raw_features=RAW_FEATURES)[0].values
+    assert (values["share"], values["target"]) == (0.9, Finding("returns", {"n_episodes": 40}))
+    assert values["raw"].values["share"] == pytest.approx(0.07)
+    assert find({"total_r2": 0.909}, raw_features=RAW_FEATURES)[0].values["raw"] is None
+    changes = {"raw_feature_shares": np.array([0.2, 0.77]), "explains_mean_reward": True}
+    values = find(changes, [], RAW_FEATURES)[0].values
+    assert (values["share"], values["target"].code) == (0.97, "mean_rewards")
+    largest = [feature.values for feature in values["largest"].values["features"]]
+    assert largest == [{"name": RAW_FEATURES[1], "share": 0.77}, {"name": RAW_FEATURES[0], "share": 0.2}]
+
+
+@pytest.mark.parametrize("is_certain", [True, False])
+@pytest.mark.parametrize(
+    ("score_type", "this", "other"), [(ScoreType.SUM, "sum", "mean"), (ScoreType.MEAN, "mean", "sum")]
+)
+def test_score_type(score_type, this, other, is_certain):
+    finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain))[0]
+    code = "score_type_is_certain" if is_certain else "score_type_is_uncertain"
+    assert finding == Finding(code, {"this": Finding(this), "other": Finding(other)})
+
+
+def test_factors_are_in_order_of_shares():
+    cost, speed = find({})[2:]
+    assert (cost.values["name"], cost.values["share"], cost.values["shape"]) == ("cost", 0.65, None)
+    assert cost.values["effect"].values == pytest.approx({"slope": 2.0, "std": 0.1})
+    assert speed.values["name"] == "speed"
+
+
+@pytest.mark.parametrize(
+    ("changes", "shapes"),
+    [
+        ({"linear_share": np.array([0.79, 0.1]), "factor_shares": np.array([0.95, 0.04])}, ["is_curved", None]),
+        ({"linear_share": np.zeros(2), "pair_shares": np.array([0.13, 0.3])}, ["is_curved", "depends_on_factor"]),
+    ],
+)
+def test_shapes_of_effects(changes, shapes):
+    factors = [finding for finding in find(changes) if finding.code == "factor"]
+    assert [shape and shape.code for shape in (finding.values["shape"] for finding in factors)] == shapes
+
+
+def test_factor_before_and_after():
+    covariance = np.array([[0.01, -0.0098], [-0.0098, 0.01]])
+    values = find(WELL_EXPLAINED | {"slope_covariance": covariance}, BOTH_STATES)[2].values
+    assert (values["name"], values["share"]) == ("speed", 0.9)
+    assert values["effect"].values == pytest.approx({"slope": 3.0, "std": 0.02})
+    assert values["states"].values["after"].values == pytest.approx({"slope": 2.0, "std": 0.1})
+    changes = find(WELL_EXPLAINED | {"slope": np.array([-20.5, 20.1])}, BOTH_STATES)[2].values
+    assert changes["effect"] == Finding("change_pays")
+    constant = find(WELL_EXPLAINED | {"factor_varies": np.array([True, False])}, BOTH_STATES)[2].values
+    assert constant["states"].values["after"] == Finding("equal_means")
+
+
+def test_residual_values():
+    values = find({}, raw_features=RAW_FEATURES)[-1].values
+    assert values == {"name": RAW_FEATURES[1], "correlation": -0.8, "judges": Finding("judges_may_be_wrong")}
+    assert find({}, BOTH_STATES, RAW_FEATURES)[-1].values["judges"] is None
+
+
+ANYTHING = {
+    **dict.fromkeys(("share", "slope", "std", "correlation"), 0.5),
+    **dict.fromkeys(("n_episodes", "this", "other", "target", "largest", "features", "name", "raw", "effect"), "x"),
+    **dict.fromkeys(("states", "shape", "before", "after", "judges"), None),
+}
+
+
+@pytest.mark.parametrize("code", MESSAGES)
+def test_messages_render(code):
+    text = render(Finding(code, ANYTHING), MESSAGES)
+    assert text
+    assert "{" not in text
+
+
+def test_lines():
+    lines = explanation_lines(explanation(), None, FACTORS, RAW_FEATURES)
+    assert "90%" in lines[0]
+    assert lines[2:4] == ["- cost: 65%, +2 ± 0.1", "- speed: 25%, +1 ± 0.1"]
+
+
+def test_raw_feature_names():
+    task = read_task("HalfCheetah-v4")
+    names = raw_feature_names(task.observation, task.action, 23, task.action_size, both=False)
+    assert names[7] == "entry 7 of the observation (angle of the front foot (rad))"
+    assert names[17].startswith("entry 0 of the action")
+    assert len(names) == 23
+    assert raw_feature_names("0: price", "", 3, 1, both=True) == [
+        "entry 0 of the observation before the step (price)",
+        "entry 0 of the observation after the step (price)",
+        "entry 0 of the action",
+    ]

@@ -1,0 +1,8 @@
+"""The second tier of tests."""
+
+import pytest
+
+
+def long_case(*values):
+    """A case that repeats the other cases of its test with another algorithm, method or task. `make test-long` runs these."""
+    return pytest.param(*values, marks=pytest.mark.long)

@@ -1,0 +1,21 @@
+"""A language model whose replies are written in advance."""
+
+import json
+
+from lare_rl.errors import LareError
+
+
+class ScriptedModel:
+    """Replies with one function after the other. When none is left, it raises `LareError`."""
+
+    name = "scripted"
+
+    def __init__(self, *sources):
+        self.replies = [json.dumps({"Understand": "", "Analyze": "", "Functions": source}) for source in sources]
+        self.requests = []
+
+    def reply(self, messages, sample):
+        self.requests.append(messages)
+        if not self.replies:
+            raise LareError("no reply is left")
+        return self.replies.pop(0)

@@ -1,0 +1,187 @@
+"""Small configurations, and random steps, to test the parts of training on (`from helpers.small_configs import ...`)."""
+
+from functools import partial
+
+import jax
+import numpy as np
+
+from lare_rl.algorithms.ppo import PPOSettings
+from lare_rl.algorithms.qmix import QMIXSettings
+from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.algorithms.td3 import TD3Settings
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.methods import METHODS
+from lare_rl.data import replay
+from lare_rl.data.trajectory import Trajectory
+from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
+from lare_rl.training import learner as learners
+from lare_rl.training.compiled import training_module
+from lare_rl.training.episodes import learn_returns
+from lare_rl.training.rewards import RewardState
+from lare_rl.training.static_config import TrainConfig
+
+LENGTHS = (5, 12, 3, 9, 12)
+"""The lengths of the episodes of one environment. The next environments have them in another order."""
+
+TOTAL = sum(LENGTHS)
+
+ONE_AGENT = EnvSpec(
+    (Team("agent", 0, 1),), 3, 2, False, 12, low=np.full((1, 2), -1, np.float32), high=np.ones((1, 2), np.float32)
+)
+ONE_TEAM = EnvSpec((Team("all", 0, 3),), 3, 4, True, 12, state_size=5, agents_leave=True, masks_actions=True)
+"""Three agents with discrete actions, some of whom leave."""
+TWO_TEAMS = EnvSpec((Team("first", 0, 3), Team("second", 3, 5)), 3, 4, True, 12, agents_leave=True, masks_actions=True)
+
+SMALL_SETTINGS = {
+    "td3": TD3Settings(hidden=(8,), batch_size=8, warmup=0),
+    "ppo": PPOSettings(hidden=(8,), minibatch_size=5, epochs=2, normalise_observations=True),
+    "ippo": PPOSettings(hidden=(8,), minibatch_size=50, epochs=1),
+    "qmix": QMIXSettings(hidden=4, embed=2, hypernet=3, batch_size=4, update_every=2, target_every=4),
+}
+
+
+def small_config(method, algorithm="td3", env=ONE_AGENT, **changes):
+    values = {
+        "env": env,
+        "credit_scope": "observation",
+        "method": METHODS[method],
+        "algorithm": ALGORITHMS[algorithm],
+        "hyperparameters": SMALL_SETTINGS[algorithm],
+        "credit": CreditSettings(hidden=(8,), drawn_steps=4, steps=24),
+        "scale_rewards": False,
+        "n_factors": tuple(2 + i for i in range(len(env.teams))) if METHODS[method].needs_phi else (),
+        "factor_inputs": "after",
+        "n_envs": 1,
+        "rollout_steps": 4,
+        "capacity": 100,
+        "steps": 100,
+        "fit_updates": 1,
+    }
+    return TrainConfig(**(values | changes))
+
+
+def random_steps(env=ONE_AGENT, envs=1, seed=0, lengths=LENGTHS):
+    """Return random steps of whole episodes that are all truncated. An agent that leaves is gone until the end."""
+    random, total = np.random.default_rng(seed), sum(lengths)
+    lead, agents = (total, envs), env.n_agents
+
+    def normal(*shape):
+        return random.normal(size=(*lead, *shape)).astype(np.float32)
+
+    ended, alive = np.zeros(lead, bool), np.ones((*lead, agents), bool)
+    next_alive = alive.copy()
+    for i in range(envs):
+        ends = np.cumsum(np.roll(lengths, i))
+        ended[ends - 1, i] = True
+        for start, end in zip([0, *ends], ends, strict=False):
+            for agent in range(agents if env.agents_leave else 0):
+                leaves = start + random.integers(1, 2 * (end - start) + 1)  # half of them stay
+                alive[leaves:end, i, agent] = next_alive[leaves - 1 : end - 1, i, agent] = False
+    observation, state = normal(agents, env.observation_size), normal(env.state_size)
+    final = normal(agents, env.observation_size), normal(env.state_size)
+    observation *= alive[..., None]
+
+    def shift(values, final):
+        is_last = ended.reshape(*lead, *[1] * (values.ndim - 2))
+        return np.where(is_last, final, np.roll(values, -1, axis=0))
+
+    next_observation, next_state = shift(observation, final[0]) * next_alive[..., None], shift(state, final[1])
+    available = np.ones((*lead, agents, env.action_size), bool)
+    if env.masks_actions:
+        available = random.uniform(size=available.shape) < 0.6
+        available[..., 0] |= ~available.any(axis=-1)
+    action = 2 * normal(agents, env.action_size)  # some actions are beyond the bounds
+    if env.discrete:
+        action = to_env_action(np.where(available, action, -np.inf), env)
+    never = np.zeros(lead, bool)
+    timestep = Timestep(
+        observation=observation,
+        state=state,
+        available=available,
+        alive=alive,
+        reward=np.zeros((*lead, agents), np.float32),
+        terminated=never,
+        truncated=never,
+        measures={},
+    )
+    next_timestep = Timestep(
+        observation=next_observation,
+        state=next_state,
+        available=np.where(ended[..., None, None], True, np.roll(available, -1, axis=0)),
+        alive=next_alive,
+        reward=normal(agents) * alive,
+        terminated=never.copy(),
+        truncated=ended,
+        measures={},
+    )
+    return Trajectory(timestep, action, to_env_action(action, env), next_timestep)
+
+
+def random_factors(config, steps, seed=1):
+    """Return random factors of every row."""
+    shape = (*steps.ended.shape, config.credit_rows, max(config.n_factors, default=0))
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def untrained_learner(config, seed=0):
+    return jitted(_init_learner, config)(jax.random.key(seed))
+
+
+def _init_learner(key, config):
+    return learners.init_learner(key, config, partial(training_module(config).init, config=config))
+
+
+def add_steps(learner, config, steps, factors=None, learn=False):
+    """Return a learner that has stored these steps too.
+
+    Decoders in closed form learn from the finished episodes. Other decoders do so if `learn` is true: they would only learn the type
+    of the score, and compiling this takes a second.
+    """
+    factors = random_factors(config, steps) if factors is None else factors
+    learner = jitted(learners.store_with_factors, config)(learner, steps, factors)
+    learns = learner.credit and (learn or not config.method.uses_gradient)
+    return learn_stored_returns(learner, config) if learns else learner
+
+
+def store_seeds(config):
+    """Return a function that stores steps and their factors for several seeds."""
+    return jax.jit(jax.vmap(partial(learners.store_with_factors, config=config)), donate_argnums=0)
+
+
+_COMPILED = {}
+
+
+def jitted(function, config):
+    """Return a function for one configuration, compiled once."""
+    key = function, repr(config)
+    if key not in _COMPILED:
+        _COMPILED[key] = jax.jit(partial(function, config=config))
+    return _COMPILED[key]
+
+
+def learn_stored_returns(learner, config):
+    """Return a learner whose decoders have learned from all finished episodes."""
+    arrays = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (learner.credit, learner.replay, learner.n_learned))
+    with jax.enable_x64(True):
+        learned = jitted(learn_returns, config)(*arrays)
+    decoders, n_learned = jax.tree.map(lambda leaf: leaf[0], learned)
+    return learner._replace(credit=decoders, n_learned=n_learned)
+
+
+def learner_with_episodes(config, seed=0):
+    """Return a learner with five episodes in each environment."""
+    return add_steps(untrained_learner(config), config, random_steps(config.env, config.n_envs, seed))
+
+
+def stored_steps(learner):
+    """Return all stored steps of the first environment, in order."""
+    buffer = learner.replay
+    number = np.arange(int(replay.oldest_transition(buffer)[0]), int(buffer.transitions[0]))
+    return read(buffer, replay.Index(np.zeros_like(number), number))
+
+
+read = jax.jit(replay.read)
+
+
+def reward_state(learner):
+    return RewardState(learner.credit, learner.scale)

@@ -1,0 +1,173 @@
+"""Parquet files and Hugging Face data sets, written and read by their own libraries."""
+
+import datasets
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from helpers.toy_logs import check_log, logged_episodes
+from lare_rl import LareError
+from lare_rl.logs.episode import RelabelledEpisode
+from lare_rl.logs.log import open_log
+
+
+@pytest.fixture(autouse=True)
+def no_progress_bars():
+    datasets.disable_progress_bars()
+    yield
+    datasets.enable_progress_bars()
+
+
+def step_rows(episodes):
+    tables = []
+    for number, episode in enumerate(episodes):
+        n_steps = len(episode["actions"])
+        columns = {
+            "episode": np.full(n_steps, number),
+            "observations": list(episode["observations"][:-1]),
+            "next_observations": list(episode["observations"][1:]),
+            "actions": list(episode["actions"]),
+            **{key: episode[key] for key in ("rewards", "terminations", "truncations")},
+            "comment": ["mine"] * n_steps,
+        }
+        tables.append(pa.table(columns))
+    return pa.concat_tables(tables)
+
+
+def episode_rows(episodes):
+    episodes = list(episodes)
+    keys = ("observations", "actions", "rewards")
+    return pa.table({key: [episode[key].tolist() for episode in episodes] for key in keys})
+
+
+def write_parquet(table, path):
+    pq.write_table(table, path, row_group_size=100)
+
+
+def write_data_set(table, path):
+    datasets.Dataset(table).save_to_disk(path, num_shards=2)
+
+
+def read_data_set(path):
+    return datasets.load_from_disk(path).data.table.combine_chunks()
+
+
+def relabel(path, out):
+    """Write the log with the rewards plus one."""
+    log = open_log(path)
+    return log.write(out, (RelabelledEpisode(episode, episode.reward + 1) for episode in log.episodes()), False, "")
+
+
+@pytest.mark.parametrize(("write", "read"), [(write_parquet, pq.read_table), (write_data_set, read_data_set)])
+@pytest.mark.parametrize(("rows", "count"), [(step_rows, 400), (episode_rows, 12)])
+def test_round_trip(tmp_path, write, read, rows, count):
+    """400 episodes have more rows than a batch."""
+    old = rows(logged_episodes(count))
+    write(old, tmp_path / "log.parquet")
+    check_log(open_log(tmp_path / "log.parquet"), logged_episodes(count))
+    out = relabel(tmp_path / "log.parquet", tmp_path / "new.parquet")
+    new = read(out)
+    assert new.column_names == [*old.column_names, "paid"]
+    unchanged = [name for name in old.column_names if name != "rewards"]
+    assert new.select(unchanged).to_pylist() == old.select(unchanged).to_pylist()
+    assert new["paid"].to_pylist() == old["rewards"].to_pylist()
+    r_hat, reward = (np.concatenate([table[name].to_numpy()]) for table, name in ((new, "rewards"), (old, "rewards")))
+    np.testing.assert_allclose(np.hstack(r_hat), np.hstack(reward) + 1, rtol=1e-5, atol=1e-5)
+    check_log(open_log(out), logged_episodes(count))  # reads `paid`
+    if out.is_dir():
+        assert sorted(file.suffix for file in out.iterdir()) == [".arrow", ".json", ".json"]
+
+
+def test_parquet_directory_continues_episodes(tmp_path):
+    rows = step_rows(logged_episodes(8))
+    (tmp_path / "log").mkdir()
+    for number, start in enumerate(range(0, len(rows), 50)):
+        pq.write_table(rows.slice(start, 50), tmp_path / "log" / f"{number:02d}.parquet")
+    check_log(open_log(tmp_path / "log"), logged_episodes(8))
+    pq.write_table(rows.drop_columns("comment"), tmp_path / "log" / "99.parquet")
+    with pytest.raises(LareError, match=r"99\.parquet has other columns than .*00\.parquet"):
+        list(open_log(tmp_path / "log").episodes())
+
+
+def test_score_column(tmp_path):
+    rows = step_rows(logged_episodes(1))
+    rows = rows.drop_columns("rewards").append_column("score", pa.array([2.5] * len(rows)))
+    pq.write_table(rows, tmp_path / "log.parquet")
+    (episode,) = open_log(tmp_path / "log.parquet").episodes()
+    assert (episode.reward[-1], episode.reward.sum()) == (2.5, 2.5)
+
+
+def test_data_set_arrays_of_fixed_shape(tmp_path):
+    episode = next(iter(logged_episodes(1)))
+    n_steps = len(episode["actions"])
+    features = datasets.Features(
+        {
+            "observations": datasets.Array2D((n_steps + 1, 2), "float32"),
+            "actions": datasets.Array2D((n_steps, 1), "float32"),
+            "rewards": datasets.Sequence(datasets.Value("float32")),
+        }
+    )
+    rows = {key: [episode[key]] for key in features}
+    datasets.Dataset.from_dict(rows, features=features).save_to_disk(tmp_path / "log")
+    check_log(open_log(tmp_path / "log"), logged_episodes(1))
+
+
+def test_data_set_with_splits(tmp_path):
+    splits = {name: datasets.Dataset(episode_rows(logged_episodes(2))) for name in ("train", "test")}
+    datasets.DatasetDict(splits).save_to_disk(tmp_path / "log")
+    with pytest.raises(LareError, match=r"name one of .*log/test, .*log/train"):
+        open_log(tmp_path / "log")
+    assert len(list(open_log(tmp_path / "log" / "test").episodes())) == 2
+
+
+ROWS = step_rows(logged_episodes(1))
+N_ROWS = len(ROWS)
+
+
+def with_column(name, values):
+    return ROWS.set_column(ROWS.column_names.index(name), name, values)
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (ROWS.drop_columns("episode"), "one column episode"),
+        (ROWS.drop_columns("next_observations"), "one column next_observations"),
+        (with_column("episode", pa.array(np.ones(N_ROWS))), "episode must be whole numbers or strings, and is double"),
+        (ROWS.drop_columns("actions"), "episode 0 has no actions"),
+        (with_column("actions", pa.array(["left"] * N_ROWS)), "episode 0: actions must be numbers, and is string"),
+        (with_column("actions", pa.array([None] * N_ROWS, pa.float32())), "actions has rows without a value"),
+        (with_column("observations", pa.array([[0.0]] + [[0.0, 1.0]] * (N_ROWS - 1))), "lists of one length"),
+        (pa.concat_tables([ROWS, with_column("episode", pa.array([1] * N_ROWS)), ROWS]), "episode 0 comes twice"),
+        (ROWS.slice(0, 0), "no episode"),
+    ],
+)
+def test_bad_table(tmp_path, rows, message):
+    path = tmp_path / "log.parquet"
+    pq.write_table(rows, path)
+    with pytest.raises(LareError, match=rf"\A{path}.*{message}"):
+        relabel(path, tmp_path / "new.parquet")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("log.parquet", truncate),
+        ("log", lambda path: (path / "state.json").write_text("{")),
+        ("log", lambda path: (path / "state.json").write_text("[]")),
+        ("log", lambda path: (path / "dataset_info.json").unlink()),
+        ("log", lambda path: next(path.glob("*.arrow")).unlink()),
+        ("log", lambda path: next(path.glob("*.arrow")).write_bytes(b"ARROW")),
+    ],
+)
+def test_damaged_file(tmp_path, name, damage):
+    (write_parquet if name == "log.parquet" else write_data_set)(ROWS, tmp_path / name)
+    damage(tmp_path / name)
+    with pytest.raises(LareError, match=rf"{name} is not a (Parquet file|Hugging Face data set), or damaged: [^\n]+\Z"):
+        open_log(tmp_path / name)

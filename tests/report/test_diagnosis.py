@@ -1,0 +1,218 @@
+"""The findings about made-up runs."""
+
+import numpy as np
+import pytest
+
+from lare_rl.report.diagnosis import diagnose
+from lare_rl.report.messages import MESSAGES
+from lare_rl.report.run_summary import RunSummary
+from lare_rl.util.findings import Finding, render
+
+STEPS = np.arange(1, 9) * 1000.0
+RISING = np.array([[0.0, 10, 20, 30, 40, 50, 60, 70]])
+FLAT = np.array([[50.0, 51, 50, 51, 50, 51, 50, 51]])
+FELL = np.array([[0.0, 40, 90, 92, 60, 40, 30, 31]])
+LEVEL = np.array([[0.0, 20, 40, 60, 71, 76, 78.6, 78.5]])
+FELL_A_LITTLE = np.array([[0.0, 40, 60, 62, 44, 43, 42, 42.5]])
+RANDOM = np.array([-1.0, 0, 1])
+FACTORS = {"sees_factors": True}
+
+
+def find(returns, **facts):
+    """The findings, by code."""
+    returns = np.asarray(returns, float)
+    summary = {"steps": STEPS[: returns.shape[1]], "returns": returns, "random_returns": RANDOM, "directory": "runs/x"}
+    findings = diagnose(RunSummary(**(summary | facts)))
+    return {finding.code: finding for finding in findings}
+
+
+@pytest.mark.parametrize(
+    ("returns", "facts", "codes"),
+    [
+        (
+            np.vstack([RISING, RISING + 2]),
+            {"return_r2": 0.97, **FACTORS, "episodic_return": 12.0},
+            "learned above_episodic explained is_rising",
+        ),
+        (FLAT - 51, {"return_r2": -3.0, **FACTORS}, "not_learned explained explains_little single_seed"),
+        (FLAT - 51, {"return_r2": 0.9}, "not_learned explained needs_training single_seed"),
+        (FLAT - 51, {"return_r2": 0.0, "uses_gradient": True}, "not_learned explained try_closed_form single_seed"),
+        (FELL, {"episodic_return": 40.0}, "learned below_episodic has_fallen single_seed"),
+        (LEVEL, {}, "learned single_seed"),
+        (LEVEL, {"task": "TASK.toml"}, "learned needs_baseline single_seed"),
+        # Two standard errors of a difference are 17. They would be 22.6 with an error of 8, and the end is lower by 19.75.
+        (
+            FELL_A_LITTLE,
+            {"episode_error": 6.0, "episodic_return": 26.0},
+            "learned like_episodic has_fallen single_seed",
+        ),
+        (FELL_A_LITTLE, {"episode_error": 8.0}, "learned single_seed"),
+        (FELL - 200, {}, "worse_than_random needs_training single_seed"),
+        (FLAT - 1000, {}, "worse_than_random needs_training single_seed"),
+        (FLAT / 100 - 52, {"return_r2": 0.99}, "worse_than_random explained is_stuck single_seed"),
+        (FLAT - 50, {}, "may_beat_random needs_training single_seed"),
+        (FLAT - 1000, {"n_saturated": 1}, "worse_than_random is_stuck single_seed"),
+        (
+            np.vstack([FLAT - 51, FLAT - 51]),
+            {"return_r2": -0.93, "median_r2": 0.98},
+            "not_learned decoder_is_outdated needs_training",
+        ),
+        (np.vstack([FLAT - 50, [[0, 0, 38, 0, 1, 0, 1, 0]]]), {}, "not_learned one_seed_was_better"),
+        (np.full((1, 8), np.nan), {}, "no_return"),
+        (RISING, {"untrained": "all steps are random"}, "untrained"),
+        (np.zeros((2, 8)), {"random_returns": np.zeros(10)}, "equal_returns"),
+        (np.ones((2, 8)), {"random_returns": np.zeros(10)}, "learned"),
+        (np.zeros((2, 8)), {"random_returns": np.zeros(0)}, "outcome_unknown"),
+        (RISING[:, :3] - 10, {}, "learned single_seed"),  # too few evaluations for a trend
+    ],
+)
+def test_codes(returns, facts, codes):
+    assert list(find(returns, **facts)) == codes.split()
+
+
+@pytest.mark.parametrize(
+    ("final", "code"),
+    [
+        (10.1, "learned"),
+        (9.9, "may_beat_random"),
+        (4.9, "not_learned"),
+        (-9.9, "not_learned"),
+        (-10.1, "worse_than_random"),
+    ],
+)
+def test_outcome_by_standard_errors(final, code):
+    """Two errors of 3 and 4 make one of 5, so two standard errors are 10."""
+    findings = find(np.full((1, 8), final), random_returns=3 * np.sqrt(3) * RANDOM, episode_error=4.0)
+    assert next(iter(findings)) == code
+
+
+def test_outcome_values():
+    finding = find(np.vstack([RISING, RISING + 2]), initial_returns=np.array([3.0, 4.0]))["learned"]
+    reached, baseline = finding.values["reached"].values, finding.values["baseline"].values
+    assert (reached["return_"], reached["steps"]) == (71, 8000)
+    assert reached["std"].values["std"] == pytest.approx(np.sqrt(2))
+    assert reached["seeds"].values["n_seeds"] == 2
+    assert (baseline["return_"], baseline["std"], baseline["n_episodes"]) == (0, 1, 3)
+    assert baseline["initial"].values["returns"] == (3, 4)
+
+
+def test_seeds_that_learned_are_counted():
+    returns = np.vstack([FLAT, FLAT - 52, FLAT - 51])
+    finding = find(returns)["some_seeds_learned"]
+    assert (finding.values["n_learned"], finding.values["n_seeds"]) == (1, 3)
+    assert "not_learned" in find(returns, initial_returns=np.array([51.0, 51.5, 51.0]))
+
+
+def test_initial_policy_as_good():
+    assert list(find(FLAT, initial_returns=np.array([51.0])))[:2] == ["not_learned", "needs_training"]
+    assert "learned" in find(FLAT, initial_returns=np.array([30.0]))
+    doubtful = {"random_returns": 40 * RANDOM, "initial_returns": np.array([50.0]), "episode_error": 0.6}
+    findings = find(FLAT, **doubtful)
+    assert list(findings)[:2] == ["may_beat_initial_policy", "needs_training"]
+    assert findings["needs_training"].values["evaluate"] is None
+
+
+@pytest.mark.parametrize(
+    ("initial", "episode_error", "code", "n_learned"),
+    [
+        ([-10.3, -49.7], 0.0, "some_seeds_learned", 2),
+        ([-10.3, -49.7], 0.2, "some_seeds_learned", 1),
+        ([-11.1, -49.7], 0.0, "some_seeds_learned", 2),
+        ([-9.0, -49.7], 0.0, "some_seeds_learned", 1),
+        ([-40.3, -49.7], 0.0, "learned", None),
+    ],
+)
+def test_seeds_are_compared_with_their_own_initial_policies(initial, episode_error, code, n_learned):
+    """The mean gain over the seeds hides that the first seed's untrained policy was as good."""
+    facts = {"random_returns": -43 + 15 * RANDOM, "initial_returns": np.array(initial), "episode_error": episode_error}
+    finding = find(np.array([[-10.1], [-10.0]]) + np.zeros(8), **facts)[code]
+    assert finding.values.get("n_learned") == n_learned
+
+
+def test_proxy_rewards_values():
+    def inputs_and_amount(**facts):
+        values = find(FLAT - 51, **facts)["explained"].values
+        return values["inputs"].code, values["amount"].code, values["r2"]
+
+    assert inputs_and_amount(return_r2=0.05) == ("raw_features", "little", 0.05)
+    assert inputs_and_amount(return_r2=0.5, **FACTORS) == ("all_inputs", "a_part", 0.5)
+    assert inputs_and_amount(return_r2=0.9, sees_raw_features=False, **FACTORS) == ("factors", "nearly_all", 0.9)
+    outdated = find(FLAT - 51, return_r2=-1.15, median_r2=0.24)["decoder_is_outdated"].values
+    assert (outdated["amount"].code, outdated["r2"], outdated["last_r2"]) == ("a_part", 0.24, -1.15)
+
+
+@pytest.mark.parametrize(
+    ("facts", "cause", "remedy", "method"),
+    [
+        (FACTORS, "bad_phi", "replace_phi", "lare-bayes"),
+        ({}, "bad_raw_features", "write_phi", "bayes"),
+    ],
+)
+def test_little_explained_values(facts, cause, remedy, method):
+    finding = find(FLAT - 51, return_r2=0.0, task="Toy", uses_gradient=True, **facts)["try_closed_form"]
+    assert finding.values["method"] == method
+    assert finding.values["cause"] == Finding(cause)
+    assert finding.values["remedy"] == Finding(remedy, {"task": "Toy"})
+
+
+def test_next_step_values():
+    assert find(RISING)["is_rising"].values == {"directory": "runs/x", "steps": 16_000}
+    better = find(np.vstack([FLAT - 50, [[0, 0, 38, 0, 1, 0, 1, 0]]]))["one_seed_was_better"]
+    assert better.values == {"step": 3000, "return_": 38, "directory": "runs/x"}
+    assert find(FLAT - 1000, n_saturated=1)["is_stuck"].values["cause"].values == {"seeds": None}
+    stuck = find(np.vstack([FLAT - 1000, FLAT - 1000]), n_saturated=1)["is_stuck"].values["cause"]
+    assert stuck.values["seeds"].values == {"n_saturated": 1, "n_seeds": 2}
+    assert find(FLAT / 100 - 52)["is_stuck"].values["cause"].code == "repeats_behaviour"
+
+
+def test_needs_training_values():
+    def find_values(**facts):
+        values = find(FLAT - 51, **facts)["needs_training"].values
+        return {name for name, finding in values.items() if finding is not None}, values["limit"]
+
+    assert find_values(return_r2=0.7) == (set(), None)
+    names, limit = find_values(return_r2=0.9)
+    assert (names, limit.values) == ({"limit", "phi"}, {"agents": None, "rule": None})
+    names, limit = find_values(return_r2=0.9, task="mine.toml", many_agents=True, **FACTORS)
+    assert names == {"limit"}
+    assert limit.values == {"agents": Finding("among_agents"), "rule": Finding("own_rule")}
+    assert find(FLAT - 50)["needs_training"].values["evaluate"].values == {"directory": "runs/x"}
+
+
+def test_best_evaluation_is_trained():
+    lucky = np.array([[90.0, 80, 0, 0, 1, 0, 1, 0]])
+    assert find(lucky)["one_seed_was_better"].values["step"] == 1000
+    assert "needs_training" in find(lucky, warmup=2000)
+    assert find(FELL, warmup=2999)["has_fallen"].values["return_"] == 92
+    assert find(FELL, warmup=4000)["has_fallen"].values["return_"] == 60
+
+
+def test_best_evaluation_of_own_task():
+    """The last evaluations vary too much to say that the policy fell."""
+    returns = np.array([[0.0, 20, 60, 50, 88, 60, 85, 60]])
+    best = find(returns, task="mine.toml")["needs_baseline"].values["best"]
+    assert best.values == {"step": 5000, "return_": 88, "directory": "runs/x"}
+    assert find(LEVEL, task="mine.toml")["needs_baseline"].values["best"] is None
+
+
+ANYTHING = {
+    "returns": (1.0, 20_000.0),
+    **dict.fromkeys(("return_", "std", "r2", "last_r2"), 0.5),
+    **dict.fromkeys(("steps", "step", "n_seeds", "n_learned", "n_episodes", "n_evaluations"), 3),
+    **dict.fromkeys(("n_saturated", "n_features"), 1),
+    **dict.fromkeys(("reached", "baseline", "initial", "seeds", "reason", "inputs", "amount", "remedy", "cause"), "x"),
+    **dict.fromkeys(("method", "task", "directory", "limit", "evaluate", "phi", "agents", "rule", "best"), "x"),
+}
+
+
+@pytest.mark.parametrize("code", MESSAGES)
+def test_messages_render(code):
+    text = render(Finding(code, ANYTHING), MESSAGES)
+    assert text
+    assert "{" not in text
+
+
+def test_message_of_nested_findings():
+    text = render(find(np.vstack([RISING, RISING + 2]))["learned"], MESSAGES)
+    for words in ("learned", "71 ± 1.41", "8,000 steps", "2 seeds", "0 ± 1 in 3 episodes"):
+        assert words in text

@@ -1,0 +1,295 @@
+"""Every file that is read may be damaged, too large, too deep, of wrong types, or an attack: the error is one line."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers.toy_envs import toy_spec
+from lare_rl.config.migrate import FORMAT
+from lare_rl.config.resolve import resolve
+from lare_rl.config.settings import Settings
+from lare_rl.envs.load import read_task
+from lare_rl.errors import LareError
+from lare_rl.llm.model import recorded_model
+from lare_rl.report.report import write_report
+from lare_rl.runs import checkpoint, metrics_file
+from lare_rl.runs.config_file import MAX_CONFIG_BYTES, make_config, read_config
+from lare_rl.runs.directory import open_run
+from lare_rl.runs.metrics_file import read_metrics
+from lare_rl.sweep.sweep import read_sweep
+
+DEEP = "[" * 50_000
+TOO_DEEP = "nested more than 64 deep"
+LINE = {"step": 1, "seed": 0, "evaluation/return": 1.5}
+
+
+def refusal(read, *arguments) -> str:
+    """Return the message of the `LareError` that a reader raises. Any other exception fails the test."""
+    with pytest.raises(LareError) as error:
+        read(*arguments)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 1000
+    return str(error.value)
+
+
+@pytest.fixture
+def write_run(tmp_path):
+    """Write the directory of a run that was never trained, with changes of its config.json."""
+
+    def write(**changes) -> Path:
+        config = make_config(toy_spec(), resolve(Settings(method="dense", steps=100), toy_spec()), ())
+        values = json.loads(config.model_dump_json()) | changes
+        (tmp_path / "config.json").write_text(json.dumps(values))
+        (tmp_path / "metrics.jsonl").write_text(json.dumps(LINE) + "\n")
+        return tmp_path
+
+    return write
+
+
+# config.json
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "line 1 column 1"),
+        (b'{"format": 3', "line 1 column 13"),
+        (DEEP.encode(), TOO_DEEP),
+        (b'{"format": ' + b"[" * 988 + b"]" * 988 + b"}", TOO_DEEP),
+        (b"[]", "not an object"),
+        (b"null", "not an object"),
+        (b"\xff", "byte 0xff"),
+        (b'{"format": ' + b"9" * 5000 + b"}", "5000 digits"),
+        (f'{{"format": {FORMAT}}}'.encode(), "'lare', 'settings', 'task'"),
+        (b'{"format": 4, "settings": []}', "'lare'"),
+        (b'{"format": 1, "lare": "0.1"}', "another version of LaRe (0.1)"),
+        (b"x" * (MAX_CONFIG_BYTES + 1), "is larger than 8 MB"),
+    ],
+)
+def test_config_content(tmp_path, content, message):
+    (tmp_path / "config.json").write_bytes(content)
+    text = refusal(read_config, tmp_path)
+    assert "config.json" in text
+    assert message in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"longest_episode": "many"}, "longest_episode = 'many'"),
+        ({"settings": []}, "settings = []"),
+        ({"versions": {"jax": {}}}, "versions.jax = {}"),
+        ({"more": 1}, "'more'"),
+        ({"function_sha256": ["0" * 64, "1" * 64]}, "2 latent functions for 1 roles"),
+    ],
+)
+def test_config_values(write_run, changes, message):
+    assert message in refusal(open_run, write_run(**changes))
+
+
+def test_config_of_too_many_seeds(write_run):
+    path = write_run() / "config.json"
+    values = json.loads(path.read_text())
+    values["settings"]["seeds"] = 2_000_000_000
+    path.write_text(json.dumps(values))
+    assert "seeds = 2000000000" in refusal(read_config, path.parent)
+
+
+def test_html_is_escaped(write_run):
+    page = write_report([write_run(machine="<script>alert(1)</script>", lare="<img src=x>")]).read_text("utf-8")
+    assert "<script" not in page
+    assert "<img" not in page
+
+
+# metrics.jsonl
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (DEEP, TOO_DEEP),
+        ("{", "line 1 column 2 (char 1) in line 2"),
+        ("9" * 5000, "5000 digits in line 2"),
+        *(
+            (json.dumps(line), "line 2 is no evaluation")
+            for line in (
+                [],
+                LINE | {"step": True},
+                LINE | {"step": -1},
+                LINE | {"step": 1.5},
+                LINE | {"step": 10**400},
+                LINE | {"seed": "0"},
+                LINE | {"evaluation/return": "<script>"},
+                LINE | {"evaluation/return": [1]},
+                LINE | {"evaluation/return": 10**400},
+            )
+        ),
+    ],
+)
+def test_metrics_line(write_run, line, message):
+    directory = write_run()
+    with (directory / "metrics.jsonl").open("a") as file:
+        file.write(line + "\n")
+    for text in (refusal(read_metrics, directory), refusal(write_report, [directory])):
+        assert "metrics.jsonl is damaged" in text
+        assert message in text
+
+
+def test_metrics_size(write_run, monkeypatch):
+    monkeypatch.setattr(metrics_file, "MAX_METRICS_BYTES", 1 << 20)
+    directory = write_run()
+    (directory / "metrics.jsonl").write_text("x" * (2 << 20))
+    assert "metrics.jsonl is larger than 1 MB" in refusal(read_metrics, directory)
+
+
+def test_metrics_incomplete_line_is_skipped(write_run):
+    directory = write_run()
+    with (directory / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 2')
+    assert read_metrics(directory) == [LINE]
+
+
+# state.npz
+
+
+class Replay(NamedTuple):
+    columns: Any
+    next_row: Any
+
+
+class Learner(NamedTuple):
+    replay: Replay
+
+
+def make_learner(next_row):
+    return Learner(Replay({"reward": jnp.zeros((1, 1, 16))}, jnp.full((1, 1), next_row)))
+
+
+def load(directory: Path):
+    return checkpoint.load(directory, make_learner(0))
+
+
+def check_refused(directory: Path, message: str = "") -> None:
+    text = refusal(load, directory)
+    assert text.startswith(f"the checkpoint {directory / 'state.npz'} cannot be read: ")
+    assert message in text
+
+
+@pytest.fixture
+def directory(tmp_path) -> Path:
+    """A checkpoint."""
+    checkpoint.save(tmp_path / "checkpoint", make_learner(3), {"step": 3}, {})
+    return tmp_path / "checkpoint"
+
+
+def host(**values) -> np.ndarray:
+    return np.array(json.dumps({"step": 3} | values))
+
+
+def segments(**values) -> np.ndarray:
+    return np.array(json.dumps([{"number": 0, "start": [[0]], "count": [[4]]} | values]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"host": np.array(DEEP)}, TOO_DEEP),
+        ({"host": np.array("[]")}, "host is no object"),
+        ({"host": np.zeros(3)}, "line 1 column 3"),
+        ({"host": host(step="3")}, "'3' is not a count"),
+        ({"host": host(step=-1)}, "-1 is not a count"),
+        ({"host": host(metrics_length=2**60)}, "is not a count"),
+        ({"host": host(function_sha256=[1])}, "function_sha256 is no list"),
+        ({"segments": np.array("3")}, "not iterable"),
+        ({"segments": np.array("[{}]")}, "'number'"),
+        ({"segments": segments(number="../../../etc/passwd")}, "'../../../etc/passwd' is not a count"),
+        ({"segments": segments(start=[[-5]])}, "-5 is not a count"),
+        ({"segments": segments(count=[[10**15]])}, ""),
+        ({"segments": segments(count=[[[[4]]]])}, ""),
+        ({"segments": segments(number=7)}, ""),
+        ({".replay.next_row": np.zeros((1, 1), "U5")}, ".replay.next_row holds <U5, not int32"),
+        ({".replay.next_row": np.zeros((1, 1), float)}, ".replay.next_row holds float64, not int32"),
+        ({".replay.next_row": np.zeros((2, 9), int)}, ".replay.next_row has shape (2, 9), not (1, 1)"),
+        ({".replay.next_row": np.array([[{}]], object)}, "allow_pickle=False"),
+    ],
+)
+def test_state_values(directory, changes, message):
+    with np.load(directory / "state.npz") as state:
+        arrays = dict(state) | changes
+    np.savez(directory / "state.npz", **arrays)
+    check_refused(directory, message)
+
+
+def header(shape: tuple) -> bytes:
+    """Return an array file without its numbers."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("shape", [(10**15,), (10**11,), (2**62, 4), (-1,)])
+def test_state_with_false_shape(directory, shape):
+    with zipfile.ZipFile(directory / "state.npz", "a") as archive:
+        archive.writestr("latest/more.npy", header(shape))
+    check_refused(directory)
+
+
+def test_state_zip_bomb(directory):
+    with zipfile.ZipFile(directory / "state.npz", "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("latest/more.npy", header((1 << 24,)) + b"\0" * (8 << 24))
+    check_refused(directory, "latest/more.npy is packed")
+    assert checkpoint.read_host_state(directory) is None
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"\x93NUMPY\x01\x00" + b"\xff" * 99, header((3,)), b"\x80\x04."])
+def test_state_that_is_no_archive(directory, content):
+    (directory / "state.npz").write_bytes(content)
+    check_refused(directory)
+
+
+# Recordings, sweeps and task files
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "not JSON"),
+        (DEEP, TOO_DEEP),
+        ('{"task": ' + "[" * 988 + "]" * 988 + "}", TOO_DEEP),
+        ("[]", "not an object"),
+        ('{"task": "\\ud800"}', "surrogate"),
+        ('{"task": 3}', "task = 3"),
+    ],
+)
+def test_recording(tmp_path, content, message):
+    path = tmp_path / "talk.json"
+    path.write_text(content)
+    text = refusal(recorded_model, "Chase", "factors", 0, path)
+    assert str(path) in text
+    assert message in text
+
+
+@pytest.mark.parametrize("read", [read_task, read_sweep])
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (f"x = {DEEP}", TOO_DEEP),
+        ("a." * 200_000 + "a = 1", TOO_DEEP),
+        ("x = {" * 100 + "}" * 100, TOO_DEEP),
+        ("x", "Expected '='"),
+        (f"x = {'9' * 5000}", ""),
+        ("", ""),
+        ("name = 3\ntasks = {}", ""),
+        ("#" * (2 << 20), "is larger than 1 MB"),
+    ],
+)
+def test_task_or_sweep(tmp_path, read, content, message):
+    path = tmp_path / "file.toml"
+    path.write_text(content)
+    assert message in refusal(read, path)

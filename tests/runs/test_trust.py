@@ -1,0 +1,92 @@
+"""A run directory may name any Python module: nothing is imported that the user does not trust."""
+
+import json
+import sys
+
+import pytest
+
+from helpers.toy_envs import PHI, toy_spec
+from lare_rl.config.resolve import resolve
+from lare_rl.config.settings import Settings
+from lare_rl.errors import LareError
+from lare_rl.latent.saved import read_source
+from lare_rl.report.report import write_report
+from lare_rl.runs.config_file import make_config
+from lare_rl.runs.directory import open_run
+
+
+@pytest.fixture
+def write_run(tmp_path):
+    """Write the directory of a run of an environment."""
+
+    def write(environment, **changes):
+        config = make_config(toy_spec(), resolve(Settings(method="dense", steps=100), toy_spec()), ())
+        task = json.loads(toy_spec(environment=environment).model_dump_json())
+        values = json.loads(config.model_dump_json()) | {"task": task} | changes
+        (tmp_path / "config.json").write_text(json.dumps(values))
+        line = {"step": 1, "seed": 0, "evaluation/return": 1.5}
+        (tmp_path / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+        return tmp_path
+
+    return write
+
+
+@pytest.fixture
+def foreign_file(tmp_path, monkeypatch):
+    """A module in a folder on the path, which ends the process if it is imported."""
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "foreign_file.py").write_text("raise SystemExit('it was run')")
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.delenv("LARE_TRUST", raising=False)
+    return folder / "foreign_file.py"
+
+
+@pytest.mark.parametrize("environment", ["foreign_file:X-v0", "pettingzoo/foreign_file:make"])
+def test_open_run_refuses_foreign_module(write_run, foreign_file, monkeypatch, environment):
+    directory = write_run(environment)
+    with pytest.raises(LareError, match="LARE_TRUST=foreign_file") as error:
+        open_run(directory)
+    assert str(foreign_file.resolve()) in str(error.value)
+    monkeypatch.setenv("LARE_TRUST", "other, foreign_file")
+    assert open_run(directory).config.task.environment == environment
+
+
+@pytest.mark.parametrize("environment", ["helpers.toy_envs:toys/Chase-v0", "json:X", "nowhere_at_all:X"])
+def test_open_run_accepts_installed_or_imported_module(write_run, environment):
+    assert open_run(write_run(environment)).functions == ()
+
+
+@pytest.mark.parametrize(
+    "environment", ["foreign_file:X-v0", "pettingzoo/foreign_file:make", "this:X", "antigravity:X"]
+)
+def test_report_imports_no_module(write_run, foreign_file, environment):
+    directory, modules = write_run(environment), {*sys.modules}
+    page = write_report([directory]).read_text(encoding="utf-8")
+    module = environment.removeprefix("pettingzoo/").partition(":")[0]
+    assert f"of the module {module}" in page
+    assert module not in {*sys.modules} - modules
+
+
+def test_report_shows_function_without_import(write_run, foreign_file):
+    path = write_run("foreign_file:X-v0") / "latent_function.py"
+    path.write_text(PHI)
+    write_run("foreign_file:X-v0", function_sha256=[read_source(path).digest])
+    assert "# 1. how near the action comes" in write_report([path.parent]).read_text(encoding="utf-8")
+    path.write_text(PHI.replace("near", "far"))
+    with pytest.raises(LareError, match="its hash changed"):
+        write_report([path.parent])
+
+
+def test_report_command_names_what_it_omits(write_run, foreign_file, command):
+    directory = write_run("foreign_file:X-v0")
+    status, _, messages = command("report", directory)
+    assert status == 0
+    assert "set LARE_TRUST=foreign_file" in messages
+    (directory / "report.html").write_text("complete")
+    status, _, messages = command("report", directory)
+    assert status == 2
+    assert "set LARE_TRUST=foreign_file" in messages
+    assert "--out" in messages
+    assert (directory / "report.html").read_text() == "complete"
+    assert command("report", directory, "--out", directory / "poorer.html")[0] == 0

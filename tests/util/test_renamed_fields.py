@@ -1,0 +1,25 @@
+"""Names of arrays that earlier versions have saved."""
+
+import pytest
+
+from lare_rl.util.renamed_fields import rename_fields
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (".credit[0].closed.summed.episodes", ".credit[0].closed_form.sufficient_statistics.n_episodes"),
+        (".credit[0].average", ".credit[0].is_mean"),
+        (".replay.episodes", ".replay.episodes"),
+        (".algorithm.qmix.online.agent.decoder.weight", ".algorithm.qmix.online.agent.head.weight"),
+        (
+            ".algorithm.qmix.online.agent.memory.given.weight",
+            ".algorithm.qmix.online.agent.gru.input_projection.weight",
+        ),
+        ("learned[0].rivals.episodes", "learned[0].score_type_predictions.n_episodes"),
+        ("steps", "steps"),
+    ],
+)
+def test_rename_fields(old, new):
+    assert rename_fields(old) == new
+    assert rename_fields(new) == new

@@ -1,0 +1,63 @@
+import numpy as np
+import pytest
+
+from lare_rl.util.statistics import (
+    column_correlations,
+    correlation,
+    format_mean_std,
+    format_plus_minus,
+    grouped_standard_error,
+    r_squared,
+    sample_std,
+    standard_error,
+)
+
+
+def test_std_of_single_value():
+    assert (sample_std(np.array([3.0])), standard_error(np.zeros(0))) == (0, 0)
+    assert sample_std(np.array([1.0, 3.0])) == pytest.approx(np.sqrt(2))
+    assert standard_error(np.array([1.0, 3.0])) == pytest.approx(1)
+
+
+def test_grouped_standard_error_is_the_larger():
+    group_means = np.array([1.0, 3.0])
+    assert grouped_standard_error(group_means, 0.5) == pytest.approx(1)
+    assert grouped_standard_error(group_means, 2.0) == 2
+
+
+def test_correlation():
+    x = np.arange(4.0)
+    assert correlation(x, -3 * x + 1) == pytest.approx(-1)
+    columns = np.stack([x, np.ones(4), x**2], axis=1)
+    np.testing.assert_allclose(column_correlations(columns, x), [1, np.nan, np.corrcoef(x, x**2)[0, 1]])
+
+
+def test_r_squared():
+    y, predicted = np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 2.0])
+    r2, error = r_squared(y, predicted)
+    assert r2 == pytest.approx(0.5)
+    # e = 0 0 1, d = 1 0 1, and the linearised residuals are -0.5 0 0.5.
+    assert error == pytest.approx(np.sqrt(3 / 2 * 0.5 / 4))
+    assert np.isnan(r_squared(np.ones(3), predicted)).all()
+    assert np.isnan(r_squared(y[:1], predicted[:1])).all()
+
+
+@pytest.mark.parametrize(
+    ("mean", "std", "text"),
+    [
+        (4576.2, 349.1, "4576 ± 349"),
+        (0.4505, 0.115, "0.451 ± 0.115"),
+        (0.0002, 0.00021, "0.000200 ± 0.000210"),
+        (0.5, 0.0, "0.5000 ± 0.000"),
+        (1.23e-7, 4e-8, "1.23e-07 ± 4.00e-08"),
+        (3.0, 1e-9, "3.000000 ± 1.00e-09"),
+        (12.345, None, "12.35"),
+    ],
+)
+def test_format_plus_minus(mean, std, text):
+    assert format_plus_minus(mean, std) == text
+
+
+def test_format_mean_std():
+    assert format_mean_std(np.array([70.0, 72.0])) == "71.00 ± 1.41"
+    assert format_mean_std(np.array([70.0])) == "70.00"
