@@ -36,8 +36,8 @@ for call in json.load(sys.stdin):
 
 CALLS = {
     "lare_rl.train(task, {'method': 'rrdu'})": "lare_rl.Settings",
-    "lare_rl.train(7)": "lare_rl.TaskSpec",
-    "lare_rl.train({'name': 'x'})": "lare_rl.TaskSpec",
+    "lare_rl.train(7)": "TaskSpec",
+    "lare_rl.train({'name': 'x'})": "TaskSpec",
     "lare_rl.train(task, function=7)": "lare_rl.load_function",
     "lare_rl.train(task, listeners=[7])": "lare_rl.training.progress.Listener",
     "lare_rl.train(task, function='none.py')": "none.py does not exist",
@@ -57,9 +57,9 @@ CALLS = {
     "lare_rl.load_function('none.py', task)": "none.py does not exist",
     "lare_rl.load_function(0, task)": "not from 0",
     "lare_rl.load_function('none.py', 7)": "none.py does not exist",
-    "lare_rl.design(7)": "lare_rl.TaskSpec",
+    "lare_rl.design(7)": "TaskSpec",
     "lare_rl.design(task, model='gpt')": "reply(messages, sample)",
-    "lare_rl.reflect(phi, 7, None)": "lare_rl.TaskSpec",
+    "lare_rl.reflect(phi, 7, None)": "TaskSpec",
     "phi([[0, 0]] * 5, [[0]] * 4)": "5 observations and 4 actions",
     "phi([0, 0, 0], [0])": "(batch, 2)",
     "phi([[0, 0]], 'left')": "'left'",
@@ -67,10 +67,10 @@ CALLS = {
     "phi(0, 0)": "(batch, 2)",
     "phi.step_factors([0, 0], [0], [0, 0], 'now')": "before, after or both",
     "lare_rl.CreditAssigner('lare-bayes', 7, task=task)": "lare_rl.load_function",
-    "lare_rl.CreditAssigner('lare-bayes', phi, task=7)": "lare_rl.TaskSpec",
+    "lare_rl.CreditAssigner('lare-bayes', phi, task=7)": "TaskSpec",
     "lare_rl.CreditAssigner('lare-bayes', phi, task=pick_spec())": "task='Pick'",
-    "lare_rl.relabel('none', 'out', task=7)": "lare_rl.TaskSpec",
-    "lare_rl.logged_steps('none', 7)": "lare_rl.TaskSpec",
+    "lare_rl.relabel('none', 'out', task=7)": "TaskSpec",
+    "lare_rl.logged_steps('none', 7)": "TaskSpec",
 }
 """Bad calls, and what the message must contain."""
 GOOD_CALLS = {

@@ -69,7 +69,7 @@ def test_the_sdist_holds_what_the_tests_need_and_no_results(built):
         "CITATION.cff",
         "Makefile",
         "tests/conftest.py",
-        "src/lare/py.typed",
+        "src/lare_rl/py.typed",
     } <= names
     assert not any(name.startswith("benchmarks/results") for name in names)
 
