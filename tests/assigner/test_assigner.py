@@ -479,7 +479,7 @@ def test_add_episode_refuses(changes, message):
         ("rd", {"agents": 2}, "max_steps"),
         ("ircr", {"scale_rewards": True}, "scale_rewards"),
         ("rd-linear", {"observation_space": 10_000}, "1024 .*10001"),
-        ("rrdu", {"settings": CreditSettings(drawn_steps=8, steps=4)}, "steps = 4,.*drawn_steps = 8"),
+        ("rrdu", {"settings": CreditSettings(drawn_steps=8, steps=4)}, r"steps = 4,.*drawn_steps = 8"),
         ("rd", {"action_space": None}, "action_space"),
         ("rd", {"task": TASK, "observation_space": 3}, "observation_space .*3 .*observation_size = 2"),
         ("rd", {"capacity": 0}, "capacity = 0"),

@@ -88,7 +88,7 @@ def test_method_with_agents_that_leave(judged_from, method_name, small_many, ech
         return train_quietly(task, settings, tmp_path / "run", make_phi(method, task))
 
     if method.needs_whole_episodes or (method.multi_agent_only and from_state):
-        with pytest.raises(LareError, match=f"^{method_name} (looks at whole episodes|assigns credit among agents)"):
+        with pytest.raises(LareError, match=f"^{method_name} (reads whole episodes|assigns credit among agents)"):
             train()
         return
     line = train().metrics()[-1]

@@ -101,7 +101,7 @@ def _decoder_loss(
     """Return the decoder's `loss` on whole episodes, which are padded to the same length."""
     target = _targets(state, episodes, settings)
     features = decoder_inputs(state, episodes.features, settings)
-    features = features.reshape(len(target), -1, *features.shape[1:])
+    features = features.reshape(len(target), -1, features.shape[-1])  # the axis of the single agent is merged
     return decoder.loss(features, episodes.length, target, episodes.mask, key)
 
 
