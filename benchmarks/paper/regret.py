@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lare_rl import theory
 from lare_rl.report import figures
 from lare_rl.util.statistics import Band, format_plus_minus
+from paper import theory
 from paper.exhibits import Budget
 from paper.pages import Page, items, table
 from paper.theory import History, Table

@@ -215,7 +215,7 @@ def test_arrays_are_copied():
     class Reuses(Toy):
         memory = np.zeros(2, np.float32)
 
-        def seen(self, agent):
+        def observe(self, agent):
             self.memory[:] = self.seed, self.steps
             return self.memory
 
@@ -275,8 +275,8 @@ def toy_with_masks(make_mask):
     space = Dict({"observation": Box(-9e9, 9e9, (2,), np.float32), "action_mask": MultiBinary(3)})
 
     class Masks(Toy):
-        def seen(self, agent):
-            return {"observation": super().seen(agent), "action_mask": make_mask(self)}
+        def observe(self, agent):
+            return {"observation": super().observe(agent), "action_mask": make_mask(self)}
 
     return Masks(observations=dict.fromkeys(("a_0", "a_1"), space))
 
@@ -344,7 +344,7 @@ def test_agents_with_different_spaces(data, sizes, discrete):
     actions = [data.draw(kinds) for _ in names]
 
     class Samples(Toy):
-        def seen(self, agent):
+        def observe(self, agent):
             return self.observations[agent].sample()
 
     toy = Samples(names, dict(zip(names, observations, strict=True)), dict(zip(names, actions, strict=True)), cycles=2)

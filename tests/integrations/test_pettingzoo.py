@@ -23,11 +23,11 @@ class LoggedTeam(Toy):
         super().__init__(*args, **options)
         self.random, self.log = np.random.default_rng(0), []
 
-    def seen(self, agent):
+    def observe(self, agent):
         return np.float32([self.possible_agents.index(agent), self.steps])
 
     def step(self, actions):
-        before = {agent: self.seen(agent) for agent in self.agents}
+        before = {agent: self.observe(agent) for agent in self.agents}
         observations, _, terminated, truncated, infos = super().step(actions)
         rewards = {agent: float(self.random.normal()) for agent in observations}
         self.log.append(
@@ -111,7 +111,7 @@ def test_team_of_one():
 def test_dict_space():
     space = spaces.Dict(place=spaces.Box(-9, 9, (1,)), count=spaces.Discrete(9))
     team = LoggedTeam(NAMES[:2], observations=dict.fromkeys(NAMES[:2], space))
-    team.seen = lambda agent: {"place": np.zeros(1, np.float32), "count": team.steps}
+    team.observe = lambda agent: {"place": np.zeros(1, np.float32), "count": team.steps}
     credit = make_assigner(agents=2, observation_space=10)
     play(CreditParallel(team, credit))
     credit.metrics()

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare_rl import theory
+from paper import theory
 from paper.theory import MDP, Table
 
 CORES, ACTIONS, HORIZON = 3, 2, 5
