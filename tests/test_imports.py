@@ -100,7 +100,7 @@ def test_import_without_jax(module):
 
 
 @pytest.mark.parametrize(
-    ("command", "max_modules"), [("--help", 580), ("tasks", 680), ("methods", 600), ("train --help", 580)]
+    ("command", "max_modules"), [("--help", 450), ("tasks", 620), ("methods", 500), ("train --help", 450)]
 )
 def test_command_line_imports_little(command, max_modules):
     program = f"""

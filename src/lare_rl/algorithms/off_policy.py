@@ -1,11 +1,13 @@
 """The hyperparameters and default run settings that TD3, DDPG and SAC share."""
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
 from lare_rl.algorithms.registry import AlgorithmSettings
-from lare_rl.envs.interface import EnvSpec
+
+if TYPE_CHECKING:  # importing NumPy takes longer than all else that the command line does before it shows a message
+    from lare_rl.envs.interface import EnvSpec
 
 __all__ = ["OffPolicySettings", "run_defaults"]
 
@@ -29,6 +31,6 @@ class OffPolicySettings(AlgorithmSettings):
     """Environment steps with uniformly random actions before the first update."""
 
 
-def run_defaults(env: EnvSpec, environments: int) -> dict[str, Any]:
+def run_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
     """Return the default run settings."""
     return {"environments": environments or 1, "rollout_steps": 50, "evaluate_every": 5000, "capacity": 1_000_000}

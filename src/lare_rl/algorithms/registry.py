@@ -15,11 +15,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from lare_rl.envs.interface import EnvSpec
 from lare_rl.errors import CheckedModel
 from lare_rl.util.plugins import Registry
+
+if TYPE_CHECKING:  # importing NumPy takes longer than all else that the command line does before it shows a message
+    from lare_rl.envs.interface import EnvSpec
 
 __all__ = ["ALGORITHMS", "Algorithm", "AlgorithmSettings", "Consumes", "Noise", "register_algorithm"]
 
@@ -62,7 +64,7 @@ class Algorithm:
     """The published hyperparameters."""
     module: str
     """The module with the functions that the training loop calls (see above)."""
-    run_defaults: Callable[[EnvSpec, int], dict[str, Any]]
+    run_defaults: "Callable[[EnvSpec, int], dict[str, Any]]"
     """Return default settings of a run, from an environment and the requested number of its copies (0: not requested). They have the
     names of `Settings`; `steps_iterations` and `evaluate_iterations` count iterations, and `credit` holds changes."""
     summary: str

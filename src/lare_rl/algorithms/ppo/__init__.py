@@ -1,11 +1,13 @@
 """PPO and IPPO: hyperparameters, default run settings and registration. The update is in `ppo.py`."""
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
 from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, register_algorithm
-from lare_rl.envs.interface import EnvSpec
+
+if TYPE_CHECKING:  # importing NumPy takes longer than all else that the command line does before it shows a message
+    from lare_rl.envs.interface import EnvSpec
 
 __all__ = ["PPOSettings"]
 
@@ -43,7 +45,7 @@ class PPOSettings(AlgorithmSettings):
     """Normalise the networks' observations by their running mean and standard deviation."""
 
 
-def _ppo_defaults(env: EnvSpec, environments: int) -> dict[str, Any]:
+def _ppo_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
     environments = environments or 1
     return {
         "environments": environments,
@@ -54,7 +56,7 @@ def _ppo_defaults(env: EnvSpec, environments: int) -> dict[str, Any]:
     }
 
 
-def _ippo_defaults(env: EnvSpec, environments: int) -> dict[str, Any]:
+def _ippo_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
     # In JAX, as published for particle tasks: 82 episodes of 25 steps between two updates.
     environments = environments or (82 if env.is_jax else 1)
     return {

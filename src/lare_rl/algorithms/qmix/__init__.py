@@ -1,11 +1,13 @@
 """QMIX and VDN: hyperparameters, default run settings and registration. The update is in `qmix.py`."""
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
 from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, register_algorithm
-from lare_rl.envs.interface import EnvSpec
+
+if TYPE_CHECKING:  # importing NumPy takes longer than all else that the command line does before it shows a message
+    from lare_rl.envs.interface import EnvSpec
 
 __all__ = ["QMIXSettings"]
 
@@ -43,7 +45,7 @@ class QMIXSettings(AlgorithmSettings):
     """Environment steps over which this probability falls linearly."""
 
 
-def _run_defaults(env: EnvSpec, environments: int) -> dict[str, Any]:
+def _run_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
     return {
         "method": "lare-rd",  # the paper's: closed-form credit has not been measured with these algorithms
         "environments": environments or (8 if env.is_jax else 1),
