@@ -22,6 +22,11 @@ CASES = {
     "misspelled": ("import numpy as np\n" + phi_source("return [np.sqroot(observation)]"), "E-NUMPY line 3", "np.sqrt"),
     "chance": ("import numpy as np\n" + phi_source("return [np.random.rand(3)]"), "E-NUMPY line 3", "chance"),
     "argument": ("import numpy as np\n" + phi_source("return [np.sum(observation, axes=1)]"), "E-NUMPY line 3", "axis"),
+    "missing argument": (
+        "import numpy as np\n" + phi_source("return [np.partition(observation)]"),
+        "E-NUMPY line 3",
+        "kth",
+    ),
     "unknown name": (phi_source("return [obs[:, :1]]"), "E-RUN line 2", "obs is not defined"),
     "eval": (phi_source("return [eval('1')]"), "E-RUN line 2", "eval is not defined"),
     "dunder": (phi_source("return [observation.__class__]"), "E-ATTRIBUTE line 2", "__class__"),

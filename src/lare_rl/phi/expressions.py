@@ -92,7 +92,7 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
 
 
 def evaluate_entries(runtime: Runtime, nodes: Sequence[ast.expr], scope: Scope) -> list[Any]:
-    """Return the values of a list, of which some may be unpacked: [a, *b]."""
+    """Return the values of a list. Some of them may be unpacked: [a, *b]."""
     values: list[Any] = []
     for node in nodes:
         if isinstance(node, ast.Starred):

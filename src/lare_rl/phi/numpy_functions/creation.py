@@ -13,9 +13,7 @@ from lare_rl.phi.arrays import Array, as_array, broadcast, elementwise, stack
 from lare_rl.phi.batch import BatchSize
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
-from lare_rl.phi.limits import (
-    RefusedError,
-)
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.joining import column_stack, concatenate_
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,

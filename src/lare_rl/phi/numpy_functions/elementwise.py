@@ -11,9 +11,7 @@ import numpy as np
 from lare_rl.phi.arrays import Array, as_array, concatenate, elementwise, invert, power
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.kinds import ELEMENTWISE
-from lare_rl.phi.limits import (
-    RefusedError,
-)
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.registry import (
     UFUNCS,
     as_numbers,

@@ -7,9 +7,7 @@ from typing import Any
 
 from lare_rl.phi.arrays import Array, elementwise, stack
 from lare_rl.phi.indices import ALL
-from lare_rl.phi.limits import (
-    RefusedError,
-)
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.reductions import along
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
@@ -26,8 +24,8 @@ array_functions(
         "sort": lambda a, axis=-1, kind=None, stable=None: scan("sort", a, axis),
         "argsort": lambda a, axis=-1, kind=None, stable=None: scan("argsort", a, axis),
         # Sorted completely, which every partition allows.
-        "partition": lambda a, kth=None, axis=-1, kind=None: scan("sort", a, axis),
-        "argpartition": lambda a, kth=None, axis=-1, kind=None: scan("argsort", a, axis),
+        "partition": lambda a, kth, axis=-1, kind=None: scan("sort", a, axis),
+        "argpartition": lambda a, kth, axis=-1, kind=None: scan("argsort", a, axis),
         "median": lambda a, axis=None, *, keepdims=False, overwrite_input=False: quantile(
             a, 0.5, axis, keepdims=keepdims
         ),

@@ -13,9 +13,7 @@ from lare_rl.phi.batch import BATCH, BatchSize
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import all_positions
 from lare_rl.phi.indices import ALL
-from lare_rl.phi.limits import (
-    RefusedError,
-)
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,

@@ -10,9 +10,7 @@ from lare_rl.phi.arrays import Array, as_array, broadcast, elementwise
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.kinds import ELEMENTWISE
-from lare_rl.phi.limits import (
-    RefusedError,
-)
+from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.elementwise import UNARY
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,

@@ -12,9 +12,7 @@ import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, elementwise
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.limits import (
-    MAX_SYSTEM_SIZE,
-)
+from lare_rl.phi.limits import MAX_SYSTEM_SIZE
 from lare_rl.phi.numpy_functions.constants import plain_constant, register_constant_function
 from lare_rl.phi.numpy_functions.reductions import along
 from lare_rl.phi.numpy_functions.registry import (
