@@ -19,21 +19,22 @@ __all__ = ["alive_agents", "decoder_inputs", "episode_batch", "row_mask", "step_
 
 def decoder_inputs(steps: StoredSteps, config: TrainConfig, team_index: int) -> Float[Array, "*batch rows features"]:
     """Return the inputs of a team's decoder for some steps."""
-    inputs, rows = config.credit_specs[team_index].inputs, config.team_rows(team_index)
+    spec, agents = config.credit_specs[team_index], config.team_rows(team_index)
+    if not spec.inputs:
+        return jnp.zeros((*steps.finished.shape, spec.agents, 0))
     columns, next_columns = steps.columns, steps.next_columns
     arrays = {}
-    if "factors" in inputs:
-        arrays["factors"] = columns["factors"][..., rows, : config.n_factors[team_index]]
-    if "action" in inputs:
+    if "factors" in spec.inputs:
+        arrays["factors"] = columns["factors"][..., agents, : config.n_factors[team_index]]
+    if "action" in spec.inputs:
         # A Gaussian may choose an action beyond the bounds. The environment then used the bound.
         action = jnp.clip(columns["action"], -1, 1)
-        arrays["action"] = action.reshape(*action.shape[:-2], 1, -1) if config.team_level else action[..., rows, :]
-    observed = "state" if config.team_level else "observation"
+        arrays["action"] = action.reshape(*action.shape[:-2], 1, -1) if config.team_level else action[..., agents, :]
+    observed, rows = ("state", None) if config.team_level else ("observation", agents)
     if observed in columns:
-        rows = None if config.team_level else rows
         arrays["observation"] = columns[observed][..., rows, :]
         arrays["next_observation"] = next_columns[observed][..., rows, :]
-    return jnp.concatenate(input_arrays(inputs, arrays), axis=-1)
+    return jnp.concatenate(input_arrays(spec.inputs, arrays), axis=-1)
 
 
 def alive_agents(steps: StoredSteps, config: TrainConfig) -> Bool[Array, "*batch agents"]:
@@ -52,11 +53,8 @@ def row_mask(steps: StoredSteps, config: TrainConfig, team_index: int) -> Bool[A
 
 def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> StepBatch:
     """Return the steps as the input of a team's `proxy_rewards`."""
-    inputs = config.credit_specs[team_index].inputs
-    has_inputs = bool(inputs)
-    rows = (*steps.finished.shape, config.credit_specs[team_index].agents, 0)
     return StepBatch(
-        features=decoder_inputs(steps, config, team_index) if has_inputs else jnp.zeros(rows),
+        features=decoder_inputs(steps, config, team_index),
         length=steps.length,
         mean_reward=steps.mean_reward[..., team_index],
         finished=steps.finished,

@@ -19,6 +19,7 @@ from lare_rl.data.sampling import CreditSample, sample_transitions
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.decoder_fits import fit_decoders, sample_credit
 from lare_rl.training.learner import Learner
+from lare_rl.training.memoryless import get_actor, init_memory
 from lare_rl.training.rewards import RewardState, rewards
 from lare_rl.training.static_config import TrainConfig
 
@@ -41,16 +42,6 @@ def init(key: PRNGKeyArray, config: TrainConfig) -> Any:
     """Return the untrained algorithm."""
     env = config.env
     return config.algorithm.load().init(key, env.observation_size, env.action_size, _settings(config))
-
-
-def get_actor(learner: Learner, env_steps: int, config: TrainConfig) -> Any:
-    """Return the parts of the learner that are needed to act, for all seeds."""
-    return config.algorithm.load().get_actor(learner.algorithm)
-
-
-def init_memory(config: TrainConfig) -> tuple[()]:
-    """Return the memory of an actor: none."""
-    return ()
 
 
 def act(

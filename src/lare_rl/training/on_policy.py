@@ -14,6 +14,7 @@ from lare_rl.algorithms.batches import Rollout
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.learner import Learner
+from lare_rl.training.memoryless import get_actor, init_memory
 from lare_rl.training.rewards import RewardState, rewards
 from lare_rl.training.static_config import TrainConfig
 
@@ -37,16 +38,6 @@ def policy_input(
     n_agents = config.env.n_agents
     one_hot = jnp.broadcast_to(jnp.eye(n_agents), (*observation.shape[:-1], n_agents))
     return jnp.concatenate([observation, one_hot], axis=-1)
-
-
-def get_actor(learner: Learner, env_steps: int, config: TrainConfig) -> Any:
-    """Return the parts of the learner that are needed to act, for all seeds."""
-    return config.algorithm.load().get_actor(learner.algorithm)
-
-
-def init_memory(config: TrainConfig) -> tuple[()]:
-    """Return the memory of an actor: none."""
-    return ()
 
 
 def act(

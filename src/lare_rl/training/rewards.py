@@ -5,8 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lare_rl.credit import accuracy, engine
-from lare_rl.credit import prequential as prediction
+from lare_rl.credit import accuracy, engine, prequential
 from lare_rl.credit.decoder_settings import RECENT_STEPS
 from lare_rl.credit.decomposition import Decomposition
 from lare_rl.credit.methods import Reward
@@ -82,7 +81,7 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
             )
         )
         if (decoder := state.decoder(i)) is not None:
-            metrics[-1]["credit/return_r2"] = prediction.r2(decoder.predictions)[0]
+            metrics[-1]["credit/return_r2"] = prequential.r2(decoder.predictions)[0]
             if decoder.score_type_predictions is not None:
                 metrics[-1]["credit/average"] = decoder.is_mean.astype(jnp.float32)
     return team_metrics(metrics, config)
