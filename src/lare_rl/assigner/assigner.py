@@ -136,7 +136,7 @@ class CreditAssigner:
             action: the actions, in the environment's units.
             next_observation: the observations after the steps. At the end of an episode: its last one, not the first of the next.
             reward: the environment's rewards, (n,). Their sum over an episode is its return R. For many agents (n, agents) is
-                possible too: R is then the sum of the mean over those that are alive.
+                possible too: R is then the sum, over the steps, of the mean over the agents that are alive.
             terminated: (n,), whether the episode has terminated.
             truncated: (n,), whether the episode was truncated, for instance by a time limit. Its return is learned from as well.
             env_ids: the environment of each row, as any hashable value; 0 to n - 1 by default.

@@ -63,7 +63,7 @@ def _lengths(episodes: Sequence[Episode]) -> Int[np.ndarray, " episodes"]:
 
 
 def _pack(store: Store, episodes: Sequence[Episode], n_slots: int, rows: int) -> CreditBatch:
-    """Put whole episodes one after the other. Those that do not fit into the rows are left out."""
+    """Put whole episodes one after the other. Episodes that do not fit into the rows are left out."""
     length = _lengths(episodes)
     layout, mask = lay_out_packed(length, np.ones(len(length)), rows)
     episodes = episodes[: int(mask.sum())]

@@ -67,7 +67,7 @@ class Store:
         self.steps = 0
         """The number of steps that were ever added."""
         self.episodes: dict[int, Episode] = {}
-        """The episodes of which all steps are stored, by number."""
+        """The episodes whose steps are all stored, by number."""
         self.ended = 0
         """The number of episodes that have ever ended."""
         self.ended_steps = 0

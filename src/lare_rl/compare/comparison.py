@@ -71,7 +71,7 @@ class OverallRow:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The statistics of some methods, of which the first one is the baseline."""
+    """The statistics of some methods. The first one is the baseline."""
 
     rows: tuple[Row, ...]
     curves: Mapping[str, Band]
@@ -105,7 +105,7 @@ class Comparison:
 def compare(
     results: Sequence[Results], metric: str = RETURN, step: int | None = None, late: bool = False
 ) -> Comparison:
-    """Compare results by their labels, of which the first one is the baseline.
+    """Compare results by their labels. The first label is the baseline.
 
     Args:
         results: for each label, the same tasks, seeds and draws.
@@ -149,8 +149,8 @@ def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
     """Compare methods with the baseline over the tasks of several comparisons.
 
     Runs are compared with runs on the same task by their order alone, so the tasks need no common scale. Each task has the same
-    weight. The methods are those that are on every task, with equally many seeds. Without two of them, or if the comparisons have
-    different baselines, there are no rows.
+    weight. Only methods that ran on every task, with equally many seeds, are compared. There are no rows if there are fewer than two
+    such methods, or if the comparisons have different baselines.
     """
     if len(comparisons) < 2:
         return []

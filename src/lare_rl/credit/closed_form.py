@@ -206,7 +206,7 @@ def select_score_type(decoder: LinearDecoder, index: Int[Array, ""] | int) -> Li
 
     Args:
         decoder: the decoders of all fitted score types, along a leading axis.
-        index: the position of the score type among those that are fitted.
+        index: the position of the score type in the list of fitted score types.
     """
     return eqx.tree_at(lambda d: (d.weight, d.bias), decoder, (decoder.weight[index], decoder.bias[index]))
 

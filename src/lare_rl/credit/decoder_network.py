@@ -30,7 +30,7 @@ class DecoderNetwork(Protocol):
 
         Args:
             features: the inputs at each step.
-            key: the random key of an update of the decoder. Without a key, the output is what the algorithm is trained on.
+            key: the random key of an update of the decoder. Rewards for the algorithm are computed without a key.
         """
         ...
 

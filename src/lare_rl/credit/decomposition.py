@@ -10,8 +10,8 @@ fitted to it. The equations stay the same and assign credit over time and among 
 
 With several agents, r_hat is also multiplied by the gain sqrt(nT). R/T is then the mean of nT rewards, and a rare reward of a few
 agents is larger than this mean by about that factor. Adam changes an output by steps of the same size in any unit, and the decoder
-of many agents is seldom fitted. Without the gain, it would reach the size of a rare reward only after dozens of updates of the
-policy.
+of many agents is seldom fitted. Without the gain, its output would need dozens of updates of the policy to reach
+the size of a rare reward.
 
 Features and targets are normalised by statistics in the state. Scaling the return, or a factor, therefore changes only the scale of
 r_hat. `normalise = false` is the published form, with raw features and raw targets.
@@ -161,7 +161,7 @@ def is_optimistic(method: Method, settings: CreditSettings) -> bool:
 
 
 def score_type_index(state: Decomposition, n_score_types: int) -> Int[Array, ""] | int:
-    """Return the position of the score type that is used among those that are fitted."""
+    """Return the position of the used score type in the list of fitted score types."""
     return state.is_mean.astype(int) if n_score_types > 1 else 0
 
 

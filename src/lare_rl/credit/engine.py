@@ -210,7 +210,7 @@ def agent_shares(alive: Any) -> Any:
 
 
 class ExplanationState(NamedTuple):
-    """SufficientStatistics over episodes and over steps, from which returns are explained."""
+    """Sums over episodes and over steps. They explain the returns."""
 
     closed_form: ClosedForm
     steps: StepStatistics
@@ -220,7 +220,7 @@ def init_explanation(statistics: RunningMeanStd, basis: Basis) -> ExplanationSta
     """Return empty sums.
 
     Args:
-        statistics: mean and deviation of the inputs, by which they are standardised.
+        statistics: mean and deviation of the inputs. They standardise the inputs.
         basis: the features that explain the returns.
     """
     closed = closed_form.reset_statistics(closed_form.init(basis, 1), statistics)

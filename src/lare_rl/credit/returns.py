@@ -59,7 +59,7 @@ def predict_then_update(state: Decomposition, episodes: CreditBatch, settings: C
 def predict(state: Decomposition, episodes: CreditBatch, settings: CreditSettings) -> Decomposition:
     """Store the returns of episodes, and the decoder's predictions of them before it is fitted to these episodes.
 
-    There may be at most `prequential.WINDOW` episodes. Those whose mask is 0 are ignored. Before the first fit, all are ignored.
+    There may be at most `prequential.WINDOW` episodes. Episodes with mask 0 are ignored. Before the first fit, all are ignored.
     """
     is_new = episodes.mask > 0
     returns, n_episodes = episodes.mean_reward * episodes.length, len(episodes.length)

@@ -138,7 +138,7 @@ def sample_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, l
 
 
 def _pack(episodes: EpisodeSample, rows: int) -> CreditSample:
-    """Put whole episodes one after the other. Those that do not fit into the rows are left out."""
+    """Put whole episodes one after the other. Episodes that do not fit into the rows are left out."""
     layout, mask = lay_out_packed(episodes.length, episodes.mask, rows)
     slot = jnp.where(layout.slot < len(mask), layout.slot, 0)  # padding reads a step that is certainly stored
     steps = Index(episodes.first.env[slot], episodes.first.number[slot] + layout.number)
@@ -155,7 +155,7 @@ def episodes_in_order(
 ) -> CreditSample:
     """Return the episodes that `count_episodes_since` counts, one environment after the other, from the `start`-th on.
 
-    These are at most `count` episodes, and only those that fit into the rows as a whole.
+    Return at most `count` episodes, and only episodes that fit into the rows as a whole.
     """
     counts = count_episodes_since(replay, since)
     ends = jnp.cumsum(counts)

@@ -174,7 +174,7 @@ def _group_weights(decoder: LinearDecoder) -> dict[str, np.ndarray]:
 
 
 def _team_mean(r_hat: Array, rows: tuple[int, ...], config: TrainConfig) -> Any:
-    """Return the mean over the agents. If agents may leave, it is the mean over those that are alive, and 0 for the others."""
+    """Return the mean over the agents. If agents may leave, it is the mean over the agents that are alive, and 0 for the others."""
     if not config.env.agents_leave:
         return numpy_op("broadcast_to", numpy_op("mean", r_hat, axis=-1, keepdims=True), rows)
     alive = graph_input("alive", rows)

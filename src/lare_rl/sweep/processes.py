@@ -28,7 +28,7 @@ def train_in_processes(
 ) -> Generator[tuple[Job, str | None], None, None]:
     """Train `processes` jobs at a time, each on `cores` cores. Yield each job when it ends, and its error or None.
 
-    Closing the generator stops all jobs. Those that are running save a checkpoint first.
+    Closing the generator stops all jobs. Running jobs save a checkpoint first.
 
     Raises:
         LareError: there are not enough cores.

@@ -26,7 +26,7 @@ __all__ = ["compile_ahead", "init_learner", "learner_shape"]
 
 
 def compile_ahead(config: TrainConfig, phi: Sequence[Graph], n_seeds: int) -> CompiledFunctions:
-    """Return the functions of a run, those of every iteration compiled for the shapes that they will see."""
+    """Return the functions of a run. The functions of every iteration are compiled for the shapes that they will see."""
     functions, learner, steps = (
         compile_functions(config, phi),
         learner_shape(config, n_seeds),

@@ -37,7 +37,7 @@ def _sample_poisson_discs(
     """Return Poisson disc samples of a square (0, side)^2, computed in lockstep. Missing points of smaller samples are `inf`.
 
     Bridson's algorithm starts with one active point, uniform in the square. It then chooses an active point at random and tries
-    N_CANDIDATES points, uniform in the ring of separation to 2 * separation around it. Those that are further than `separation`
+    N_CANDIDATES points, uniform in the ring of separation to 2 * separation around it. Candidates that are further than `separation`
     from all existing points are added and become active; the selected point becomes inactive. It ends if no point is active.
     """
     # Discs with a radius of half the separation do not overlap, and lie within a square of side + separation.
