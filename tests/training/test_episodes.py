@@ -204,7 +204,7 @@ def test_learn_returns_finds_the_score_type(method, score):
     ],
 )
 def test_estimate_score_type_is_decided_by_errors(average, errors, decided, monkeypatch):
-    monkeypatch.setattr(returns, "errors_told_apart", lambda _: np.array(errors))
+    monkeypatch.setattr(returns, "_score_type_errors", lambda _: np.array(errors))
     state = untrained_learner(small_config("lare-linear")).credit[0]._replace(is_mean=np.array(average))
     assert returns.estimate_score_type(state) == (None if decided is None else ScoreTypeEstimate(average, decided))
 
