@@ -10,6 +10,7 @@ transposes, flips or repetitions take their numbers from, and whether the result
 
 from __future__ import annotations
 
+import itertools
 import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +25,7 @@ from lare_rl.phi.indices import ALL, computed_positions, fixed_index, index_entr
 from lare_rl.phi.kinds import widest
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import Operand
+from lare_rl.phi.values import describe
 
 __all__ = [
     "Array", "Complex", "Masked", "as_array", "broadcast", "concatenate", "elementwise", "invert", "power", "stack",
@@ -91,8 +93,7 @@ class Array(_Value):
         """Return the only number of a constant, as a number of Python."""
         values = self.constant
         if values is None:
-            what = "a number or a condition that differs from row to row"
-            raise RefusedError("E-FLOW", f"{what}: use np.where instead of if")
+            raise RefusedError("E-FLOW", "a number that differs from row to row: use np.where instead of if")
         if values.size != 1:
             raise ValueError("the truth value of an array with more than one element is ambiguous")
         return values.item()
@@ -246,7 +247,9 @@ def as_array(value: Any) -> Array:
         return value
     if isinstance(value, (bool, int, float, np.ndarray, np.generic)):
         return Array(current_builder().constant(value), None)
-    if isinstance(value, (list, tuple, range)) and len(value):
+    if isinstance(value, (list, tuple, range)):
+        if not len(value):
+            raise TypeError("an empty list has no numbers")
         current_builder().spend(len(value))
         if all(isinstance(item, (bool, int, float)) for item in value):
             return Array(current_builder().constant(list(value)), None)
@@ -257,9 +260,7 @@ def as_array(value: Any) -> Array:
         raise RefusedError(
             "E-ROWS", "x[mask] can only be computed with, and written to the same places: use np.where(mask, x, 0)"
         )
-    if value in ([], ()):
-        raise TypeError("an empty list has no numbers")
-    raise TypeError(f"no array can be made of a {type(value).__name__}")
+    raise TypeError(f"no array can be made of {describe(value)}")
 
 
 COMPLEX_OPERATIONS: dict[str, Callable[..., Any]] = {}
@@ -300,14 +301,9 @@ def power(x: Any, exponent: Any) -> Any:
         x = elementwise("multiply", x, 1.0)
     x = x if isinstance(x, Operand) else as_array(x)
     square = elementwise("multiply", x, x)
-    match int(value):
-        case 1:
-            return x
-        case 2:
-            return square
-        case 3:
-            return elementwise("multiply", square, x)
-    return elementwise("multiply", square, square)
+    if value <= 2:
+        return x if value == 1 else square
+    return elementwise("multiply", square, x if value == 3 else square)
 
 
 def invert(x: Any) -> Any:
@@ -344,11 +340,10 @@ def concatenate(arrays: Sequence[Array], axis: Any) -> Array:
         raise ValueError(f"the shapes {_shapes_text(arrays)} cannot be joined along axis {at}")
     builder = current_builder()
     kind = widest([array.kind for array in arrays])
-    positions, start = [], 0
-    for array in arrays:
-        positions.append(all_positions(array.row_shape) + start)
-        start += positions[-1].size
-    builder.check_size((start,))
+    sizes = [math.prod(array.row_shape) for array in arrays]
+    builder.check_size((sum(sizes),))
+    starts = itertools.accumulate(sizes, initial=0)
+    positions = [all_positions(array.row_shape) + start for array, start in zip(arrays, starts, strict=False)]
     node = builder.concat([builder.cast(array.node, kind) for array in arrays])
     return Array(builder.gather(node, np.concatenate(positions, at)), first.batch_axis)
 

@@ -1,7 +1,8 @@
 """Calls: which functions there are, and how the arguments of a call become the names of a function of the program."""
 
 import ast
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from lare_rl.phi.attributes import IGNORED_CALLS
@@ -21,7 +22,7 @@ from lare_rl.phi.values import (
     ReturnSignal,
     Scope,
     Symbol,
-    type_name,
+    describe,
 )
 
 __all__ = ["call", "define_function", "evaluate_call"]
@@ -55,11 +56,11 @@ def call(runtime: Runtime, function: Any, args: Sequence[Any], kwargs: Mapping[s
         case Instance():
             return runtime.call(runtime.attribute(function, "__call__"), args, kwargs)
         case Bound(call=bound):
-            return bound(*args, **kwargs)
+            return _call_python("the function", bound, args, kwargs)
         case Decorated(function=inner):
             return runtime.call(inner, args, kwargs)
         case Symbol(name) if name in BUILTINS:
-            return BUILTINS[name](runtime, *args, **kwargs)
+            return _call_python(name, BUILTINS[name], [runtime, *args], kwargs)
         case Symbol(name) if name.startswith("np.") and name[3:] in FUNCTIONS:
             if any(map(is_complex, args)):
                 return call_with_complex(name[3:], args, kwargs)
@@ -70,7 +71,19 @@ def call(runtime: Runtime, function: Any, args: Sequence[Any], kwargs: Mapping[s
             return Decorated(name, args[0])
         case Symbol(name) if name in IGNORED_CALLS:
             return None
-    raise TypeError(f"{function if isinstance(function, Symbol) else 'a ' + type_name(function)} cannot be called")
+    raise TypeError(f"{describe(function)} cannot be called")
+
+
+def _call_python(name: str, function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+    """Call a function of LaRe. A message about its arguments gets the name that the program knows."""
+    try:
+        return function(*args, **kwargs)
+    except TypeError:
+        try:
+            inspect.signature(function).bind(*args, **kwargs)
+        except TypeError as error:
+            raise TypeError(f"{name}: {error}") from None
+        raise
 
 
 def _convert_callables(runtime: Runtime, name: str, args: Sequence[Any]) -> Sequence[Any]:

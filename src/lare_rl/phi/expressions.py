@@ -10,7 +10,7 @@ from lare_rl.phi.meter import check_key, check_text
 from lare_rl.phi.operators import apply_unary, compare
 from lare_rl.phi.runtime import Runtime
 from lare_rl.phi.text import format_value
-from lare_rl.phi.values import Iterator, Scope, Set, type_name
+from lare_rl.phi.values import Iterator, Scope, Set, describe
 
 __all__ = ["evaluate", "evaluate_entries"]
 
@@ -47,12 +47,8 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
             return _evaluate_dict(runtime, keys, values, scope)
         case ast.Compare():
             return _evaluate_comparison(runtime, node, scope)
-        case ast.BoolOp(op=op, values=values):
-            for operand in values[:-1]:
-                value = runtime.evaluate(operand, scope)
-                if runtime.truth(value) == isinstance(op, ast.Or):
-                    return value
-            return runtime.evaluate(values[-1], scope)
+        case ast.BoolOp():
+            return _evaluate_and_or(runtime, node, scope)
         case ast.IfExp(test=test, body=body, orelse=orelse):
             return runtime.evaluate(body if runtime.truth(runtime.evaluate(test, scope)) else orelse, scope)
         case ast.NamedExpr(target=ast.Name(id=name), value=value):
@@ -61,16 +57,8 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
             return result
         case ast.Lambda():
             return runtime.define(node, scope)
-        case ast.ListComp(elt=item, generators=generators):
-            return [runtime.evaluate(item, inner) for inner in _turns(runtime, generators, scope)]
-        case ast.GeneratorExp(elt=item, generators=generators):
-            return Iterator([runtime.evaluate(item, inner) for inner in _turns(runtime, generators, scope)])
-        case ast.SetComp(elt=item, generators=generators):
-            turns = _turns(runtime, generators, scope)
-            return Set({check_key(runtime.evaluate(item, inner)): None for inner in turns})
-        case ast.DictComp(key=key, value=value, generators=generators):
-            turns = _turns(runtime, generators, scope)
-            return {check_key(runtime.evaluate(key, inner)): runtime.evaluate(value, inner) for inner in turns}
+        case ast.ListComp() | ast.GeneratorExp() | ast.SetComp() | ast.DictComp():
+            return _evaluate_comprehension(runtime, node, scope)
         case ast.JoinedStr(values=values):
             text = ""
             for value in values:
@@ -79,15 +67,8 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
         case ast.FormattedValue(value=value, format_spec=spec):
             format_spec = "" if spec is None else runtime.evaluate(spec, scope)
             return format_value(runtime.meter, runtime.evaluate(value, scope), format_spec)
-        case ast.Yield(value=value):
-            yielded = scope.function.yielded
-            if yielded is None:
-                raise RefusedError("E-PYTHON", "yield outside a function")
-            yielded.append(None if value is None else runtime.evaluate(value, scope))
-            return None
-        case ast.YieldFrom(value=value) if scope.function.yielded is not None:
-            scope.function.yielded.extend(runtime.items(runtime.evaluate(value, scope)))
-            return None
+        case ast.Yield() | ast.YieldFrom():
+            return _evaluate_yield(runtime, node, scope)
     raise RefusedError("E-PYTHON", f"{type(node).__name__.lower()} is not available")
 
 
@@ -115,8 +96,27 @@ def _evaluate_dict(
             result |= value
             runtime.meter.pay_for_list(len(result))
         else:
-            raise TypeError(f"** of a {type_name(value)}")
+            raise TypeError(f"** of {describe(value)}")
     return result
+
+
+def _evaluate_and_or(runtime: Runtime, node: ast.BoolOp, scope: Scope) -> Any:
+    for operand in node.values[:-1]:
+        value = runtime.evaluate(operand, scope)
+        if runtime.truth(value) == isinstance(node.op, ast.Or):
+            return value
+    return runtime.evaluate(node.values[-1], scope)
+
+
+def _evaluate_yield(runtime: Runtime, node: ast.Yield | ast.YieldFrom, scope: Scope) -> None:
+    yielded = scope.function.yielded
+    if yielded is None:
+        raise RefusedError("E-PYTHON", "yield outside a function")
+    value = None if node.value is None else runtime.evaluate(node.value, scope)
+    if isinstance(node, ast.YieldFrom):
+        yielded.extend(runtime.items(value))
+    else:
+        yielded.append(value)
 
 
 def _evaluate_comparison(runtime: Runtime, node: ast.Compare, scope: Scope) -> Any:
@@ -129,6 +129,21 @@ def _evaluate_comparison(runtime: Runtime, node: ast.Compare, scope: Scope) -> A
         y = runtime.evaluate(comparator, scope)
         result, x = compare(runtime, op, x, y), y
     return result
+
+
+def _evaluate_comprehension(
+    runtime: Runtime, node: ast.ListComp | ast.GeneratorExp | ast.SetComp | ast.DictComp, scope: Scope
+) -> Any:
+    turns = _turns(runtime, node.generators, scope)
+    if isinstance(node, ast.DictComp):
+        return {check_key(runtime.evaluate(node.key, turn)): runtime.evaluate(node.value, turn) for turn in turns}
+    items = [runtime.evaluate(node.elt, turn) for turn in turns]
+    match node:
+        case ast.SetComp():
+            return Set(dict.fromkeys(map(check_key, items)))
+        case ast.GeneratorExp():
+            return Iterator(items)
+    return items
 
 
 def _turns(runtime: Runtime, generators: Sequence[ast.comprehension], scope: Scope) -> Iterable[Scope]:

@@ -3,14 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from lare_rl.phi.limits import (
-    MAX_INT_BITS,
-    MAX_KEY_LENGTH,
-    MAX_LIST_LENGTH,
-    MAX_STEPS,
-    MAX_TEXT_LENGTH,
-    RefusedError,
-)
+from lare_rl.phi.limits import MAX_INT_BITS, MAX_KEY_LENGTH, MAX_LIST_LENGTH, MAX_STEPS, MAX_TEXT_LENGTH, RefusedError
 from lare_rl.phi.values import Instance, Symbol
 
 

@@ -13,7 +13,7 @@ from lare_rl.phi.numpy_functions import INDEXED, call_numpy
 from lare_rl.phi.operand import Operand
 from lare_rl.phi.runtime import Runtime
 from lare_rl.phi.text import combine_values
-from lare_rl.phi.values import Class, Function, Instance, Iterator, Set, Symbol, type_name
+from lare_rl.phi.values import Class, Function, Instance, Iterator, Set, Symbol, describe
 
 __all__ = ["apply_binary", "apply_unary", "compare", "get_item", "list_items", "test_truth"]
 
@@ -43,7 +43,7 @@ def apply_unary(runtime: Runtime, op: ast.unaryop, value: Any) -> Any:
     if isinstance(value, Instance):
         return runtime.call(runtime.attribute(value, f"__{function.__name__}__"), [], {})
     if not isinstance(value, (*NUMBERS, Operand)):
-        raise TypeError(f"bad operand type for {type(op).__name__}: {type_name(value)}")
+        raise TypeError(f"bad operand type for {type(op).__name__}: {describe(value)}")
     return function(value)
 
 
@@ -59,7 +59,7 @@ def apply_binary(runtime: Runtime, op: ast.operator, x: Any, y: Any) -> Any:
         return function(*(value if isinstance(value, (Operand, int, complex)) else as_array(value) for value in (x, y)))
     if isinstance(x, BatchSize) or isinstance(y, BatchSize):
         if not isinstance(x, (int, float, BatchSize)) or not isinstance(y, (int, float, BatchSize)):
-            raise TypeError(f"the number of rows and a {type_name(x if isinstance(y, BatchSize) else y)}")
+            raise TypeError(f"the number of rows and {describe(x if isinstance(y, BatchSize) else y)}")
         return function(x, y)
     if isinstance(x, NUMBERS) and isinstance(y, NUMBERS):
         if isinstance(x, int) and isinstance(y, int) and name in ("pow", "lshift"):
@@ -105,7 +105,7 @@ def get_item(runtime: Runtime, container: Any, index: Any) -> Any:
             return index
         case Symbol(name) if name in GENERIC_TYPES or name.startswith(("typing.", "np.typing.")):
             return container
-    raise TypeError(f"a {type_name(container)} cannot be indexed")
+    raise TypeError(f"{describe(container)} cannot be indexed")
 
 
 def test_truth(runtime: Runtime, value: Any) -> bool:
@@ -135,6 +135,6 @@ def list_items(runtime: Runtime, value: Any) -> Sequence[Any]:
                 member for name, member in members if not name.startswith("_") and not isinstance(member, Function)
             ]
         case _:
-            raise TypeError(f"a {type_name(value)} cannot be gone through")
+            raise TypeError(f"{describe(value)} cannot be gone through")
     runtime.meter.pay(len(items))
     return items

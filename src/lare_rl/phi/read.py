@@ -24,6 +24,7 @@ from lare_rl.phi.values import (
     ReturnSignal,
     Scope,
     Symbol,
+    describe,
 )
 
 __all__ = ["FUNCTION_NAME", "read"]
@@ -129,4 +130,4 @@ def _check_factors(factors: object, max_factors: int) -> list[int]:
 
 
 def _describe(value: object) -> str:
-    return f"of the shape {value.shape}" if isinstance(value, Array) else f"a {type(value).__name__.lower()}"
+    return f"of the shape {value.shape}" if isinstance(value, Array) else describe(value)

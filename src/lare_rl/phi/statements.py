@@ -26,7 +26,7 @@ from lare_rl.phi.values import (
     Scope,
     Set,
     Symbol,
-    type_name,
+    describe,
 )
 
 __all__ = ["assign", "run_statements"]
@@ -158,7 +158,7 @@ def _set_item(runtime: Runtime, container: Any, index: Any, value: Any) -> None:
     elif isinstance(container, Array) or (isinstance(container, list) and not isinstance(index, slice)):
         container[index] = value
     else:
-        raise TypeError(f"nothing can be written into a {type_name(container)}")
+        raise TypeError(f"nothing can be written into {describe(container)}")
 
 
 def _augment(runtime: Runtime, statement: ast.AugAssign, scope: Scope) -> None:
@@ -193,7 +193,7 @@ def _delete(runtime: Runtime, target: ast.expr, scope: Scope) -> None:
         case ast.Subscript(value=container, slice=index):
             owner, key = runtime.evaluate(container, scope), runtime.evaluate(index, scope)
             if not isinstance(owner, (dict, list)):
-                raise TypeError(f"entries of a {type_name(owner)} cannot be deleted")
+                raise TypeError(f"entries of {describe(owner)} cannot be deleted")
             del owner[check_key(key) if isinstance(owner, dict) else key]
         case _:
             raise NameError("a name that is not defined cannot be deleted")

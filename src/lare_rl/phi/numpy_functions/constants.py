@@ -10,15 +10,8 @@ import numpy as np
 
 from lare_rl.phi.arrays import as_array
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.limits import (
-    MAX_CONSTANT_SIZE,
-    MAX_SYSTEM_SIZE,
-    RefusedError,
-)
-from lare_rl.phi.numpy_functions.registry import (
-    numpy_function,
-    require_constant,
-)
+from lare_rl.phi.limits import MAX_CONSTANT_SIZE, MAX_SYSTEM_SIZE, RefusedError
+from lare_rl.phi.numpy_functions.registry import numpy_function, require_constant
 
 
 def register_constant_function(

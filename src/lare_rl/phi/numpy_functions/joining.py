@@ -11,26 +11,13 @@ import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, broadcast, concatenate, stack
 from lare_rl.phi.indices import ALL
-from lare_rl.phi.numpy_functions.registry import (
-    numpy_function,
-    require_constant,
-)
+from lare_rl.phi.numpy_functions.registry import as_arrays, numpy_function, numpy_functions, require_constant
 from lare_rl.phi.numpy_functions.shapes import atleast_1d, atleast_2d, atleast_3d, ravel
 
 
 @numpy_function("concatenate", "concat")
 def concatenate_(arrays: list[Array], axis: Any = 0) -> Array:
     return concatenate(arrays, axis) if axis is not None else concatenate([ravel(a) for a in arrays], 0)
-
-
-@numpy_function("stack")
-def stack_(arrays: list[Array], axis: int = 0) -> Array:
-    return stack(arrays, axis)
-
-
-@numpy_function("vstack", "row_stack")
-def vstack(tup: list[Array]) -> Array:
-    return concatenate([atleast_2d(a) for a in tup], 0)
 
 
 @numpy_function()
@@ -42,11 +29,6 @@ def hstack(tup: list[Array]) -> Array:
 @numpy_function()
 def column_stack(tup: list[Array]) -> Array:
     return concatenate([a if a.ndim > 1 else a[:, None] for a in tup], 1)
-
-
-@numpy_function()
-def dstack(tup: list[Array]) -> Array:
-    return concatenate([atleast_3d(a) for a in tup], 2)
 
 
 @numpy_function()
@@ -63,11 +45,6 @@ def block(arrays: Any) -> Array:
 
 
 @numpy_function()
-def append(arr: Array, values: Array, axis: Any = None) -> Array:
-    return concatenate_([arr, values], axis)
-
-
-@numpy_function("array_split")
 def array_split(ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any]:
     (at,) = ary.row_axes(axis)
     size = ary.row_shape[at]
@@ -82,9 +59,9 @@ def array_split(ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any
     return [ary[(*(ALL,) * at, slice(start, end))] for start, end in itertools.pairwise(ends)]
 
 
-def _register_split(name: str, axis_for: Callable[[Array], int] | None) -> None:
+def _register_split(name: str, axis_for: Callable[[Array, int], int]) -> None:
     def split(ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any]:
-        at = axis if axis_for is None else axis_for(ary)
+        at = axis_for(ary, axis)
         size = ary.row_shape[ary.axis(at)]
         if isinstance(indices_or_sections, int) and size % max(indices_or_sections, 1):
             raise ValueError(f"{size} numbers cannot be split into {indices_or_sections} equal parts")
@@ -93,16 +70,26 @@ def _register_split(name: str, axis_for: Callable[[Array], int] | None) -> None:
     numpy_function(name)(split)
 
 
-_register_split("split", None)
-_register_split("hsplit", lambda a: min(a.ndim - 1, 1))
-_register_split("vsplit", lambda a: 0)
-_register_split("dsplit", lambda a: 2)
+_register_split("split", lambda a, axis: axis)
+_register_split("hsplit", lambda a, _: min(a.ndim - 1, 1))
+_register_split("vsplit", lambda a, _: 0)
+_register_split("dsplit", lambda a, _: 2)
 
 
 @numpy_function()
 def unstack(x: Array, *, axis: int = 0) -> tuple[Any, ...]:
     (at,) = x.row_axes(axis)
     return tuple(x[(*(ALL,) * at, i)] for i in range(x.row_shape[at]))
+
+
+numpy_functions(
+    {
+        "stack": lambda arrays, axis=0: stack(as_arrays(arrays), operator.index(axis)),
+        "vstack row_stack": lambda tup: concatenate([atleast_2d(a) for a in as_arrays(tup)], 0),
+        "dstack": lambda tup: concatenate([atleast_3d(a) for a in as_arrays(tup)], 2),
+        "append": lambda arr, values, axis=None: concatenate_([as_array(arr), as_array(values)], axis),
+    }
+)
 
 
 @numpy_function()

@@ -10,19 +10,11 @@ import numpy as np
 from lare_rl.phi.arrays import Array, as_array, elementwise, power, stack
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
-from lare_rl.phi.limits import (
-    MAX_INVERSE_SIZE,
-    MAX_MATRIX_POWER,
-    RefusedError,
-)
+from lare_rl.phi.limits import MAX_INVERSE_SIZE, MAX_MATRIX_POWER, RefusedError
 from lare_rl.phi.numpy_functions.positions import diagonal
 from lare_rl.phi.numpy_functions.products import matmul
 from lare_rl.phi.numpy_functions.reductions import along
-from lare_rl.phi.numpy_functions.registry import (
-    FUNCTIONS,
-    as_numbers,
-    numpy_function,
-)
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, as_numbers, numpy_function
 
 
 @numpy_function("linalg.norm")

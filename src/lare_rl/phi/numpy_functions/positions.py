@@ -18,12 +18,12 @@ from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
     numpy_function,
+    numpy_functions,
     require_constant,
 )
 from lare_rl.phi.numpy_functions.shapes import ravel, split_shape
 
 
-@numpy_function()
 def flip(m: Array, axis: Any = None) -> Array:
     axes = m.row_axes(axis)
     return m.rearranged(lambda positions: np.flip(positions, axes), m.batch_axis)
@@ -128,23 +128,8 @@ def _along_axis(arr: Array, indices: Array, axis: Any) -> tuple[Any, ...]:
 
 
 @numpy_function()
-def take_along_axis(arr: Array, indices: Array, axis: Any = -1) -> Any:
-    return arr[_along_axis(arr, indices, axis)]
-
-
-@numpy_function()
-def put_along_axis(arr: Array, indices: Array, values: Any, axis: Any) -> None:
-    arr[_along_axis(arr, indices, axis)] = values
-
-
-@numpy_function()
 def copyto(dst: Array, src: Any, casting: Any = "same_kind", where: Any = True) -> None:
     dst[...] = src if where is True else elementwise("where", where, src, dst)
-
-
-@numpy_function("putmask", "place")
-def putmask(a: Array, mask: Array, values: Any) -> None:
-    copyto(a, values, where=mask)
 
 
 @numpy_function()
@@ -175,4 +160,19 @@ def sliding_window_view(x: Array, window_shape: Any, axis: Any = None) -> Array:
     return x.rearranged(lambda positions: windows(positions, sizes, axes).copy(), x.batch_axis)
 
 
-array_functions({"fliplr": lambda m: flip(m, 1), "flipud": lambda m: flip(m, 0)})
+array_functions(
+    {
+        "flip": flip,
+        "fliplr": lambda m: flip(m, 1),
+        "flipud": lambda m: flip(m, 0),
+        "take_along_axis": lambda arr, indices, axis=-1: arr[_along_axis(arr, indices, axis)],
+    }
+)
+numpy_functions(
+    {
+        "put_along_axis": lambda arr, indices, values, axis: as_array(arr).__setitem__(
+            _along_axis(as_array(arr), as_array(indices), axis), values
+        ),
+        "putmask place": lambda a, mask, values: copyto(as_array(a), values, where=as_array(mask)),
+    }
+)

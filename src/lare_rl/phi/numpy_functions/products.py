@@ -12,18 +12,10 @@ import numpy as np
 from lare_rl.phi.arrays import Array, as_array, elementwise, stack
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
-from lare_rl.phi.limits import (
-    MAX_EINSUM_ARRAYS,
-    RefusedError,
-)
+from lare_rl.phi.limits import MAX_EINSUM_ARRAYS, RefusedError
 from lare_rl.phi.numpy_functions.positions import diagonal
 from lare_rl.phi.numpy_functions.reductions import along
-from lare_rl.phi.numpy_functions.registry import (
-    FUNCTIONS,
-    array_functions,
-    numpy_function,
-    require_constant,
-)
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, array_functions, numpy_function, require_constant
 from lare_rl.phi.numpy_functions.shapes import ravel
 
 _TERM = r"[a-zA-Z]*+(\.\.\.)?[a-zA-Z]*+"

@@ -16,6 +16,7 @@ from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import Kind
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import Operand
+from lare_rl.phi.values import describe
 
 Function = Callable[..., Any]
 
@@ -63,13 +64,19 @@ def numpy_function(*names: str) -> Callable[[Function], Function]:
     return register
 
 
-def array_functions(table: Mapping[str, Function]) -> None:
-    """Register functions under names that are separated by spaces. Arguments without a default are converted to arrays."""
+def numpy_functions(table: Mapping[str, Function], converts: bool = False) -> None:
+    """Register functions under names that are separated by spaces. `converts`: arguments without a default become arrays."""
     for names, function in table.items():
-        for name in names.split():
-            numpy_function(name)(function)
-            parameters = _SIGNATURES[name].parameters
-            _CONVERTERS[name] = {key: as_array for key, p in parameters.items() if p.default is p.empty}
+        numpy_function(*names.split())(function)
+        if converts:
+            parameters = inspect.signature(function).parameters
+            converters = {key: as_array for key, p in parameters.items() if p.default is p.empty}
+            _CONVERTERS.update(dict.fromkeys(names.split(), converters))
+
+
+def array_functions(table: Mapping[str, Function]) -> None:
+    """Register functions whose arguments without a default become arrays."""
+    numpy_functions(table, converts=True)
 
 
 def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
@@ -125,7 +132,7 @@ def as_arrays(values: Any) -> list[Array]:
 
 def as_float(value: Any) -> float:
     if not isinstance(value, (bool, int, float, Array)):
-        raise TypeError(f"a number is needed, not a {type(value).__name__}")
+        raise TypeError(f"a number is needed, not {describe(value)}")
     return float(value)
 
 

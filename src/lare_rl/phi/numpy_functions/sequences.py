@@ -8,12 +8,7 @@ from lare_rl.phi.arrays import Array, as_array, broadcast, concatenate, elementw
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.numpy_functions.reductions import along, flatten_constant
-from lare_rl.phi.numpy_functions.registry import (
-    array_functions,
-    as_numbers,
-    numpy_function,
-    require_constant,
-)
+from lare_rl.phi.numpy_functions.registry import array_functions, as_numbers, numpy_function, require_constant
 
 
 def scan(op: str, x: Array, axis: Any) -> Array:

@@ -9,16 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import Array, broadcast
+from lare_rl.phi.arrays import Array, as_array, broadcast
 from lare_rl.phi.batch import BATCH, BatchSize, common_batch_axis
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.numpy_functions.registry import (
-    FUNCTIONS,
-    array_functions,
-    numpy_function,
-)
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, array_functions, numpy_function, numpy_functions
 
 
 def split_shape(shape: Any) -> tuple[tuple[int, ...], int | None]:
@@ -110,40 +106,28 @@ def squeeze(a: Array, axis: Any = None) -> Any:
     return a[tuple(0 if i in removed else ALL for i in range(a.ndim))]
 
 
-def _each(function: Callable[[Array], Any], arrays: Sequence[Array]) -> Any:
+def atleast_1d(a: Array) -> Any:
+    return a if a.ndim else a[None]
+
+
+def atleast_2d(a: Array) -> Any:
+    return a if a.ndim > 1 else a[(None,) * (2 - a.ndim)]
+
+
+def atleast_3d(a: Array) -> Any:
+    return a if a.ndim > 2 else atleast_2d(a)[:, :, None]
+
+
+def _map(function: Callable[[Array], Any], arrays: Sequence[Array]) -> Any:
+    """Return the result of a function for one array, or a list of its results for several."""
     results = [function(a) for a in arrays]
     return results[0] if len(results) == 1 else results
-
-
-@numpy_function()
-def atleast_1d(*arys: Array) -> Any:
-    return _each(lambda a: a if a.ndim else a[None], arys)
-
-
-@numpy_function()
-def atleast_2d(*arys: Array) -> Any:
-    return _each(lambda a: a if a.ndim > 1 else a[(None,) * (2 - a.ndim)], arys)
-
-
-@numpy_function()
-def atleast_3d(*arys: Array) -> Any:
-    return _each(lambda a: a if a.ndim > 2 else (a if a.ndim == 2 else atleast_2d(a))[:, :, None], arys)
-
-
-@numpy_function()
-def broadcast_to(array: Array, shape: Any) -> Array:
-    return broadcast(array, *split_shape(shape))
 
 
 @numpy_function()
 def broadcast_arrays(*args: Array) -> list[Array]:
     shape, batch_axis = np.broadcast_shapes(*(a.row_shape for a in args)), common_batch_axis(args)
     return [broadcast(a, shape, batch_axis) for a in args]
-
-
-@numpy_function()
-def broadcast_shapes(*args: Any) -> tuple[Any, ...]:
-    return broadcast_arrays(*(FUNCTIONS["zeros"](shape) for shape in args))[0].shape
 
 
 @numpy_function()
@@ -166,8 +150,17 @@ def ravel(a: Array, order: Any = "C") -> Array:
     return reshape(a, -1)
 
 
+numpy_functions(
+    {
+        "broadcast_to": lambda array, shape: broadcast(as_array(array), *split_shape(shape)),
+        "broadcast_shapes": lambda *args: broadcast_arrays(*(FUNCTIONS["zeros"](shape) for shape in args))[0].shape,
+    }
+)
 array_functions(
     {
+        "atleast_1d": lambda *arys: _map(atleast_1d, arys),
+        "atleast_2d": lambda *arys: _map(atleast_2d, arys),
+        "atleast_3d": lambda *arys: _map(atleast_3d, arys),
         "ravel": ravel,
         "permute_dims": lambda a, axes=None: transpose(a, axes),
         "matrix_transpose linalg.matrix_transpose": lambda x: swapaxes(x, -1, -2),

@@ -15,12 +15,7 @@ from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import MAX_SYSTEM_SIZE
 from lare_rl.phi.numpy_functions.constants import plain_constant, register_constant_function
 from lare_rl.phi.numpy_functions.reductions import along
-from lare_rl.phi.numpy_functions.registry import (
-    as_float,
-    as_numbers,
-    numpy_function,
-    require_constant,
-)
+from lare_rl.phi.numpy_functions.registry import as_float, as_numbers, numpy_function, require_constant
 
 
 def _steps_above(x: Array, edges: Array, op: str) -> Array:
