@@ -139,8 +139,12 @@ def test_unreadable_file(chase, tmp_path, name, content, words):
 
 @pytest.mark.parametrize(
     "record",
-    ["{", "{}", "[" * 20_000, "[]", '{"source": "", "model": null, "exchanges": []}']
-    + ['{"source": "", "model": "m", "exchanges": 3}', '{"source": "\\ud800", "model": "m", "exchanges": []}'],
+    ["{", "{}", "[" * 20_000, "[]"]
+    + [
+        f'{{"source": {values}}}'
+        for values in ('"", "model": null, "exchanges": []', '"", "model": "m", "exchanges": 3')
+    ]
+    + ['{"source": "\\ud800", "model": "m", "exchanges": []}'],
 )
 def test_broken_record(chase, path, record):
     path.with_suffix(".json").write_text(record)

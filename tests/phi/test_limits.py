@@ -7,8 +7,7 @@ import pytest
 from helpers.attacks import ATTACKS
 from helpers.toy_envs import phi_source
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.parse import parse
-from lare_rl.phi.read import read
+from lare_rl.phi.read import parse, read
 
 
 @pytest.mark.parametrize("name", ATTACKS)

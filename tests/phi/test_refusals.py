@@ -19,7 +19,7 @@ SOURCES = {
     "import os" + RETURN: "E-IMPORT line 1: numpy and math",
     "from . import x" + RETURN: "E-IMPORT line 1: numpy and math",
     "async def f():\n    pass\n": "E-PYTHON line 1: async",
-    "n = []\n" + phi_source("n.append(1)\nreturn [observation[:, :1] * len(n)]"): "E-STATE line 3: second call",
+    "n = []\n" + phi_source("n.append(1)\nreturn [observation[:, :1] * len(n)]"): "E-STATE line 4: second call",
     "def f(x):\n    return f(x)\n" + phi_source("return [f(observation)]"): "E-COST line 2: calls",
 }
 BODIES = {
@@ -66,14 +66,14 @@ BODIES = {
     "return [np.zeros((1000, 1000))]": "E-COST line 3: 1000000",
     "return [np.linalg.eigvalsh(observation[:, :16].reshape(-1, 4, 4))]": "E-NUMPY line 3: 3 x 3",
     # What a message says of a value is its type in Python.
-    "return [np.sum(np.sin)]": "E-RUN line 3: no array can be made of a function",
+    "return [np.sum(np.sin)]": "E-RUN line 3: no array can be made of np.sin",
     "return [np.sum(observation.sum)]": "E-RUN line 3: no array can be made of a function",
     "return [np.sum({1})]": "E-RUN line 3: no array can be made of a set",
-    "return [observation.T()]": "E-RUN line 3: a ndarray cannot be called",
-    "return (x for x in [action])": "E-FORM line 3: not an iterator",
-    "return [np.dtype]": "E-FORM line 3: not a type",
-    "return [observation.tolist(1)]": "E-RUN line 3: tolist",
-    "return [len(1, 2)]": "E-RUN line 3: len()",
+    "return [observation.T()]": "E-RUN line 3: an array cannot be called",
+    "return {1: action}": "E-FORM line 3: not a dict",
+    "return [np.dtype]": "E-FORM line 3: not np.dtype",
+    "return [observation.tolist(1)]": "E-RUN line 3: too many positional arguments",
+    "return [len(1, 2)]": "E-RUN line 3: len",
     "return [np.linspace('a', 1)]": "E-RUN line 3: not a str",
 }
 CASES = SOURCES | {"import math, numpy as np\n" + phi_source(body): words for body, words in BODIES.items()}

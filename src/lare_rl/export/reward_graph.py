@@ -23,9 +23,8 @@ from lare_rl.credit.step_decoders import Bottleneck, StepDecoder
 from lare_rl.export.layers import finish, first_outputs, graph_input, network, numpy_op, standardize
 from lare_rl.nn.normalise import CLIP, running_std
 from lare_rl.phi.arrays import Array, elementwise
-from lare_rl.phi.builder import Builder, building, current_builder
+from lare_rl.phi.builder import Builder, building, current_builder, inline
 from lare_rl.phi.graph import Graph
-from lare_rl.phi.inline import inline
 from lare_rl.phi.limits import UNLIMITED
 from lare_rl.tasks.spec import select_states
 from lare_rl.training.static_config import TrainConfig

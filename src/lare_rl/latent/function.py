@@ -23,17 +23,9 @@ from lare_rl.phi.read import read
 from lare_rl.tasks.spec import FactorInputs, TaskSpec, require_role, select_states
 
 __all__ = [
-    "CHANGED_SUFFIX",
-    "HEADER_PREFIX",
-    "LatentFunction",
-    "check_task",
-    "features_text",
-    "function_from_verdict",
-    "normalise_source",
-    "pair_with_roles",
-    "source_hash",
-    "verify_function",
-]
+    "CHANGED_SUFFIX", "HEADER_PREFIX", "LatentFunction", "check_task", "features_text", "function_from_verdict",
+    "normalise_source", "pair_with_roles", "source_hash", "verify_function",
+]  # fmt: skip
 
 CHANGED_SUFFIX = "; changed by hand since"
 """It is appended to the model's name if a source is not the saved one."""
@@ -118,9 +110,7 @@ class LatentFunction:
         single = observations.ndim == actions.ndim == 1
         observations, actions = np.atleast_2d(observations), np.atleast_2d(actions)
         if len(observations) != len(actions):
-            raise LareError(
-                f"there are {len(observations)} observations and {len(actions)} actions: each step needs one of both"
-            )
+            raise LareError(f"there are {len(observations)} observations and {len(actions)} actions")
         factors = compute_factors(self.graph, observations, actions)
         check_finite(factors, self.names, observations, actions)
         return factors[0] if single else factors
@@ -188,9 +178,7 @@ def _as_array(name: str, values: Any, size: int) -> np.ndarray:
     except (TypeError, ValueError):
         raise LareError(f"{name}s must be arrays of numbers, not {short_repr(values)}") from None
     if array.ndim not in (1, 2) or array.shape[-1] != size:
-        raise LareError(
-            f"{name}s must have the shape (batch, {size}), or ({size},) for a single step: the shape is {array.shape}"
-        )
+        raise LareError(f"{name}s must have the shape (batch, {size}) or ({size},): the shape is {array.shape}")
     return array
 
 

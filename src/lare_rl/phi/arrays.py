@@ -18,13 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.batch import BATCH, BatchSize, common_batch_axis
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.graph import Kind, all_positions
+from lare_rl.phi.graph import Kind, all_positions, widest
 from lare_rl.phi.indices import ALL, computed_positions, fixed_index, index_entries, is_mask, masked_index, overwrite
-from lare_rl.phi.kinds import widest
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.operand import Operand
+from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis
 from lare_rl.phi.values import describe
 
 __all__ = [
@@ -93,7 +91,9 @@ class Array(_Value):
         """Return the only number of a constant, as a number of Python."""
         values = self.constant
         if values is None:
-            raise RefusedError("E-FLOW", "a number that differs from row to row: use np.where instead of if")
+            raise RefusedError(
+                "E-FLOW", "a number or condition that differs from row to row: use np.where instead of if"
+            )
         if values.size != 1:
             raise ValueError("the truth value of an array with more than one element is ambiguous")
         return values.item()
@@ -187,7 +187,7 @@ class Array(_Value):
                 value = value.values
             elif isinstance(value, Array) and value.batch_axis is not None:
                 raise ValueError(
-                    "x[mask] = y has other numbers in each row: write x[mask] = y[mask], or np.where(mask, y, x)"
+                    "x[mask] = y differs from row to row: write x[mask] = y[mask], or np.where(mask, y, x)"
                 )
             value = elementwise("where", region.mask_for(region.values), value, region.values)
             self[masked_index(self, entries)] = value
@@ -257,9 +257,7 @@ def as_array(value: Any) -> Array:
     if isinstance(value, BatchSize):
         value.refuse()
     if isinstance(value, Masked):
-        raise RefusedError(
-            "E-ROWS", "x[mask] can only be computed with, and written to the same places: use np.where(mask, x, 0)"
-        )
+        raise RefusedError("E-ROWS", "what x[mask] selects differs from row to row: use np.where(mask, x, 0)")
     raise TypeError(f"no array can be made of {describe(value)}")
 
 
@@ -271,9 +269,7 @@ def elementwise(op: str, *operands: Any) -> Any:
     """Apply an operation on each number to arrays, which are broadcast to each other."""
     if any(isinstance(operand, (complex, Complex)) for operand in operands):
         if op not in COMPLEX_OPERATIONS:
-            raise RefusedError(
-                "E-NUMPY", f"{op} of complex numbers is not available: use np.abs, np.angle, .real or .imag"
-            )
+            raise RefusedError("E-NUMPY", f"{op} of complex numbers: use np.abs, np.angle, .real or .imag")
         return COMPLEX_OPERATIONS[op](*operands)
     masks = {operand.mask.node: operand.mask for operand in operands if isinstance(operand, Masked)}
     if masks:

@@ -6,8 +6,7 @@ import re
 from collections.abc import Sequence
 
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.parse import parse
-from lare_rl.phi.read import FUNCTION_NAME
+from lare_rl.phi.read import FUNCTION_NAME, parse
 
 __all__ = ["factor_meanings", "factor_names"]
 

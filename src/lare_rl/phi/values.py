@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from lare_rl.phi.batch import BatchSize
-from lare_rl.phi.operand import Operand
+from lare_rl.phi.operand import BatchSize, Operand
 
 
 class _Value:

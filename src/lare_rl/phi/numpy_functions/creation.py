@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, broadcast, elementwise, stack
-from lare_rl.phi.batch import BatchSize
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.numpy_functions.joining import column_stack, concatenate_
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
@@ -24,7 +22,8 @@ from lare_rl.phi.numpy_functions.registry import (
     numpy_function,
     numpy_functions,
 )
-from lare_rl.phi.numpy_functions.shapes import ravel, split_shape
+from lare_rl.phi.numpy_functions.shapes import column_stack, concatenate_, ravel, split_shape
+from lare_rl.phi.operand import BatchSize
 
 
 @numpy_function()
@@ -143,9 +142,7 @@ def apply_along_axis(func1d: Callable[..., Any], axis: int, arr: Array, *args: A
     (at,) = arr.row_axes(axis)
     lead = [i for i in range(arr.ndim) if i not in (at, arr.batch_axis)]
     if at != arr.ndim - 1 or (arr.batch_axis is not None and (arr.batch_axis or arr.row_shape[0] != 1)):
-        raise RefusedError(
-            "E-NUMPY", "np.apply_along_axis is available along the last axis: write the function with axis=-1"
-        )
+        raise RefusedError("E-NUMPY", "np.apply_along_axis works along the last axis: use axis=-1")
     in_row = Array(arr.node, None).reshaped((-1, arr.row_shape[at]), None)  # arrays of one row, without a batch axis
     series = [as_array(func1d(in_row[i], *args, **kwargs)) for i in range(in_row.row_shape[0])]
     results = stack(series, 0)

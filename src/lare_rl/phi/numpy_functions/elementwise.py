@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, concatenate, elementwise, invert, power
+from lare_rl.phi.graph import ELEMENTWISE
 from lare_rl.phi.indices import ALL
-from lare_rl.phi.kinds import ELEMENTWISE
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.registry import UFUNCS, as_numbers, as_operand, call_numpy, numpy_function
 from lare_rl.phi.operand import Operand

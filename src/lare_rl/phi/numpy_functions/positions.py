@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, elementwise
-from lare_rl.phi.batch import BATCH, BatchSize
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import all_positions
 from lare_rl.phi.indices import ALL
@@ -22,6 +21,7 @@ from lare_rl.phi.numpy_functions.registry import (
     require_constant,
 )
 from lare_rl.phi.numpy_functions.shapes import ravel, split_shape
+from lare_rl.phi.operand import BATCH, BatchSize
 
 
 def flip(m: Array, axis: Any = None) -> Array:
@@ -97,7 +97,7 @@ def pad(array: Array, pad_width: Any, mode: Any = "constant", *, constant_values
         return array.rearranged(lambda positions: np.pad(positions, widths, mode), array.batch_axis)
     if mode != "constant":
         raise RefusedError(
-            "E-NUMPY", f"np.pad with mode={str(mode)[:40]!r}: use constant, edge, reflect, symmetric or wrap"
+            "E-NUMPY", f"np.pad, mode={str(mode)[:40]!r}: use constant, edge, reflect, symmetric or wrap"
         )
     builder = current_builder()
     fill = as_array(constant_values)

@@ -98,9 +98,7 @@ def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any
             bound.arguments[key] = tuple(map(converters[key], value)) if several else converters[key](value)
     out, dtype = kwargs.get("out"), kwargs.get("dtype")
     if out is None and arguments.get("where", True) is not True and name in UFUNCS:
-        raise RefusedError(
-            "E-NUMPY", f"np.{name} with where= needs out=: without it, NumPy returns memory that nobody has written"
-        )
+        raise RefusedError("E-NUMPY", f"np.{name} with where= needs out=, or the other numbers are undefined")
     result = FUNCTIONS[name](*bound.args, **bound.kwargs)
     if dtype is not None and "dtype" not in signature.parameters:
         result = astype(result, dtype)
