@@ -117,7 +117,7 @@ def test_program_is_refused(name):
 
 @pytest.mark.parametrize("entry", repaired_programs(), ids=lambda entry: entry["name"])
 def test_refusal_was_enough_to_mend_the_program(entry):
-    """A language model that saw a refused program and the errors, and nothing else, wrote `mended.json`, each at the first try."""
+    """A language model that saw a refused program and its errors, and nothing else, wrote `mended.json` at the first try."""
     program = next(p for p in varied_programs() if p.name == entry["name"])
     graph, inputs = read(entry["code"], *program.sizes), make_inputs(program)
     check_equal(evaluate(graph, inputs, dtype=np.float64)["factors"], execute_program(program.source, **inputs), 1e-6)

@@ -224,8 +224,8 @@ def function_from_verdict(source: str, task: TaskSpec, kind: Kind, verdict: Verd
 def normalise_source(source: str) -> str:
     r"""Return a source as it is saved: lines end with \n, no surrounding blank lines, and no header.
 
-    A line ends where Python's parser ends it, and nowhere else. Variation selectors, which make an emoji of a sign, are removed:
-    models write warning signs into comments, and a variation selector is invisible.
+    A line ends where Python's parser ends it, and nowhere else. Variation selectors, which make an emoji of a sign, are
+    removed: models write warning signs into comments, and a variation selector is invisible.
     """
     lines = source.replace(_VARIATION_SELECTOR, "").replace("\r\n", "\n").replace("\r", "\n").split("\n")
     body = itertools.dropwhile(lambda line: not line or line.startswith(HEADER_PREFIX), lines)

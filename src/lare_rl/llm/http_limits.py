@@ -73,7 +73,8 @@ def read_body(response: Any) -> bytes:
 def run_in_time(fetch: Callable[[], bytes], timeout_s: float) -> bytes:
     """Return what `fetch` returns, or raise what it raises.
 
-    The time-out of a socket is not enough: a server may send its headers byte by byte, and each byte starts that time-out again.
+    The time-out of a socket is not enough: a server may send its headers byte by byte, and each byte starts that time-out
+    again.
 
     Raises:
         TimeoutError: `fetch` takes longer than `timeout_s`. Its thread then runs on.

@@ -1,11 +1,12 @@
 """The arrays that a program works with: NumPy's shapes, views, indices and writing, on top of a graph of one row.
 
-A program sees a batch: one axis of its arrays has a length that it does not know. In the graph this axis has length 1, or m if the
-program has merged m numbers of a row into it: `x.reshape(batch * m, k)`. All other axes are the same in program and graph.
-An operation that would combine rows is refused: along the batch axis, with an index into it, or on arrays whose batch axes do not meet.
+A program sees a batch: one axis of its arrays has a length that it does not know. In the graph this axis has length 1, or m
+if the program has merged m numbers of a row into it: `x.reshape(batch * m, k)`. All other axes are the same in program and
+graph. An operation that would combine rows is refused: along the batch axis, with an index into it, or on arrays whose batch
+axes do not meet.
 
-The numbers of a view are at `positions` of another array, its base. NumPy itself is applied to positions, to find out where slices,
-transposes, flips or repetitions take their numbers from, and whether the result is a view.
+The numbers of a view are at `positions` of another array, its base. NumPy itself is applied to positions, to find out where
+slices, transposes, flips or repetitions take their numbers from, and whether the result is a view.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A function of one row, as a list of typed array operations.
 
-The shapes of a graph do not include the batch, and no operation can reach another row, so rows are independent by construction.
-`evaluate` computes any number of rows by giving every array batch axes in front. `Builder` knows, and limits, the kind and the shape
-of every result before any number is computed.
+The shapes of a graph do not include the batch, and no operation can reach another row, so rows are independent by
+construction. `evaluate` computes any number of rows by giving every array batch axes in front. `Builder` knows, and limits,
+the kind and the shape of every result before any number is computed.
 
     bool, int, float      the kinds of numbers: bool, int32 and float32 when a graph is computed
     input, constant       arrays of the caller, and arrays that never change
@@ -194,7 +194,7 @@ _ON_BOOL = {"add": "logical_or", "maximum": "logical_or", "multiply": "logical_a
 
 
 class Typed(NamedTuple):
-    """An operation with the kind that its operands are cast to and the kind of its result. `op` is None if nothing is to be done."""
+    """An operation, the kind that its operands are cast to, and the kind of its result. `op` is None if nothing is to be done."""
 
     op: str | None
     operands: Kind

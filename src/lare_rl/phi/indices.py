@@ -86,7 +86,8 @@ def masked_index(array: Shaped, entries: Sequence[Any]) -> tuple[Any, ...]:
 def computed_positions(array: Shaped, entries: Sequence[Any], as_array: Callable[[Any], Any]) -> Any:
     """Return the array of the positions of x[np.arange(batch), i, 2:4] in a row.
 
-    Each row reads its own numbers, or those of a constant. A computed index beyond the end of an axis stands for the last entry.
+    Each row reads its own numbers, or those of a constant. A computed index beyond the end of an axis stands for the last
+    entry.
     """
     at_arrays = [i for i, entry in enumerate(entries) if not isinstance(entry, slice) and entry is not None]
     apart = at_arrays != list(range(at_arrays[0], at_arrays[-1] + 1))

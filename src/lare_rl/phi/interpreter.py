@@ -1,10 +1,12 @@
 """Carries out a program: a small, closed subset of Python, in which arrays are nodes of a graph.
 
-Nothing of the source is compiled or executed. Each kind of statement (statements.py) and of expression (expressions.py) has one rule,
-and all others are refused. A name is defined by the program or by `python_functions`. A function is defined by the program, by
-`python_functions` or by `numpy_functions`. An attribute is in a table (attributes.py) or in a class of the program (calls.py).
+Nothing of the source is compiled or executed. Each kind of statement (statements.py) and of expression (expressions.py) has
+one rule, and all others are refused. A name is defined by the program or by `python_functions`. A function is defined by the
+program, by `python_functions` or by `numpy_functions`. An attribute is in a table (attributes.py) or in a class of the
+program (calls.py).
 
-A program ends soon: the meter counts every step, and numbers, texts, lists and arrays are limited before they are made (limits.py).
+A program ends soon: the meter counts every step, and numbers, texts, lists and arrays are limited before they are made
+(limits.py).
 """
 
 from typing import Any

@@ -1,7 +1,7 @@
 """Every limit on a program and on its graph, and the error that a program gets when it is refused.
 
-Each limit is checked before the time or the memory is spent. `Meter` (runtime.py) counts the steps of a program, `Builder` (builder.py)
-the sizes of its arrays.
+Each limit is checked before the time or the memory is spent. `Meter` (runtime.py) counts the steps of a program, `Builder`
+(builder.py) the sizes of its arrays.
 """
 
 from dataclasses import dataclass

@@ -38,8 +38,8 @@ from lare_rl.phi.values import (
 from lare_rl.util.sanitize import first_invisible
 
 _PARSING = threading.Lock()
-"""`threading.stack_size` is for the whole process. Before Python 3.11.8 and 3.12.2, parsers in two threads may also miscount their
-recursion depth (python/cpython#106905)."""
+"""`threading.stack_size` is for the whole process. Before Python 3.11.8 and 3.12.2, parsers in two threads may also miscount
+their recursion depth (python/cpython#106905)."""
 
 
 def parse(source: str) -> ast.Module:
@@ -90,8 +90,8 @@ def read(source: str, observation_size: int, action_size: int, max_factors: int 
     The program sees arrays (batch, observation_size) and (batch, action_size), and returns a list of arrays (batch, 1).
 
     Raises:
-        RefusedError: the text is no such function. Each line of the message names a rule, a line of the source, what is wrong, and often
-            what to write instead: first what stopped the reader, then further names that are not available.
+        RefusedError: the text is no such function. Each line of the message names a rule, a line of the source, what is wrong,
+            and often what to write instead: first what stopped the reader, then further names that are not available.
     """
     builder, tree = Builder(), None
     interpreter = Interpreter(builder, has_yield="yield" in source)

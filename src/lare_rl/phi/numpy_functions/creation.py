@@ -138,7 +138,7 @@ def fromfunction(function: Callable[..., Any], shape: Any, *, dtype: Any = "floa
 
 @numpy_function()
 def apply_along_axis(func1d: Callable[..., Any], axis: int, arr: Array, *args: Any, **kwargs: Any) -> Any:
-    """Apply a function to each series along an axis. It is called once for all rows, and once for each entry of the other axes."""
+    """Apply a function to each series along an axis. It is called once for all rows, for each entry of the other axes."""
     (at,) = arr.row_axes(axis)
     lead = [i for i in range(arr.ndim) if i not in (at, arr.batch_axis)]
     if at != arr.ndim - 1 or (arr.batch_axis is not None and (arr.batch_axis or arr.row_shape[0] != 1)):

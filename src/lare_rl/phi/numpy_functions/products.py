@@ -215,7 +215,7 @@ def det(a: Array) -> Array:
 
 @numpy_function("linalg.inv")
 def inv(a: Array) -> Any:
-    """Return the inverse, of at most 4 x 4 numbers by cofactors, of a constant by NumPy. It is not finite if the matrix is singular."""
+    """Return the inverse: by NumPy of a constant, else by cofactors. It is not finite if the matrix is singular."""
     n = _check_square(a, "inv")
     if a.constant is not None:
         current_builder().spend(n * math.prod(a.row_shape))
@@ -249,7 +249,7 @@ def matrix_power(a: Array, n: int) -> Any:
 
 @numpy_function("linalg.eigvalsh")
 def eigvalsh(a: Array, UPLO: Any = "L") -> Any:  # noqa: N803
-    """Return the eigenvalues of symmetric matrices of at most 3 x 3 numbers, in rising order. NumPy computes those of a constant.
+    """Return the eigenvalues of symmetric matrices of at most 3 x 3 numbers, in rising order; of a constant, by NumPy.
 
     For 3 x 3: O. K. Smith, Eigenvalues of a symmetric 3 x 3 matrix, Communications of the ACM 4(4), 1961.
     """

@@ -1,7 +1,8 @@
 """The functions of NumPy that a program can call, by name. Nothing else of NumPy can be reached.
 
-A function is registered with NumPy's name and parameters. Its annotations say what its arguments are converted to: an `Array`, an
-`Operand` (an array or x[mask]), a list of arrays, an int, a float. `out=` and `dtype=` are handled here for all functions.
+A function is registered with NumPy's name and parameters. Its annotations say what its arguments are converted to: an
+`Array`, an `Operand` (an array or x[mask]), a list of arrays, an int, a float. `out=` and `dtype=` are handled here for all
+functions.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ KIND_OF_DTYPE: dict[str, Kind] = {
     ),
     **dict.fromkeys("bool bool_ ?".split(), "bool"),
 }
-"""The kinds of NumPy's types. Their precision is not followed: all numbers are float32, int32 or bool when a graph is computed."""
+"""The kinds of NumPy's types. Their precision is ignored: all numbers are float32, int32 or bool when a graph is computed."""
 
 IGNORED = frozenset("order casting subok copy like device".split())
 """Arguments of NumPy that change no number."""
