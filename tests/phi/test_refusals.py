@@ -53,6 +53,8 @@ BODIES = {
     "return [observation[:, 40]]": "E-RUN line 3: IndexError",
     "return [observation[:, 40:41]]": "E-RUN line 3: beyond the end",
     "return [observation + action]": "E-RUN line 3: ValueError",
+    "return [observation[:, :1] + np.ones((5, 1))]": "E-RUN line 3: for any number of rows",
+    "return [np.zeros((len(action), 0))]": "E-INDEX line 3: empty",
     "observation[:, 0] = 1\nreturn [1]": "E-RUN line 3: copy",
     "raise ValueError('no')": "E-RUN line 3: no",
     "assert observation.shape[1] == 18, 'size'\nreturn [1]": "E-RUN line 3: size",
