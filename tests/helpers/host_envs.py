@@ -40,8 +40,6 @@ class ToyHostEnv:
         match self.fault:
             case "itself":
                 raise LareError("the battery is empty")
-            case "error":
-                raise ZeroDivisionError
             case "exit":
                 sys.exit("the window is closed")
             case "dies":

@@ -10,8 +10,6 @@ from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-__all__ = ["AnyArray", "EnvSpec", "HostEnv", "JaxEnv", "Team", "Timestep", "alive_mean", "team_mean", "to_env_action"]
-
 AnyArray = Any
 """A JAX array in compiled code, a NumPy array on the host. The type is `Any`, so that this module need not import JAX."""
 

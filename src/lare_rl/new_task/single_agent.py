@@ -20,8 +20,6 @@ from lare_rl.new_task.draft import (
 )
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX
 
-__all__ = ["draft_task"]
-
 USED_TITLES = {
     *("", "description", "observation space", "observation", "action space", "action"),
     *("episode end", "episode termination"),

@@ -16,24 +16,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lare_rl.envs.particles.nearest import concatenate_rows, distances, nearest_entities, relative_positions, slice_rows
 from lare_rl.envs.particles.prey import Layers, sample_actions, shipped_prey
 from lare_rl.envs.particles.task import ParticleTask, Team
-from lare_rl.envs.particles.world import State, World, at_rest
-
-__all__ = [
-    "SIZES",
-    "Size",
-    "chase",
-    "competitive",
-    "flee",
-    "make_world",
-    "observe_preys",
-    "predator_prey",
-    "reset",
-    "reward_predators",
-    "reward_preys",
-]
+from lare_rl.envs.particles.world import (
+    State,
+    World,
+    at_rest,
+    concatenate_rows,
+    distances,
+    nearest_entities,
+    relative_positions,
+    slice_rows,
+)
 
 PREDATOR_SENSITIVITY, PREY_SENSITIVITY = 3.0, 4.0
 PREDATOR_SPEED, PREY_SPEED = 1.0, 1.3
@@ -187,7 +181,6 @@ def reward_preys(size: Size, state: State) -> Float[Array, " preys"]:
 
 
 def flee(size: Size, layers: Layers, state: State, key: PRNGKeyArray) -> Int[Array, " preys"]:
-    """Sample the actions of scripted preys."""
     return sample_actions(layers, observe_preys(size, state), key)
 
 

@@ -11,11 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.envs.particles.nearest import concatenate_rows, distances, relative_positions, slice_rows
 from lare_rl.envs.particles.task import ParticleTask, Team
-from lare_rl.envs.particles.world import State, World, at_rest
-
-__all__ = ["triangle_area"]
+from lare_rl.envs.particles.world import (
+    State,
+    World,
+    at_rest,
+    concatenate_rows,
+    distances,
+    relative_positions,
+    slice_rows,
+)
 
 AGENTS, OBSTACLES = range(3), range(3, 6)
 AGENT, OBSTACLE = 0.15, 0.4

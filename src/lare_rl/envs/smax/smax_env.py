@@ -29,8 +29,6 @@ from lare_rl.envs.smax.observation import global_state, observation_size, observ
 from lare_rl.envs.smax.scenarios import Scenario, find_scenario
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["SMAX", "WIN_RETURN", "SmaxState", "make", "reward"]
-
 WIN_RETURN = 20.0
 """The return of an episode that is won."""
 
@@ -113,7 +111,6 @@ class SMAX:
     def frames(
         self, states: SmaxState, credit: Float[np.ndarray, "steps agents"] | None = None
     ) -> list[UInt8[np.ndarray, "height width 3"]]:
-        """Draw the states of an episode."""
         from lare_rl.envs.smax.drawing import draw_frames
 
         if credit is not None:  # all living units have the same credit, dead units none
