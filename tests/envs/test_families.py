@@ -12,7 +12,6 @@ from lare_rl.envs.families import find_score, load_env_spec, make_env, make_host
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.load import read_task
-from lare_rl.envs.pettingzoo_env import ParallelHost
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
@@ -183,11 +182,3 @@ def test_make_host_env(echo, log):
     env = make_host_env(echo)
     assert isinstance(env, JaxOnHost)
     assert env.spec is Echo.spec
-
-
-def test_single_team_of_pettingzoo_is_first():
-    task = toy_spec(environment=TOY, observation_size=2, action_size=3, team="second", agents=("a_1",))
-    env = make_host_env(task)
-    assert isinstance(env, ParallelHost)
-    assert env.spec.teams == (Team("second", 0, 1), Team("not second", 1, 2))
-    assert [agent.name for agent in env.layout.agents] == ["a_1", "a_0"]

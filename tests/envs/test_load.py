@@ -54,17 +54,6 @@ def test_task_file(spec_file):
     )
 
 
-def test_like_provides_missing_keys():
-    parent, child = read_task("HalfCheetah-v4"), read_task("HalfCheetahSparse-v4")
-    changed = {"name", "environment", "measures"}
-    assert child.model_dump(exclude=changed) == parent.model_dump(exclude=changed)
-    assert {key: getattr(child, key) for key in changed} == {
-        "name": "HalfCheetahSparse-v4",
-        "environment": "lare/HalfCheetahSparse-v4",
-        "measures": ("x_position",),
-    }
-
-
 def test_like_over_two_generations(spec_file, tmp_path):
     spec_file(like="Reacher-v4", action=None)
     child = tmp_path / "child.toml"
@@ -141,18 +130,6 @@ def test_unknown_task(task, content):
         load_task(task)
 
 
-def test_roles_of_teams():
-    task = read_task("CompetitivePP-6")
-    assert [role.name for role in task.roles] == ["CompetitivePP-6-predator", "CompetitivePP-6-prey"]
-    assert (task.family, task.environment_name, task.team) == ("particles", "CompetitivePP-6", None)
-    assert [(role.environment, role.team) for role in task.roles] == [
-        (task.environment, "predator"),
-        (task.environment, "prey"),
-    ]
-    single = read_task("CN-6")
-    assert (single.roles, single.team) == ((single,), None)
-
-
 def test_teams_inherit_shared_keys(spec_file, tmp_path):
     spec_file(team="first", environment=None, judges=None)
     (tmp_path / "both.toml").write_text(
@@ -165,7 +142,13 @@ def test_teams_inherit_shared_keys(spec_file, tmp_path):
 
 def test_like_keeps_teams(tmp_path):
     (tmp_path / "mine.toml").write_text('like = "CompetitivePP-6"\nname = "Mine"\n')
-    assert [role.team for role in read_task(tmp_path / "mine.toml").teams] == ["predator", "prey"]
+    task = read_task(tmp_path / "mine.toml")
+    assert [(role.name, role.team) for role in task.roles] == [
+        ("CompetitivePP-6-predator", "predator"),
+        ("CompetitivePP-6-prey", "prey"),
+    ]
+    assert (task.family, task.environment_name, task.team) == ("particles", "CompetitivePP-6", None)
+    assert read_task("CN-6").roles == (read_task("CN-6"),)
 
 
 @pytest.mark.parametrize("circle", [["a"], ["a", "b", "c"]])

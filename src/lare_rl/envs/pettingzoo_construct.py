@@ -38,7 +38,7 @@ def make_parallel_env(name: str, arguments: Mapping[str, Any]) -> Any:
         warnings.filterwarnings("ignore", message="The old environment creation API", category=DeprecationWarning)
         module = importlib.import_module(module_name)
         if not hasattr(module, maker_name):
-            raise LareError(f"{message}: {module_name} has no {maker_name!r}{_suggest_makers(module, maker_name)}")
+            raise LareError(f"{message}: {module_name} has no {maker_name!r}{did_you_mean(maker_name, vars(module))}")
         env = getattr(module, maker_name)(**arguments)
     if hasattr(env, "agent_iter"):
         raise LareError(f"{message}: {maker_name} makes an AECEnv, whose agents take turns. Name its parallel_env.")
@@ -54,11 +54,6 @@ def _make_hint(error: BaseException) -> str:
     if (error.name or "").partition(".")[0] == "pettingzoo":
         return f" (PettingZoo is an extra: {install_command('pettingzoo')})"
     return " (a module in this folder is found with PYTHONPATH=.)"
-
-
-def _suggest_makers(module: Any, name: str) -> str:
-    makers = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
-    return did_you_mean(name, makers) or (f"; it has {', '.join(makers[:8])}" if makers else "")
 
 
 def find_time_limit(env: Any, arguments: Mapping[str, Any]) -> int | None:

@@ -11,15 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lare_rl.envs import env_errors
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
-from lare_rl.envs.env_errors import (
-    EnvOutputError,
-    as_lare_error,
-    no_time_limit_error,
-    one_line_errors,
-    read_measure,
-    to_float,
-)
+from lare_rl.envs.env_errors import EnvOutputError, one_line_errors, read_measure, to_float
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.envs.pettingzoo_construct import find_time_limit, group_by_team, make_parallel_env
 from lare_rl.envs.spaces import finite_array
@@ -70,7 +64,7 @@ class ParallelHost:
             raise LareError(f"environment {self._name!r}: {error}") from None
         max_steps = task.max_episode_steps or find_time_limit(environment, task.arguments)
         if max_steps is None:
-            raise no_time_limit_error(task)
+            raise env_errors.no_time_limit_error(task)
         self._available = self.layout.available
         self._masks_actions = any(agent.observes_mask for agent in agents) or not self._available.all()
         self._credit_from_state = any(role.judged_from == "state" for role in (task, *task.teams))
@@ -258,7 +252,7 @@ class ParallelHost:
         except (Exception, SystemExit) as error:
             if self._initialising and isinstance(error, NotImplementedError):
                 return  # from PettingZoo's base class: the environment has no state
-            error = as_lare_error(f"environment {self._name!r} failed in state", error)
+            error = env_errors.as_lare_error(f"environment {self._name!r} failed in state", error)
             if self._initialising or self._credit_from_state:
                 raise error from None
             # Only a critic reads the state: keep the previous one. Multiwalker has no state once an agent has fallen.

@@ -13,18 +13,9 @@ from lare_rl.envs.agent_arrays import Agent
 from lare_rl.envs.interface import Team
 from lare_rl.envs.pettingzoo_construct import agent_kind, find_time_limit, make_parallel_env
 from lare_rl.envs.pettingzoo_env import ParallelHost
+from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
-from lare_rl.new_task.draft import (
-    JUDGES_LINE,
-    SCORE_LINE,
-    Draft,
-    count_entries,
-    describe_action,
-    describe_flattening,
-    file_name,
-    text_lines,
-    warning_lines,
-)
+from lare_rl.new_task.draft import Draft, count_entries, file_name, text_lines, warning_lines
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
 GENERIC_MAKERS = ("parallel_env", "env", "raw_env")
@@ -56,7 +47,7 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
             f'environment = "{environment_id}"',
             f"observation_size = {host.spec.observation_size}",
             f"action_size = {host.spec.action_size}",
-            JUDGES_LINE,
+            draft.JUDGES_LINE,
         ]
         files = {}
         for team in host.spec.teams if several else ():
@@ -73,7 +64,7 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
         f'name = "{name}"',
         *([*TEAMS_COMMENT, f"teams = {json.dumps(list(files))}"] if several else []),
         *environment_lines,
-        SCORE_LINE,
+        draft.SCORE_LINE,
         *([] if limit else ["max_episode_steps = 1000 # the environment does not state its own limit"]),
         *([f"# arguments = {{ {arguments} }} # the defaults, unless they are set here"] if arguments else []),
         *own_text_lines,
@@ -136,12 +127,12 @@ def _team_text_lines(host: ParallelHost, team: Team, texts: Mapping[str, str]) -
 def _first_lines(host: ParallelHost, team: Team) -> dict[str, str]:
     """Return the descriptions of the spaces of a team's first agent, with the padding that other agents require."""
     agent, spec = host.layout.agents[team.start], host.spec
-    flattening, padding = describe_flattening(agent.observation_space), _describe_padding(host, agent)
+    flattening, padding = draft.describe_flattening(agent.observation_space), _describe_padding(host, agent)
     fewer = f"; {agent.name} has only the first {agent.action_size}"
     missing_actions = fewer if agent.discrete and agent.action_size < spec.action_size else ""
     return {
         "observation": f"{count_entries(spec.observation_size)}{flattening}{padding}.",
-        "action": f"{count_entries(spec.action_size)}{describe_action(agent.action_space)}{missing_actions}.",
+        "action": f"{count_entries(spec.action_size)}{draft.describe_action(agent.action_space)}{missing_actions}.",
     }
 
 

@@ -14,17 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from lare_rl.envs.particles import views
 from lare_rl.envs.particles.task import ParticleTask, Team
-from lare_rl.envs.particles.world import (
-    State,
-    World,
-    at_rest,
-    concatenate_rows,
-    distances,
-    nearest_entities,
-    relative_positions,
-    slice_rows,
-)
+from lare_rl.envs.particles.world import State, World, at_rest
 
 AGENT, LANDMARK = 0.15, 0.05
 """The radii of both."""
@@ -104,19 +96,19 @@ def _reset(size: Size, key: PRNGKeyArray) -> State:
 
 def _observe(size: Size, state: State) -> Float[Array, "agents observation"]:
     """Return each agent's velocity and position, the nearest landmarks, and the nearest other agents."""
-    landmarks = nearest_entities(state.position, size.agents, size.landmarks, N_VISIBLE_LANDMARKS)
-    other_agents = nearest_entities(state.position, size.agents, size.agents, N_VISIBLE_AGENTS)
-    return concatenate_rows(
-        slice_rows(state.velocity, size.agents),
-        slice_rows(state.position, size.agents),
-        relative_positions(state.position, size.agents, landmarks),
-        relative_positions(state.position, size.agents, other_agents),
+    landmarks = views.nearest_entities(state.position, size.agents, size.landmarks, N_VISIBLE_LANDMARKS)
+    other_agents = views.nearest_entities(state.position, size.agents, size.agents, N_VISIBLE_AGENTS)
+    return views.concatenate_rows(
+        views.slice_rows(state.velocity, size.agents),
+        views.slice_rows(state.position, size.agents),
+        views.relative_positions(state.position, size.agents, landmarks),
+        views.relative_positions(state.position, size.agents, other_agents),
     )
 
 
 def _reward(size: Size, state: State) -> Float[Array, " agents"]:
-    to_landmarks = distances(state.position, size.agents, size.landmarks)
-    to_agents = distances(state.position, size.agents, size.agents)
+    to_landmarks = views.distances(state.position, size.agents, size.landmarks)
+    to_agents = views.distances(state.position, size.agents, size.agents)
     return -jnp.min(to_landmarks, axis=1) - jnp.sum(to_agents < 2 * AGENT, axis=1)
 
 

@@ -94,16 +94,11 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
         self._state, observation, reward = _advance(self.task, state, action, self._next_key())
         self.steps += 1
         ended = self.steps == MAX_STEPS
-        results = (
-            self._by_agent(np.asarray(observation)),
-            self._by_agent(np.asarray(reward).tolist()),
-            dict.fromkeys(acted, False),
-            dict.fromkeys(acted, ended),
-            {agent: {} for agent in acted},
-        )
         if ended:
             self.agents = []
-        return results
+        observations, rewards = self._by_agent(np.asarray(observation)), self._by_agent(np.asarray(reward).tolist())
+        infos = {agent: {} for agent in acted}
+        return observations, rewards, dict.fromkeys(acted, False), dict.fromkeys(acted, ended), infos
 
     def render(self) -> np.ndarray:
         return to_pixels(draw_state(self.task, np.asarray(self._world_state().position)))

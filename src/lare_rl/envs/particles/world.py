@@ -1,4 +1,4 @@
-"""The physics of the particle tasks, and views of entities: discs of mass 1 in a plane without walls (MADDPG, Lowe et al., 2017).
+"""The physics of the particle tasks: discs of mass 1 in a plane without walls (Lowe et al., MADDPG, 2017).
 
     F = sensitivity * direction + sum of contact forces
     v <- (1 - DAMPING) v + TIME_STEP * F                  then scaled down to at most max_speed
@@ -14,7 +14,6 @@ which is close to CONTACT_FORCE * (d_min - d) if d < d_min, and close to 0 if th
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -84,35 +83,3 @@ def move(world: World, state: State, force: Float[Array, "moving 2"]) -> State:
     velocity = jnp.where(speed > world.max_speed, world.max_speed / speed, 1)[:, None] * velocity
     moved = state.position[: world.n_moving] + TIME_STEP * velocity
     return State(state.position.at[: world.n_moving].set(moved), state.velocity.at[: world.n_moving].set(velocity))
-
-
-def distances(
-    position: Float[Array, "entities 2"], observers: range, targets: range
-) -> Float[Array, "observers targets"]:
-    """Return the distances between the centres of observers and targets; infinite from an entity to itself."""
-    offset = slice_rows(position, targets) - slice_rows(position, observers)[:, None]
-    is_same = np.asarray(observers)[:, None] == np.asarray(targets)
-    return jnp.where(is_same, jnp.inf, jnp.sqrt(jnp.sum(offset**2, axis=-1)))
-
-
-def nearest_entities(
-    position: Float[Array, "entities 2"], observers: range, targets: range, count: int
-) -> Int[Array, "observers count"]:
-    """Return the indices of the `count` targets that are nearest to each observer, nearest first."""
-    _, index = jax.lax.top_k(-distances(position, observers, targets), count)
-    return targets.start + index
-
-
-def relative_positions(
-    position: Float[Array, "entities 2"], observers: range, entities: Int[Array, "observers count"]
-) -> Float[Array, "observers count 2"]:
-    return position[entities] - slice_rows(position, observers)[:, None]
-
-
-def slice_rows(values: Float[Array, "entities 2"], entities: range) -> Float[Array, "range 2"]:
-    return values[entities.start : entities.stop]
-
-
-def concatenate_rows(*arrays: Float[Array, "observers ..."]) -> Float[Array, "observers observation"]:
-    """Flatten arrays to one row for each observer, and concatenate them."""
-    return jnp.concatenate([array.reshape(len(array), -1) for array in arrays], axis=1)
