@@ -61,21 +61,20 @@ def test_episode_equals_smax():
 STOP = np.eye(11, dtype=np.float32)[[1] * 5]
 
 
-def test_time_limit_truncates():
-    games = []
+@pytest.mark.parametrize("won", [False, True])
+def test_time_limit(won):
+    """A battle that is won in the last step has terminated too."""
 
-    class Recorded(FakeSmac):
-        def __init__(self, **kwargs):
-            super().__init__(**kwargs)
-            games.append(self)
+    class Ending(FakeSmac):
+        def step(self, actions):
+            super().step(actions)
+            return 1.0, True, {"battle_won": won}
 
-    env = StarCraft("2s3z", make_game=Recorded)
+    env = StarCraft("2s3z", make_game=Ending)
     env.reset(0)
     env.spec = replace(env.spec, max_steps=1)
-    battle = games[-1].state.battle
-    games[-1].state = games[-1].state._replace(battle=battle._replace(step=jnp.array(119, jnp.int32)))
     timestep = env.step(STOP)
-    assert (bool(timestep.truncated), bool(timestep.terminated)) == (True, False)
+    assert (bool(timestep.truncated), bool(timestep.terminated)) == (True, won)
 
 
 def test_crash_truncates_the_episode():

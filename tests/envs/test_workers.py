@@ -95,12 +95,14 @@ def test_other_rows_do_not_change(make_vec_env):
         ("itself", "the battery is empty"),
         ("exit", "environment 1 failed in step: the window is closed"),
         ("make", "environment 1 cannot be made: no asset"),
+        ("output", "the reward is nan"),
     ],
 )
 def test_error_of_an_environment(make_vec_env, fault, message):
     with pytest.raises(LareError) as error:
         walk(make_vec_env([ToyHostEnv, partial(ToyHostEnv, fault)]))
     assert str(error.value) == message
+    assert getattr(error.value, "env_index", None) == (1 if fault == "output" else None)
 
 
 @pytest.mark.parametrize(
