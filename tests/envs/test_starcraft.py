@@ -91,12 +91,22 @@ def test_crash_truncates_the_episode():
 
 
 def test_repeated_crashes_end_the_run():
-    env = StarCraft("2s3z", make_game=partial(FakeSmac, crash_at=1))
-    for seed in range(2):
-        env.reset(seed)
-        with pytest.warns(RuntimeWarning):
+    """A complete episode between crashes starts a new count."""
+    infos = iter([{}, {}, {"battle_won": False}, {}, {}, {}])  # at the end of each episode; a crash has none
+
+    class Ending(FakeSmac):
+        def step(self, actions):
+            super().step(actions)
+            self.ended = True
+            return 0.0, True, next(infos)
+
+    env = StarCraft("2s3z", make_game=Ending)
+    with pytest.warns(RuntimeWarning) as crashes:
+        for seed in range(5):
+            env.reset(seed)
             env.step(STOP)
-    env.reset(2)
+    assert len(crashes) == 4
+    env.reset(5)
     with pytest.raises(LareError, match=r"crashed .* 3rd time"):
         env.step(STOP)
 

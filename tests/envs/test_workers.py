@@ -162,7 +162,7 @@ from helpers.host_envs import ToyHostEnv
 from lare_rl.envs.workers import SubprocVecEnv
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
-envs = SubprocVecEnv([partial(ToyHostEnv, seconds=0.05)] * 2, processes=2)
+envs = SubprocVecEnv([partial(ToyHostEnv, sys.argv[1], seconds=0.05)] * 2, processes=2)
 print(*envs.pids, flush=True)
 envs.reset(np.ones(2, bool), np.arange(2))
 while True:
@@ -170,12 +170,12 @@ while True:
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_workers_end_silently_with_their_parent(how):
-    """The program has no `if __name__ == "__main__"`: workers do not run it again."""
+@pytest.mark.parametrize(("how", "fault"), [(signal.SIGINT, ""), (signal.SIGKILL, ""), (signal.SIGKILL, "hangs")])
+def test_workers_end_silently_with_their_parent(how, fault):
+    """The program has no `if __name__ == "__main__"`: workers do not run it again. A step that hangs must end too."""
     paths = os.pathsep.join(str(Path(module.__file__).parents[1]) for module in (lare_rl, host_envs))
     parent = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM],
+        [sys.executable, "-c", PROGRAM, fault],
         env=os.environ | {"PYTHONPATH": paths},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -185,7 +185,7 @@ def test_workers_end_silently_with_their_parent(how):
     try:
         pids = list(map(int, parent.stdout.readline().split()))
         assert all(map(is_running, pids))
-        time.sleep(0.2)
+        time.sleep(0.5)  # the third step has begun
         os.killpg(parent.pid, how)  # as a terminal does
         _, error_output = parent.communicate(timeout=30)
     finally:
