@@ -101,10 +101,14 @@ def test_repeated_crashes_end_the_run():
             return 0.0, True, next(infos)
 
     env = StarCraft("2s3z", make_game=Ending)
-    with pytest.warns(RuntimeWarning) as crashes:
+
+    def play_episodes():
         for seed in range(5):
             env.reset(seed)
             env.step(STOP)
+
+    with pytest.warns(RuntimeWarning) as crashes:
+        play_episodes()
     assert len(crashes) == 4
     env.reset(5)
     with pytest.raises(LareError, match=r"crashed .* 3rd time"):
