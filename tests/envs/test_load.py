@@ -189,3 +189,8 @@ def test_require_role():
     teams = tuple(toy_spec(name=name, team=name) for name in ("cat", "mouse"))
     with pytest.raises(LareError, match="cat, mouse"):
         require_role(toy_spec(teams=teams))
+
+
+def test_team_of_another_environment():
+    with pytest.raises(LareError, match="Cat is not a team of a/b"):
+        toy_spec(environment="a/b", teams=(toy_spec(name="Cat", team="cat", environment="c/d"),))
