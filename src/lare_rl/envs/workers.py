@@ -49,8 +49,8 @@ class VecEnv(ABC):
 
     def __init__(self, specs: Sequence[EnvSpec]):
         self.spec = specs[0]
-        first, *others = map(_sizes, specs)
-        for env_index, sizes in enumerate(others, 1):
+        first, *rest = map(_sizes, specs)
+        for env_index, sizes in enumerate(rest, 1):
             if sizes != first:
                 raise LareError(f"environment {env_index} differs from environment 0: {sizes}, not {first}")
         self.batch = _empty_batch(self.spec, len(specs))
