@@ -10,19 +10,6 @@ from gymnasium.spaces import Box, Discrete
 from lare_rl.envs.spaces import OneHot
 from lare_rl.tasks.spec import FILL_IN
 
-__all__ = [
-    "JUDGES_LINE",
-    "MEASURES_LINE",
-    "SCORE_LINE",
-    "Draft",
-    "count_entries",
-    "describe_action",
-    "describe_flattening",
-    "file_name",
-    "text_lines",
-    "warning_lines",
-]
-
 JUDGES_LINE = (
     'judges = "after" # the observation that shows what a step earned: "after" the action, "before" it, or "both"'
 )
@@ -61,13 +48,7 @@ class Draft:
 def warning_lines(
     removed: Sequence[str], origin: str = "the documentation of the environment", unused: Sequence[str] = ()
 ) -> list[str]:
-    """Return the comments at the top of a draft.
-
-    Args:
-        removed: the sentences that were removed.
-        origin: the source of the texts.
-        unused: the titles of sections that were not used.
-    """
+    """Return the comments at the top of a draft, with the titles of `unused` sections."""
     count = "1 sentence or row" if len(removed) == 1 else f"{len(removed)} sentences or rows"
     return [
         f"# A first draft, from {origin}. Read it before you use it: a language model will",
@@ -95,7 +76,6 @@ def text_lines(texts: Mapping[str, str], first_lines: Mapping[str, str]) -> list
 
 
 def _quote(text: str) -> str:
-    """Return a text as a multi-line string in TOML."""
     escaped = text.replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
     escaped = re.sub(r"[\x00-\x08\x0b-\x1f\x7f]", lambda match: f"\\u{ord(match[0]):04x}", escaped)
     return f'"""\n{escaped}\n"""'
@@ -107,7 +87,6 @@ def file_name(text: str) -> str:
 
 
 def count_entries(count: int) -> str:
-    """Return a number of entries as text."""
     return "1 entry" if count == 1 else f"{count} entries"
 
 

@@ -12,8 +12,6 @@ from lare_rl.envs.particles.task import MAX_STEPS, N_ACTIONS
 from lare_rl.envs.particles.world import State
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["ParticleJaxEnv", "ParticleState", "make"]
-
 
 def make(task: TaskSpec, **_: Any) -> "ParticleJaxEnv":
     """Make the environment of a task with the name `particles/NAME`."""
@@ -43,14 +41,12 @@ class ParticleJaxEnv:
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[ParticleState, Timestep]:
-        """Start an episode."""
         state = ParticleState(self.task.reset(key), jnp.zeros((), jnp.int32))
         return state, self._make_timestep(state, jnp.zeros(self.spec.n_agents))
 
     def step(
         self, state: ParticleState, action: Float[Array, "agents action"], key: PRNGKeyArray
     ) -> tuple[ParticleState, Timestep]:
-        """Make one step, in which all agents act at once."""
         world = self.task.step(state.world, jnp.argmax(action, axis=-1), key)
         state = ParticleState(world, state.step + 1)
         return state, self._make_timestep(state, self.task.reward(world))
@@ -71,7 +67,6 @@ class ParticleJaxEnv:
     def frames(
         self, states: ParticleState, credit: Float[np.ndarray, "steps agents"] | None = None
     ) -> list[UInt8[np.ndarray, "height width 3"]]:
-        """Draw the states of an episode."""
         from lare_rl.envs.particles.drawing import draw_frames
 
         return draw_frames(self.task, np.asarray(states.world.position), credit)

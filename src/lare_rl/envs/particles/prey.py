@@ -10,8 +10,6 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-__all__ = ["Layers", "logits", "sample_actions", "shipped_prey"]
-
 Layers = tuple[tuple[Float[np.ndarray | Array, "_in _out"], Float[np.ndarray | Array, " _out"]], ...]
 """Weight and bias of each layer."""
 
@@ -24,7 +22,6 @@ def shipped_prey() -> Layers:
 
 
 def logits(layers: Layers, observation: Float[Array, "preys observation"]) -> Float[Array, "preys actions"]:
-    """Return the network's outputs."""
     *hidden, (weight, bias) = layers
     for hidden_weight, hidden_bias in hidden:
         observation = jax.nn.relu(observation @ hidden_weight + hidden_bias)

@@ -18,8 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-__all__ = ["State", "World", "at_rest", "contact_force", "move", "push"]
-
 TIME_STEP = 0.1
 DAMPING = 0.25
 """The share of its velocity that each entity loses in a step."""
@@ -34,7 +32,7 @@ DIRECTIONS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)], np.float32)
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """The constants of a world. The first `moving` entities are agents and preys; the others are landmarks, which do not move."""
+    """The constants of a world. The first `n_moving` entities are agents and preys. The others are landmarks, which do not move."""
 
     size: Float[np.ndarray, " entities"]
     """The radii."""
