@@ -82,13 +82,8 @@ def assess_factors(
         explanation = jax.tree.map(np.asarray, explanation)
     is_certain = min(errors.values()) < MAX_ERROR_RATIO * max(errors.values())
     r2, r2_error = r_squared(returns[N_FIRST:], predicted[score_type])
-    return FactorAssessment(
-        r2=r2,
-        r2_error=r2_error,
-        length_r2=length_r2,
-        score_type=ScoreTypeEstimate(score_type, is_certain) if len(score_types) > 1 else None,
-        explanation=explanation,
-    )
+    estimate = ScoreTypeEstimate(score_type, is_certain) if len(score_types) > 1 else None
+    return FactorAssessment(r2, r2_error, length_r2=length_r2, score_type=estimate, explanation=explanation)
 
 
 def mean_features(
@@ -117,7 +112,6 @@ def _add_episode(
     inputs: Float[Array, "steps agents inputs"],
     share: Float[Array, "steps agents"],
 ) -> tuple[Float[Array, " features"], StepStatistics]:
-    """Return the weighted sum of the features of an episode's steps, and the sums over all steps so far."""
     features = decoder.features(inputs).astype(float)
     return jnp.einsum("taf,ta->f", features, share), add_steps(statistics, features, share > 0, decoder.basis)
 
@@ -131,12 +125,7 @@ def predict_returns(
 ) -> Float[np.ndarray, " later_episodes"]:
     """Return R_hat of all episodes but the first `N_FIRST`, each by a fit to episodes before it. Call this within `float64()`.
 
-    Args:
-        features: the mean features of each episode.
-        returns: R of each episode.
-        length: T of each episode.
-        basis: the features. Only functions of factors are used.
-        score_type: a `ScoreType`.
+    `features` are the means of each episode. Only functions of factors are used.
     """
     features, group_index = features[:, basis.is_factor_feature], basis.group_index[basis.is_factor_feature]
     n_features, n_groups = len(group_index), int(group_index.max()) + 1

@@ -18,10 +18,7 @@ def episode_means(
 ) -> Float[Array, " episodes"]:
     """Return mean_t r_hat_t of each episode over its steps in the batch: all T of them, or K sampled ones.
 
-    Args:
-        r_hat: the proxy rewards of the steps.
-        episode_index: the index of each step's episode. Steps whose index is not in 0..B-1 are ignored.
-        n_steps: the number of steps of each episode in the batch.
+    `n_steps` is the number of steps of each episode in the batch. Steps whose `episode_index` is not in 0..B-1 are ignored.
     """
     total = jnp.zeros(n_steps.shape, r_hat.dtype).at[episode_index].add(r_hat, mode="drop")
     return total / jnp.maximum(n_steps, 1)
