@@ -71,6 +71,8 @@ def test_rewards_of_every_method(method, function):
     if method == "ircr":
         means = np.array([episode.reward.mean() for episode in episodes])
         np.testing.assert_allclose(r_hat[:, 0], (means - means.min()) / np.ptp(means), rtol=1e-5)
+        running = add_episode(credit, episodes[0], "running", end=False)
+        assert credit.rewards_at(running).tolist() == [0.5] * 10
         with pytest.raises(LareError, match="rewards_at"):
             credit.rewards(*episodes[0][:3])
     else:
@@ -467,7 +469,8 @@ def test_task_with_discrete_actions():
 def test_judges(judges, phi):
     (episode,) = random_episodes([4])
     factors, raw = small_assigner("lare-rd", phi, judges=judges), small_assigner("bayes", judges=judges)
-    for credit in (factors, raw):
+    changes = small_assigner("rd", judges=judges)
+    for credit in (factors, raw, changes):
         credit.add_episode(*episode)
         credit.learner.flush_inputs()
     np.testing.assert_array_equal(factors.store.features[:4], phi.step_factors(*episode[:3], judges))
@@ -475,6 +478,8 @@ def test_judges(judges, phi):
     observations = {"before": [before], "after": [after], "both": [before, after]}[judges]
     expected = np.concatenate([*observations, episode.action], axis=1)
     np.testing.assert_array_equal(raw.store.features[:4], expected)
+    expected = np.concatenate([before, episode.action, before - after], axis=1)
+    np.testing.assert_array_equal(changes.store.features[:4], expected)
 
 
 # Many agents

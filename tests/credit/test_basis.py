@@ -48,6 +48,7 @@ def test_many_raw_features_have_fewer_frequencies_and_no_pairs(n_raw, frequencie
     assert basis.raw_frequencies == frequencies
     assert basis.n_features == n_raw * (1 + 2 * frequencies) + n_pairs
     assert basis.n_features <= max(MAX_FEATURES, n_raw)
+    assert Basis(20, 50, extended=True).raw_frequencies == 1  # factors leave less room
 
 
 def test_raw_features_of_images_are_not_used():

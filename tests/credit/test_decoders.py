@@ -62,13 +62,13 @@ def test_outputs(name):
 
 def test_bottleneck_equations():
     decoder, noise = DECODERS["bottleneck"](key=KEY), jax.random.normal(KEY, (EPISODES * STEPS, AGENTS, 2))
-    mean, log_variance = jnp.split(decoder.encoder(ROWS), 2, axis=-1)
+    mean, log_variance = jnp.split(decoder.encoder(jnp.asarray(ROWS)), 2, axis=-1)
     assert float(jnp.abs(log_variance).max()) > 0.1
     for key, z in ((KEY, mean + jnp.sqrt(jnp.exp(log_variance)) * noise), (None, mean)):
         want = decoder.decoder(z, None).r_hat
-        np.testing.assert_allclose(decoder(ROWS, key).r_hat, want, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(decode(decoder, ROWS, key).r_hat, want, rtol=1e-4, atol=1e-5)
     divergence = 0.5 * (np.exp(log_variance) + mean**2 - 1 - log_variance).sum(axis=-1)
-    np.testing.assert_allclose(decoder(ROWS, KEY).penalty, 0.1 * divergence, rtol=1e-5)
+    np.testing.assert_allclose(decode(decoder, ROWS, KEY).penalty, 0.1 * divergence, rtol=1e-5)
 
 
 DISTINCT = {

@@ -30,6 +30,7 @@ def fit_batches(state, batches, fit, settings):
     return jax.lax.scan(body, state, batches)
 
 
+@jax.jit
 def observe(state, rows, mean_reward, length):
     state = decomposition.observe_steps(state, rows)
     return decomposition.observe_returns(state, mean_reward, length, jnp.ones(len(length), bool))
@@ -100,8 +101,8 @@ def test_decoder_of_many_agents_soon_reaches_the_size_of_rare_rewards():
 
 
 def test_loss_of_packed_episodes_against_numpy():
-    """The mean r_hat of each episode is compared with R/T. Padding is ignored, so that an empty batch changes nothing."""
-    rng, settings = np.random.default_rng(0), CreditSettings(hidden=(8,), normalise=False)
+    """The mean r_hat of each episode is compared with R/T. Padding is ignored. An empty batch has no gradient."""
+    rng, settings = np.random.default_rng(0), CreditSettings(hidden=(8,), normalise=False, weight_decay=0.1)
     length, returns = np.array([3, 1, 5]), np.array([6.0, -2.0, 1.0], np.float32)
     rows = jnp.asarray(rng.normal(size=(12, FEATURES)), jnp.float32)
     state = init(KEY, FEATURES, METHODS["rd"], settings, STEPS, 1)
@@ -119,7 +120,9 @@ def test_loss_of_packed_episodes_against_numpy():
     assert float(metrics["credit/loss"]) == pytest.approx(want, rel=1e-4)
     after, metrics = update(state, batch._replace(mask=np.zeros(3)), KEY, fit=Fit.ALL_STEPS, settings=settings)
     assert float(metrics["credit/loss"]) == 0.0
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, state.decoder, after.decoder))
+    for weight, new in zip(jax.tree.leaves(state.decoder), jax.tree.leaves(after.decoder), strict=True):
+        decayed = weight - settings.learning_rate * np.sign(weight)  # Adam's first step for the decay alone
+        np.testing.assert_allclose(new, decayed, atol=3e-5)
 
 
 @pytest.mark.parametrize(("name", "sum_form"), [("rd", True), ("rrdu", False)])
@@ -130,7 +133,7 @@ def test_gradient_in_chunks_is_that_of_the_batch(name, sum_form):
     features, target = rng.normal(size=(n_episodes * k, agents, FEATURES)), rng.normal(size=n_episodes)
     length = np.full(n_episodes, STEPS)
     state = init(KEY, FEATURES, METHODS[name], settings, STEPS, agents)
-    state = decomposition.observe_returns(state, target, length, np.ones(n_episodes, bool))
+    state = observe(state, features, target, length)
 
     def batch(n_chunks):
         episode_index = np.tile(np.repeat(np.arange(n_episodes // n_chunks), k), n_chunks)

@@ -99,4 +99,4 @@ def test_must_learn_step_rewards():
 
     decoder = train(decoder, rng.normal(size=(600, 32, STEPS, FEATURES)).astype(np.float32))
     x = rng.normal(size=(500, FEATURES)).astype(np.float32)
-    assert np.corrcoef(decoder(x, None).r_hat, x @ weight)[0, 1] > 0.9
+    assert np.corrcoef(decoder(jnp.asarray(x), None).r_hat, x @ weight)[0, 1] > 0.9

@@ -98,7 +98,7 @@ class Store:
         self,
         env_ids: Sequence[Hashable],
         numbers: Int[np.ndarray, " n"],
-        steps: tuple[np.ndarray, np.ndarray, np.ndarray],
+        steps: Sequence[np.ndarray],
         reward: Float[np.ndarray, " n"],
         ended: Bool[np.ndarray, " n"],
     ) -> Iterator[Episode]:

@@ -102,7 +102,7 @@ def credit_spec(
         scale_rewards: whether training rewards are divided by the scale of R/T.
     """
     inputs = method.encoder.inputs(judges, single_agent=single_agent) if method.encoder is not None else ()
-    score_types = score_types_to_fit(settings, fixed_length) if "score" in method.settings else (ScoreType.SUM,)
+    score_types = score_types_to_fit(settings.score, fixed_length) if "score" in method.settings else (ScoreType.SUM,)
     return CreditSpec(
         method=method,
         settings=settings,

@@ -24,7 +24,7 @@ from lare_rl.credit.closed_form import FIT_GROWTH, MAX_ROUNDS, LinearDecoder
 from lare_rl.credit.evidence import Posterior, SufficientStatistics
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
 from lare_rl.credit.returns import MAX_ERROR_RATIO
-from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate, score_types_to_fit
 from lare_rl.util.float64 import float64
 from lare_rl.util.statistics import r_squared
 
@@ -66,8 +66,7 @@ def assess_factors(
     """
     length = np.array([len(episode) for episode in inputs])
     lengths_differ = len(set(length)) > 1
-    all_types = (ScoreType.SUM, ScoreType.MEAN) if lengths_differ else (ScoreType.SUM,)
-    score_types = {"sum": (ScoreType.SUM,), "average": (ScoreType.MEAN,)}.get(score or "", all_types)
+    score_types = score_types_to_fit(score or "auto", fixed_length=not lengths_differ)
     with float64():
         features, step_statistics = mean_features(inputs, alive, basis)
         predict = partial(predict_returns, returns=returns, length=length, basis=basis)
