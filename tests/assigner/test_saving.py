@@ -16,7 +16,7 @@ from lare_rl.errors import LareError
 
 
 def trained_assigner(method, phi=None, is_mean=False, **changes):
-    """Return an assigner with some episodes, the last of which goes on, and new steps."""
+    """Return an assigner with some episodes and one that goes on, and new steps."""
     credit = small_assigner(method, phi, **changes)
     for *steps, reward in random_episodes([7, 4, 9, 6] * 6):
         credit.add_episode(*steps, reward.mean() if is_mean else reward)

@@ -5,7 +5,7 @@ import pytest
 from lare_rl.credit.basis import MAX_FEATURES, MAX_PAIRED_RAW_FEATURES, Basis, expand, fourier_terms
 
 U = np.array([0.5, -1.0, 2.0, 9.0, -0.3], np.float32)
-"""Three factors and two raw features, one of which is far from its mean."""
+"""Three factors and two raw features. The first raw feature is far from its mean."""
 
 
 def numpy_fourier_terms(u):

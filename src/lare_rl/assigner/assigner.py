@@ -181,7 +181,7 @@ class CreditAssigner:
     def add_episode(
         self, observation: Any, action: Any, next_observation: Any, reward: Any, *, alive: Any = None
     ) -> Int[np.ndarray, " steps"]:
-        """Add a whole episode that has ended. `reward` is that of each step, (T,), or the score, a single number.
+        """Add a whole episode that has ended. `reward` is the reward of each step, (T,), or the score, a single number.
 
         Raises:
             LareError: as in `add`, or the episode has no step.

@@ -105,7 +105,7 @@ class DecoderLearner:
             self._pending_returns.append((episode.score / len(episode.steps), len(episode.steps)))
 
     def flush_large_queues(self) -> None:
-        """Process what waits, if there is much of it."""
+        """Process the queues that have become long."""
         if self.n_pending_steps >= PENDING_STEPS:
             self.flush_inputs()
         if sum(len(episode.steps) for episode in chain.from_iterable(self._pending_episodes)) >= CHUNK_ROWS:

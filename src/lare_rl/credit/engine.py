@@ -141,7 +141,8 @@ def proxy_rewards(
 ) -> Float[Array, "*batch agents"]:
     """Return r_hat of each agent, in the unit of the true rewards if the method's rewards have one.
 
-    `decoder` is None for a method that has none. `scale` is that of R/T. If `optimistic`, add the optimism that the settings ask for.
+    `decoder` is None for a method that has none. `scale` is the scale of R/T. If `optimistic`, the optimism that the settings ask
+    for is added.
     """
     match spec.method.reward:
         case Reward.DESIGNED:
