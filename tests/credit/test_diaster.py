@@ -41,7 +41,7 @@ def numpy_piece_reward(decoder, rows):
 def test_piece_rewards_against_numpy(decoder, rows):
     begins = np.zeros((EPISODES, STEPS), bool)
     begins[0, 3] = begins[2, 1] = True
-    rewards = np.asarray(jax.jit(decoder.piece_rewards)(rows, begins))
+    rewards = np.asarray(jax.jit(lambda *args: decoder.piece_rewards(*args))(rows, begins))
     for episode, step in np.ndindex(rewards.shape):
         begin = max([0, *(b for b in np.flatnonzero(begins[episode]) if b <= step)])
         want = numpy_piece_reward(decoder, rows[episode, begin : step + 1])
