@@ -67,7 +67,7 @@ def learn(method, env, phi=None):
 
 
 @pytest.mark.parametrize(
-    ("method", "env"), [("lare-bayes", PHI_ENV), ("rd-linear", ONE_TEAM), long_case("ircr", ONE_AGENT)]
+    ("method", "env"), [("lare-bayes", PHI_ENV), long_case("rd-linear", ONE_TEAM), long_case("ircr", ONE_AGENT)]
 )
 def test_rewards_agree(method, env, phi):
     learner, config, credit = learn(method, env, phi if METHODS[method].needs_phi else None)

@@ -82,7 +82,7 @@ def test_vector_steps(mode, env_spaces):
     check_stored_episodes(credit, envs)
     assert credit.store.dropped == 0
     n_finished = sum(len(steps) for env in envs for steps, _ in env.episodes)
-    assert credit.store.steps == n_finished + sum(len(env.going) for env in envs if env.left > 0)
+    assert credit.store.steps == n_finished + sum(len(env.running) for env in envs if env.n_remaining > 0)
 
 
 @all_spaces
@@ -95,7 +95,7 @@ def test_single_steps(env_spaces):
         done = False
         while not done:
             _, reward, terminated, truncated, info = wrapped.step(env.action_space.sample())
-            assert reward == info[TRUE_REWARD] == env.going[-1][3]
+            assert reward == info[TRUE_REWARD] == env.running[-1][3]
             done = terminated or truncated
         assert info[CREDIT_STEP] == credit.store.steps - 1
     check_stored_episodes(credit, [env])
@@ -138,7 +138,7 @@ def test_vector_reset_drops_episodes(mode):
     credit = small_assigner("rd")
     wrapped = VectorCredit(vector, credit, pay="environment")
     play(wrapped, 10)
-    n_running = sum(env.left > 0 and bool(env.going) for env in envs)
+    n_running = sum(env.n_remaining > 0 and bool(env.running) for env in envs)
     play(wrapped, 10)
     check_stored_episodes(credit, envs)
     assert credit.store.dropped == n_running > 0
@@ -149,7 +149,7 @@ def test_reset_mask_drops_one_episode():
     credit = small_assigner("rd")
     wrapped = VectorCredit(vector, credit, pay="environment")
     for env in envs:
-        env.reset = lambda env=env, **_: (LoggedEnv.reset(env), setattr(env, "left", 4))[0]
+        env.reset = lambda env=env, **_: (LoggedEnv.reset(env), setattr(env, "n_remaining", 4))[0]
     wrapped.reset()
     actions = wrapped.action_space.sample()
     wrapped.step(actions)
@@ -166,10 +166,10 @@ def test_single_reset_drops_episode():
     credit = make_assigner(env)
     wrapped = Credit(env, credit)
     wrapped.reset()
-    env.left = 3
+    env.n_remaining = 3
     wrapped.step(env.action_space.sample())
     wrapped.reset()
-    env.left = 2
+    env.n_remaining = 2
     for _ in range(2):
         wrapped.step(env.action_space.sample())
     check_stored_episodes(credit, [env])
@@ -217,7 +217,7 @@ def test_rewards_replaced_by_inner_wrapper(mode):
     vector = SyncVectorEnv([lambda env=env: EpisodicReward(env) for env in envs], autoreset_mode=mode)
     for *_, infos in play(VectorCredit(vector, make_assigner(envs[0])), 20):
         mask = infos[f"_{TRUE_REWARD}"]
-        rewards = {step[3] for env in envs for steps, _ in [*env.episodes, (env.going, 0)] for step in steps}
+        rewards = {step[3] for env in envs for steps, _ in [*env.episodes, (env.running, 0)] for step in steps}
         assert set(infos[TRUE_REWARD][mask].tolist()) <= rewards
 
 

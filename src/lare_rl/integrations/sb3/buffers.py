@@ -8,7 +8,6 @@ from jaxtyping import Float, Int
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from lare_rl.assigner import saving
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.errors import LareError
 from lare_rl.integrations.recorder import StepRecorder, check_capacity
@@ -98,10 +97,8 @@ class CreditReplayBuffer(ReplayBuffer):
         self.rewards = _ProxyRewards(credit, self.steps)  # pyright: ignore[reportAttributeAccessIssue]
 
     def __getstate__(self) -> dict[str, Any]:
-        with self.credit.lock:
-            credit = saving.get_state(self.credit.config, self.credit.learner, episodes=True)
         state = {name: value for name, value in vars(self).items() if name not in ("_recorder", "rewards")}
-        return state | {"credit": credit}
+        return state | {"credit": self.credit.get_state(episodes=True)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         credit = CreditAssigner.__new__(CreditAssigner)
