@@ -43,8 +43,15 @@ register_algorithm(
 '''
 
 PROGRAM = """
-import lare_rl
-settings = lare_rl.Settings(algorithm="quiet", method="dense", steps=150, quiet={"shift": 0.25}, evaluation_episodes=1)
+import sys
+import lare_rl.cli
+for arguments in (["algorithms"], ["train", "--help"]):
+    sys.argv[1:] = arguments
+    try:
+        lare_rl.cli.main()
+    except SystemExit:
+        pass
+settings = lare_rl.Settings(algorithm="quiet", method="dense", steps=100, quiet={"shift": 0.25}, evaluation_episodes=1)
 run = lare_rl.train("Reacher-v4", settings, out="run")
 print(run.config.settings.hyperparameters)
 print(lare_rl.open_run("run").config.settings == run.config.settings)
@@ -66,16 +73,10 @@ def test_register_algorithm_refuses_used_name():
 def test_plugin_algorithm(tmp_path, monkeypatch):
     (tmp_path / "quiet_td3.py").write_text(PLUGIN)
     monkeypatch.setenv("LARE_PLUGINS", "quiet_td3")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-
-    def run(*arguments):
-        return subprocess.run(
-            [sys.executable, *arguments], capture_output=True, text=True, check=True, cwd=tmp_path
-        ).stdout
-
-    assert "quiet" in run("-m", "lare_rl", "algorithms")
-    assert "--quiet.shift FLOAT" in run("-m", "lare_rl", "train", "--help")
-    *_, hyperparameters, is_equal = run("-c", PROGRAM).splitlines()
+    output = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, cwd=tmp_path)
+    *texts, hyperparameters, is_equal = output.stdout.splitlines()
+    assert any("quiet" in line and "a test" in line for line in texts)
+    assert any("--quiet.shift FLOAT" in line for line in texts)
     assert "shift=0.25" in hyperparameters
     assert "batch_size=8" in hyperparameters
     assert is_equal == "True"
