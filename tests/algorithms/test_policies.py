@@ -9,15 +9,8 @@ import pytest
 from lare_rl.algorithms.ppo.policies import StochasticPolicy
 from lare_rl.nn.networks import MLP
 
-log_probability, entropy, sample, mode = (
-    eqx.filter_jit(method)
-    for method in (
-        StochasticPolicy.log_probability,
-        StochasticPolicy.entropy,
-        StochasticPolicy.sample,
-        StochasticPolicy.mode,
-    )
-)
+METHODS = ("log_probability", "entropy", "sample", "mode")
+log_probability, entropy, sample, mode = (eqx.filter_jit(getattr(StochasticPolicy, name)) for name in METHODS)
 
 
 def test_gaussian_density():

@@ -2,45 +2,31 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
 from lare_rl.algorithms.registry import ALGORITHMS, register_algorithm
 from lare_rl.errors import LareError
 
-PLUGIN = '''
-"""TD3 with a deterministic exploration, in one file."""
+PLUGIN = """
+from dataclasses import replace
 
-from typing import Annotated
-
-from pydantic import Field
-
-from lare_rl.algorithms.off_policy import OffPolicySettings, run_defaults
-from lare_rl.algorithms.registry import Algorithm, Consumes, register_algorithm
+from lare_rl.algorithms.registry import ALGORITHMS, register_algorithm
 from lare_rl.algorithms.td3.td3 import TD3Settings, act, get_actor, init, update
 
 
 class QuietSettings(TD3Settings):
-    shift: Annotated[float, Field(ge=0)] = 0.5
+    shift: float = 0.5
 
 
 def explore(actor, observation, noise, settings):
     return act(actor, observation) * settings.shift
 
 
-register_algorithm(
-    Algorithm(
-        name="quiet",
-        consumes=Consumes.TRANSITIONS,
-        settings=QuietSettings(hidden=(8,), batch_size=8, warmup=50),
-        module=__name__,
-        run_defaults=run_defaults,
-        summary="a test",
-        source="-",
-        discrete=False,
-    )
-)
-'''
+settings = QuietSettings(hidden=(8,), batch_size=8, warmup=50)
+register_algorithm(replace(ALGORITHMS["td3"], name="quiet", settings=settings, module=__name__, summary="a test"))
+"""
 
 PROGRAM = """
 import sys
@@ -67,7 +53,7 @@ def test_greedy_samples_distributions_over_choices(discrete):
 def test_register_algorithm_refuses_used_name():
     register_algorithm(ALGORITHMS["td3"])
     with pytest.raises(LareError, match="'td3'"):
-        register_algorithm(ALGORITHMS["td3"].__class__(**{**vars(ALGORITHMS["sac"]), "name": "td3"}))
+        register_algorithm(replace(ALGORITHMS["sac"], name="td3"))
 
 
 def test_plugin_algorithm(tmp_path, monkeypatch):

@@ -54,11 +54,10 @@ def test_standardise_if_observed():
     np.testing.assert_array_equal(normalise.standardise_if_observed(statistics, rows), want)
 
 
-@pytest.mark.parametrize("constant", [0.0, 1e9, -1e-9])
-def test_constant_feature_becomes_zero(constant):
-    rows = jnp.full((50, 1), constant)
-    statistics = update_mean_std(observe(rows), rows)
-    assert float(jnp.abs(standardise(statistics, rows)).max()) == 0.0
+def test_constant_feature_becomes_zero():
+    for constant in (0.0, 1e9, -1e-9):
+        rows = jnp.full((50, 1), constant)
+        assert not standardise(update_mean_std(observe(rows), rows), rows).any()
 
 
 def test_root_mean_square():
