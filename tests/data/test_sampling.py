@@ -44,10 +44,10 @@ def pairs(index):
     return list(zip(np.ravel(index.env).tolist(), np.ravel(index.number).tolist(), strict=True))
 
 
-def assert_uniform(drawn, expected, deviations=6):
-    distinct, counts = np.unique(drawn, axis=0, return_counts=True)
+def assert_uniform(sampled, expected, deviations=6):
+    distinct, counts = np.unique(sampled, axis=0, return_counts=True)
     assert sorted(map(tuple, distinct.tolist())) == sorted(expected)
-    mean = len(drawn) / len(expected)
+    mean = len(sampled) / len(expected)
     np.testing.assert_allclose(counts, mean, atol=deviations * np.sqrt(mean))
 
 
@@ -75,12 +75,12 @@ def test_sample_episodes_is_uniform(buffer):
 def test_sample_distinct_episodes(buffer, count):
     sample = jax.jit(jax.vmap(lambda key: sampling.sample_distinct_episodes(buffer, key, count)))
     episodes = jax.tree.map(np.asarray, sample(jax.random.split(jax.random.key(0), 200)))
-    drawn = []
+    sampled = []
     for i, mask in enumerate(episodes.mask > 0):
         firsts = pairs(jax.tree.map(lambda leaf, i=i, mask=mask: leaf[i, mask], episodes.first))
         assert len(firsts) == len(set(firsts)) == min(count, len(FIRST))
-        drawn += firsts
-    assert_uniform(drawn, FIRST)
+        sampled += firsts
+    assert_uniform(sampled, FIRST)
 
 
 def test_samples_of_an_empty_replay_are_masked():
@@ -137,9 +137,9 @@ def test_sample_drawn_has_steps_of_its_episodes(buffer):
     assert 3 in lengths
     rows = pairs(sample.steps)
     for i, ((env, first), length) in enumerate(zip(pairs(sample.episodes.first), lengths, strict=True)):
-        drawn = rows[4 * i : 4 * i + 4]
-        assert set(drawn) <= {(env, first + t) for t in range(length)}
-        assert len(set(drawn)) == min(length, 4)
+        sampled = rows[4 * i : 4 * i + 4]
+        assert set(sampled) <= {(env, first + t) for t in range(length)}
+        assert len(set(sampled)) == min(length, 4)
         # An episode of three steps has three rows; its fourth row is padding.
         slots = sample.episode.reshape(42, 4)[i]
         assert slots.tolist() == [i % 6] * min(length, 4) + [6] * (4 - min(length, 4))
