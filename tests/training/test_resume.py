@@ -18,8 +18,7 @@ from helpers.listeners import AtStep, MessageListener, metrics_without_times
 from helpers.long_tests import long_case
 from helpers.toy_envs import pick_spec, toy_spec
 from helpers.training_runs import assert_equal_runs, resume_quietly, train_and_stop, train_quietly
-from lare_rl.config.replay_size import replay_rows
-from lare_rl.config.resolve import resolve
+from lare_rl.config.resolve import replay_rows, resolve
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function

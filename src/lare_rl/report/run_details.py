@@ -6,8 +6,8 @@ from html import escape
 
 import numpy as np
 
-from lare_rl.config.defaults import apply_defaults
 from lare_rl.config.effective import effective_settings
+from lare_rl.config.resolve import apply_defaults
 from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.families import load_env_spec

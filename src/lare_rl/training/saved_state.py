@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int
 
 from lare_rl.algorithms.registry import ALGORITHMS
-from lare_rl.config.replay_size import replay_rows
+from lare_rl.config.resolve import replay_rows
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError
