@@ -48,7 +48,7 @@ def stack_seeds(*seeds):
 
 def test_fit_until_converged_keeps_the_best_decoders():
     """The only factor is the true reward, so a decoder's error is the distance of its weight from 1."""
-    config = small_config("lare-linear", "ippo", ONE_TEAM, n_factors=(1,), n_envs=10)
+    config = small_config("lare-linear", "ippo", ONE_TEAM, n_factors=(1,), n_envs=10, credit=SUM_CREDIT)
     steps = random_steps(ONE_TEAM, 10, lengths=(12,))
     learner = add_steps(untrained_learner(config), config, steps, steps.next_timestep.reward[..., None])
     errors, rounds = [[3.0, 3.0], [1.0, 4.0], [2.0, 2.0], [5.0, 5.0], [0.0, 6.0]], []
@@ -81,7 +81,8 @@ def test_config_of_first_fit_reads_an_eighth_of_the_steps(steps, first):
 def test_resume_during_and_after_the_first_fit(small_many, tmp_path, monkeypatch):
     task, function = echo_spec(), verify_function(ECHO_PHI, echo_spec())
     changes = {"environments": 8, "rollout_steps": 10, "steps": 240, "evaluate_every": 80}
-    settings = small_many(method="lare-rd", seeds=1, first_fit="held-out", credit=QUICK_CREDIT, **changes)
+    changes |= {"algorithm": "ippo", "method": "lare-rd", "first_fit": "held-out"}
+    settings = small_many(seeds=1, credit=QUICK_CREDIT, **changes)
     expected = train_quietly(task, settings, tmp_path / "complete", function)
     collect = DeviceCollector.collect
 
