@@ -101,7 +101,7 @@ def test_packed_entry_is_refused(tmp_path):
     content = bytearray((directory / "state.npz").read_bytes())
     content[content.index(b"PK\x01\x02") + 10] ^= 64  # a bit that names another compression
     (directory / "state.npz").write_bytes(content)
-    with pytest.raises(LareError, match=r"\.replay\.next_row\.npy is packed"):
+    with pytest.raises(LareError, match=r"\.replay\.row\.npy is packed"):
         checkpoint.load(directory, template(1, 1, CAPACITY))
 
 
