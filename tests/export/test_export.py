@@ -149,7 +149,7 @@ def test_export_agrees_with_jax(kind, method, small, small_many, echo, tmp_path)
     steps = jax.tree.map(lambda leaf: np.concatenate(np.swapaxes(leaf, 0, 1)), steps)
     # Exported rewards are in the unit of the true rewards, before they are scaled.
     unscaled = replace(config, scale_rewards=False)
-    expected = np.asarray(rewards(stored, RewardState(seed_learner.credit, seed_learner.scale), unscaled))
+    expected = np.asarray(rewards(stored, RewardState(seed_learner.decoders, seed_learner.scale), unscaled))
     for team_index, name in enumerate(names):
         check_reward(exported, name, config, steps, np.asarray(stored.length, np.float32), expected, team_index)
 
@@ -258,7 +258,7 @@ def test_reward_without_lare(run, tmp_path, phi):
     config, learner, _, _ = load_learner(run)
     # Actions of the toy are in [-2, 2], and those of the trainer in [-1, 1].
     features = np.concatenate([phi(before, action), before, action / 2], axis=1)
-    expected = decomposition.proxy_rewards(select_seed(learner, 0).credit[0], jnp.asarray(features), config.credit)
+    expected = decomposition.proxy_rewards(select_seed(learner, 0).decoders[0], jnp.asarray(features), config.credit)
     np.testing.assert_allclose(json.loads(process.stdout), expected, rtol=1e-4, atol=1e-6)
     exported = import_exported(tmp_path / "out")
     np.testing.assert_allclose(exported.reward(before[0], action[0], after[0]), expected[0], rtol=1e-4)

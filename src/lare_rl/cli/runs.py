@@ -211,7 +211,7 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = False) ->
     """
     from lare_rl.report.report import write_report
     from lare_rl.runs.config_file import read_config
-    from lare_rl.runs.discover import find_run_directories
+    from lare_rl.runs.directory import find_run_directories
     from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module
 
     if film:

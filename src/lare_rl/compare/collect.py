@@ -6,8 +6,7 @@ from pathlib import Path
 from lare_rl.compare.labels import find_differences, find_origin_differences, label_runs
 from lare_rl.compare.results import Results, read_results_table, read_run_results
 from lare_rl.errors import LareError, did_you_mean
-from lare_rl.runs.directory import Run, open_without_functions
-from lare_rl.runs.discover import find_run_directories
+from lare_rl.runs.directory import Run, find_run_directories, open_without_functions
 from lare_rl.runs.metric_names import RETURN, SUMMED_RETURN
 from lare_rl.training.advice import describe_untrained
 from lare_rl.util.findings import Finding

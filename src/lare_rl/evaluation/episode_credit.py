@@ -74,10 +74,10 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
         return None
     steps, proxy_reward = jax.jit(partial(_read_rewards, config=config))(learner, index)
     uncertainty = None
-    if learner.credit and config.method.fit is Fit.EVIDENCE and config.credit_rows == 1:
+    if learner.decoders and config.method.fit is Fit.EVIDENCE and config.credit_rows == 1:
         with float64():
-            std = np.asarray(jax.jit(partial(_posterior_std, config=config))(learner.credit[0], steps))
-        uncertainty = 2 * std / np.where(learner.credit[0].is_mean, steps.length, 1)
+            std = np.asarray(jax.jit(partial(_posterior_std, config=config))(learner.decoders[0], steps))
+        uncertainty = 2 * std / np.where(learner.decoders[0].is_mean, steps.length, 1)
     reward = np.asarray(steps.columns["reward"])
     return EpisodeCredit(
         reward=reward,
@@ -105,7 +105,7 @@ def _read_rewards(
 ) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
     """Read steps of one seed's replay, and compute their proxy rewards."""
     steps = replay.read(learner.replay, index)
-    return steps, rewards(steps, RewardState(learner.credit, learner.scale), config)
+    return steps, rewards(steps, RewardState(learner.decoders, learner.scale), config)
 
 
 def _posterior_std(decoder: Decomposition, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:

@@ -126,6 +126,6 @@ def compute_proxy_rewards(
     def compute(steps: Trajectory, factors: Array) -> Array:
         filled = store_with_factors(learner._replace(replay=buffer), steps, factors, config).replay
         stored = replay.read(filled, replay.newest_steps(filled, n_steps))
-        return jnp.swapaxes(rewards(stored, RewardState(learner.credit, learner.scale), config), 0, 1)
+        return jnp.swapaxes(rewards(stored, RewardState(learner.decoders, learner.scale), config), 0, 1)
 
     return np.asarray(compute(jax.tree.map(jnp.asarray, steps), jnp.asarray(factors)))

@@ -79,7 +79,7 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
     actor = jax.tree.map(lambda leaf: leaf[seed_index], actors)
     first_choice = _first_choice(run) if config.env.discrete and config.env.n_agents == 1 else 0
     graphs = {"policy": policy_graph(actor, config, first_choice)}
-    credit = select_seed(learner.credit, seed_index)
+    credit = select_seed(learner.decoders, seed_index)
     no_reward_reason = missing_reward_reason(config, credit[0].decoder if credit else None)
     function_files: dict[str, str] = {}
     for team_index, role in enumerate(run.config.task.roles if no_reward_reason is None else ()):

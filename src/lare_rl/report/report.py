@@ -12,8 +12,7 @@ from lare_rl.report.html import render_note, write_page
 from lare_rl.report.overview import render_diagnoses, render_final_values, render_learning_curves
 from lare_rl.report.reported_run import ReportedRun
 from lare_rl.report.run_details import FILM, render_run
-from lare_rl.runs.directory import Run, open_run, open_without_functions
-from lare_rl.runs.discover import find_run_directories
+from lare_rl.runs.directory import Run, find_run_directories, open_run, open_without_functions
 from lare_rl.tasks.trust import untrusted_module
 from lare_rl.util.provenance import code_version
 

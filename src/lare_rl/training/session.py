@@ -1,6 +1,7 @@
 """A running training: the training state, its environments, and the functions that advance it by one iteration."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,13 +25,11 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training import advice, first_fit
 from lare_rl.training.collect_device import DeviceCollector
 from lare_rl.training.collect_host import HostCollector, make_host_collector
-from lare_rl.training.compile_ahead import compile_ahead, init_learner
 from lare_rl.training.compile_cache import cache_by_value
-from lare_rl.training.compiled import CompiledFunctions, compile_functions
+from lare_rl.training.compiled import CompiledFunctions, compile_ahead, compile_functions, init_seeds
 from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.saved_state import actor_shape, load_learner, make_train_config
-from lare_rl.training.seed_axis import metrics_lines
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
 
@@ -70,9 +69,6 @@ class Session:
     def advance(self, stop_requested: Callable[[], bool] = lambda: False) -> None:
         """Make one iteration: collect steps, compute factors, store them, sometimes fit the decoder, update the algorithm.
 
-        Args:
-            stop_requested: whether the user has asked the run to stop.
-
         Raises:
             FirstFitStoppedError: the user has asked the run to stop, during the decoder's first fit. The session cannot
                 continue.
@@ -82,7 +78,7 @@ class Session:
         if self.run.functions and not np.all(is_finite):
             compute_host_factors(self.run, self.config, steps)  # raises an error that names the factor
             raise LareError("a factor is not finite in the compiled function; the last checkpoint is whole")
-        if self.learner.credit and np.any(steps.ended):
+        if self.learner.decoders and np.any(steps.ended):
             self.learner = self.functions.learn_returns(self.learner)
         if self.step >= self.config.warmup:
             self._update(steps, stop_requested)
@@ -113,10 +109,7 @@ class Session:
         self.latest_metrics |= metrics
 
     def evaluate(self, rate: float) -> list[dict[str, Any]]:
-        """Evaluate, always from the same initial states, and keep the best policies.
-
-        Args:
-            rate: steps per second.
+        """Evaluate, always from the same initial states, and keep the best policies. `rate` is in steps per second.
 
         Returns:
             One line of metrics.jsonl for each seed.
@@ -127,7 +120,7 @@ class Session:
         metrics = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest_metrics
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics |= {ACTOR_SATURATION: advice.saturation(self.greedy_actions(advice.N_PROBE_STATES))}
-        return metrics_lines(self.run.seeds, self.step, metrics, rate)
+        return _metrics_lines(self.run.seeds, self.step, metrics, rate)
 
     def greedy_actions(self, n_states: int) -> Float[np.ndarray, "seeds states action"]:
         """Return an off-policy algorithm's actions without noise in the newest states of the first environment.
@@ -180,7 +173,7 @@ def start_session(run: Run) -> Session:
     """Return a session before its first step."""
     config = make_train_config(run)
     functions = compile_ahead(config, run.graphs, len(run.seeds))
-    learner = init_learner(functions, seed_keys(jnp.asarray(run.seeds), 0))
+    learner = init_seeds(functions, seed_keys(jnp.asarray(run.seeds), 0))
     return Session(run, config, functions, learner, _make_collector(run, config, functions))
 
 
@@ -231,3 +224,14 @@ _abandon_episodes = jax.jit(jax.vmap(abandon_episodes))
 def _select_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     """Return the arrays whose names begin with a prefix, by the rest of their names."""
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
+def _metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], rate: float) -> list[dict[str, Any]]:
+    """Return one line of metrics.jsonl for each seed, from arrays with one number for each seed."""
+    lines = []
+    for seed_index, seed in enumerate(seeds):
+        numbers = {name: float(np.asarray(values)[seed_index]) for name, values in metrics.items()}
+        # JSON has no NaN: a correlation with a value that never varies is null.
+        valid = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+        lines.append({"step": step, "seed": seed, **valid, "time/steps_per_second": round(rate, 1)})
+    return lines
