@@ -26,7 +26,7 @@ MODULES = {
         "pettingzoo",
         f"lare_rl.envs.particles.parallel_env needs an extra: {install_command('particles')}",
     ),
-    "lare_rl.logs.parquet": ("pyarrow", f"a Parquet file needs an extra: {install_command('parquet')}"),
+    "lare_rl.logs.tables": ("pyarrow", f"a Parquet file needs an extra: {install_command('parquet')}"),
     "lare_rl.logs.huggingface": ("datasets", f"a Hugging Face data set needs an extra: {install_command('datasets')}"),
     "lare_rl.logs.minari": ("minari", f"a Minari data set needs an extra: {install_command('minari')}"),
 }

@@ -25,7 +25,6 @@ from helpers.training_runs import (
     train_and_stop,
     train_quietly,
 )
-from lare_rl.config.resolve import replay_rows, resolve
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
