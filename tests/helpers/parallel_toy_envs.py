@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete
-from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo import ParallelEnv
 
 
 class Toy(ParallelEnv):
@@ -69,15 +69,6 @@ class Toy(ParallelEnv):
 
     def close(self):
         pass
-
-
-class Turns(AECEnv):
-    """Agents take turns."""
-
-    possible_agents = ("a_0",)
-
-    def agent_iter(self):
-        return iter(())
 
 
 def leaves():
