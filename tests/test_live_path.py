@@ -143,7 +143,7 @@ def test_failed_design_is_one_line(serve, design_live, tmp_path):
     assert "'Reacher-v4'" in line
     assert "E-NUMPY line 1" in line
     assert line.endswith(" (and 1 more)")
-    assert err.splitlines()[-1] == "every attempt is kept in talk.json"
+    assert "every attempt is kept in talk.json" in err
     assert saved_stages(tmp_path / "talk.json") == ["candidate", *["correct"] * 4]
 
 
