@@ -14,7 +14,6 @@ BANNED = set(
 GENITIVE = re.compile(r"^_?of_\w+$")
 EXCEPTIONS: dict[str, int] = {
     "src/lare_rl/assigner/layout.py": 7,
-    "src/lare_rl/compare/labels.py": 1,
     "src/lare_rl/integrations/torchrl.py": 1,
     "src/lare_rl/logs/draft_from_log.py": 1,
     "src/lare_rl/phi/expressions.py": 1,
@@ -24,7 +23,6 @@ EXCEPTIONS: dict[str, int] = {
     "tests/assigner/test_assigner.py": 9,
     "tests/assigner/test_layout.py": 1,
     "tests/benchmarks/paper/test_exhibits.py": 2,
-    "tests/compare/test_results.py": 1,
     "tests/conftest.py": 2,
     "tests/envs/test_episodic.py": 4,
     "tests/envs/test_gymnasium_env.py": 3,
