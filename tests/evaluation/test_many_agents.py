@@ -15,7 +15,9 @@ from lare_rl.evaluation.cross_play import combine_policies, cross_play
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.evaluation.rollout import N_SAMPLE_EPISODES, roll_out, sample_steps
 from lare_rl.evaluation.video import record_video, render_rollout
+from lare_rl.report.overview import render_learning_curves
 from lare_rl.report.run_details import render_agents
+from lare_rl.report.run_summary import ReportedRun
 from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.compiled import training_module
 from lare_rl.training.saved_state import load_learner
@@ -25,11 +27,11 @@ N_EPISODES = 8
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory, small_many):
-    """Two runs with two teams."""
+    """Two runs with two teams. They run the same compiled programs."""
     directory = tmp_path_factory.mktemp("runs")
     return [
-        lare_rl.train("CompetitivePP-6", small_many(method=method, seed=seed), out=directory / method, listeners=[])
-        for seed, method in enumerate(("lare-rd", "dense"))
+        lare_rl.train("CompetitivePP-6", small_many(seed=seed), out=directory / str(seed), listeners=[])
+        for seed in (0, 2)
     ]
 
 
@@ -40,9 +42,16 @@ def test_rollout(runs):
     assert rollout.proxy_reward.std() > 0
     assert rollout.select_episode(rollout.reward).shape == (25, 8)
     assert [frame.shape for frame in render_rollout(runs[0], rollout)] == [(400, 400, 3)] * 25
-    without_proxy = roll_out(runs[1])
-    assert without_proxy.proxy_reward is None
-    np.testing.assert_array_equal(without_proxy.credit, without_proxy.reward)
+
+
+@pytest.mark.long
+def test_rollout_without_proxy_rewards(small_many, tmp_path):
+    run = lare_rl.train("TriangleArea", small_many(method="dense"), out=tmp_path / "run", listeners=[])
+    rollout = roll_out(run)
+    assert rollout.proxy_reward is None
+    np.testing.assert_array_equal(rollout.credit, rollout.reward)
+    page = lare_rl.write_report(run, tmp_path / "report.html").read_text()
+    assert "proxy" not in page.split("Who got which credit when")[1].split("Settings")[0]
 
 
 def test_sample_steps(runs):
@@ -107,16 +116,19 @@ def test_single_agent_functions_refuse_many_agents(runs, tmp_path):
         load_policy(runs[0])
 
 
-def test_report(runs, tmp_path):
-    page = lare_rl.write_report(runs[1].directory, tmp_path / "report.html").read_text()
+def test_report(runs):
     details = "\n".join(render_agents(runs[0], max_tsne_points=50))
-    for text, headings in (
-        (page, ("True return, team of prey", "Who got which credit when", ">true reward<")),
-        (details, ("The factors of CompetitivePP-6-predator", "The latent function of CompetitivePP-6-prey")),
+    for text in (
+        "Who got which credit when",
+        "The factors of CompetitivePP-6-predator",
+        "The latent function of CompetitivePP-6-prey",
+        ">true reward<",
+        ">proxy reward<",
     ):
-        assert text.count("data:image/gif;base64,") == 1
-        assert ">nan<" not in text
-        assert all(heading in text for heading in headings)
-    assert "proxy" not in page.split("Who got which credit when")[1].split("Settings")[0]
-    assert "proxy reward" in details
+        assert text in details
+    assert details.count("data:image/gif;base64,") == 1
     assert details.count("t-SNE of steps of agents") == 2
+    assert ">nan<" not in details
+    curves = "\n".join(render_learning_curves(runs[0].config.task, [ReportedRun("a", runs[0])], np.zeros(0)))
+    assert "True return, team of prey" in curves
+    assert "Correlation of proxy and true reward, team of predator" in curves

@@ -30,7 +30,7 @@ gymnasium.register("toys/EpisodicChase-v0", entry_point=episodic_chase, max_epis
 @pytest.fixture(scope="module")
 def runs(small, phi, tmp_path_factory):
     """Two small runs of a toy, one with rewards at each step, and one with a reward at the last step."""
-    directory, settings = tmp_path_factory.mktemp("runs"), small(method="lare-bayes", steps=120)
+    directory, settings = tmp_path_factory.mktemp("runs"), small(method="lare-bayes", steps=240)
     return [
         lare_rl.train(toy_spec(environment=name), settings, function=phi, out=directory / name[5:-3], listeners=[])
         for name in ("toys/Chase-v0", "toys/EpisodicChase-v0")
@@ -112,7 +112,7 @@ def test_live_page(make_run, monkeypatch):
     assert opened == [path.resolve().as_uri()]
     assert "Step 0 of 100" in path.read_text()
     shutil.copy(trained.directory / "metrics.jsonl", run.directory)
-    page.on_evaluation({})
+    page.on_evaluation([])
     for text in ('<meta http-equiv="refresh" content="10">', "Step 100 of 100", "<svg", 'class="verdict"'):
         assert text in path.read_text()
     page.on_stop()
