@@ -61,8 +61,7 @@ def label_factors(run: Run, team_index: int = 0) -> list[FactorLabel]:
     function = run.functions[team_index]
     names = function.factor_columns(run.factor_inputs)
     n_observations = len(names) // function.size
-    labels = zip(names, function.meanings * n_observations, function.reads * n_observations, strict=True)
-    return [FactorLabel(name=name, meaning=meaning, reads=reads) for name, meaning, reads in labels]
+    return list(map(FactorLabel, names, function.meanings * n_observations, function.reads * n_observations))
 
 
 def load_episode_credit(run: Run) -> EpisodeCredit | None:
