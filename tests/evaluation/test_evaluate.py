@@ -88,7 +88,7 @@ def test_record_video(run, tmp_path):
     with Image.open(tmp_path / "film.gif") as film:
         assert (film.n_frames, film.info["duration"]) == (10, 40)
     assert not FilmedChase.open_envs
-    with pytest.raises(LareError, match="toys/Chase-v0.* cannot be made"):
+    with pytest.raises(LareError, match=r"toys/Chase-v0.* cannot be made"):
         record_video(replace_task(run, toy_spec()), tmp_path / "film.gif")
 
 

@@ -159,7 +159,7 @@ def evaluate(
         record_video(opened, video, best, deterministic)
         print_line(f"wrote {video}")
     evaluation = evaluate_policy(opened, episodes, best, deterministic)
-    best_steps = load_actor(opened, best=True)[2] if best else None
+    best_steps = load_actor(opened, best=True)[2].tolist() if best else None
     random_episodes = play_random(task, max(episodes, RANDOM_EPISODES)) if len(task.roles) == 1 else []
     for line in _describe_evaluation(opened, evaluation, random_episodes, best_steps):
         print_line(line)
@@ -189,7 +189,7 @@ def _describe_evaluation(
             line = f"{role.name}, " if len(roles) > 1 else ""
             line += f"seed {seed}: return {format_mean_std(returns)} over {format_value(len(returns), 'count episode')}"
             if best_steps is not None:
-                step = int(best_steps[seed_index])
+                step = best_steps[seed_index]
                 untrained = ", before its first update" if step <= run.config.settings.warmup else ""
                 line += f" (the policy of step {step:,}{untrained})"
             if has_many_agents:

@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float
 from lare_rl.envs.spaces import check_spaces, finite_array, flatten_value
 from lare_rl.errors import LareError, short_repr
 
+__all__ = ["Agent", "AgentArrays", "make_agent"]
+
 MASK = "action_mask"
 """PettingZoo's key for the mask of available actions, in the observation's dictionary or in `info`."""
 

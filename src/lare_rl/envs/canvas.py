@@ -8,6 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+__all__ = ["blank_figure", "paint_frames", "to_pixels"]
+
 
 def blank_figure() -> tuple[Figure, Axes]:
     """Make an empty picture of 400 by 400 pixels."""

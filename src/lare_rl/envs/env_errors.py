@@ -10,6 +10,8 @@ import numpy as np
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["EnvOutputError", "as_lare_error", "no_time_limit_error", "one_line_errors", "read_measure", "to_float"]
+
 
 class EnvOutputError(LareError):
     """An environment returned a value that cannot be used for training."""

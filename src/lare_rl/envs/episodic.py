@@ -9,6 +9,8 @@ from gymnasium.utils import RecordConstructorArgs
 
 from lare_rl.errors import LareError, short_repr
 
+__all__ = ["TRUE_REWARD", "EpisodicReward", "read_score"]
+
 TRUE_REWARD = "true_reward"
 """The key of `info` for the true reward of the step."""
 

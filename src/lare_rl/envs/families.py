@@ -13,6 +13,17 @@ from lare_rl.errors import LareError
 from lare_rl.tasks.spec import NO_ENVIRONMENT, SHARED_KEYS, TaskSpec
 from lare_rl.util.plugins import Registry
 
+__all__ = [
+    "FAMILIES",
+    "Family",
+    "check_logs",
+    "find_score",
+    "load_env_spec",
+    "make_env",
+    "make_host_env",
+    "register_family",
+]
+
 Maker = Callable[..., JaxEnv | HostEnv]
 
 OPTIONAL_KEYS = ("max_episode_steps", "arguments", "agents")

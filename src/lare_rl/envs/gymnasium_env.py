@@ -15,6 +15,8 @@ from lare_rl.envs.spaces import OneHot, check_spaces, finite_array, flatten_spac
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["GymnasiumEnv", "make_gymnasium"]
+
 mujoco_rewards.register()
 
 

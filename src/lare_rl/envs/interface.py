@@ -10,6 +10,8 @@ from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
+__all__ = ["AnyArray", "EnvSpec", "HostEnv", "JaxEnv", "Team", "Timestep", "alive_mean", "team_mean", "to_env_action"]
+
 AnyArray = Any
 """A JAX array in compiled code, a NumPy array on the host. The type is `Any`, so that this module need not import JAX."""
 
@@ -134,12 +136,15 @@ class JaxEnv(Protocol[State]):
 
     def reset(self, key: Any) -> tuple[State, Timestep]:
         """Start an episode."""
+        ...
 
     def step(self, state: State, action: Float[AnyArray, "agents action"], key: Any) -> tuple[State, Timestep]:
         """Make one step. Continuous actions are in the environment's units, discrete actions are one-hot."""
+        ...
 
     def frames(self, states: State, credit: Float[np.ndarray, "steps agents"] | None = None) -> list[np.ndarray]:
         """Return an episode's states (leading axis: steps) as pictures (height, width, 3), with each agent's credit."""
+        ...
 
 
 @runtime_checkable
@@ -150,12 +155,15 @@ class HostEnv(Protocol):
 
     def reset(self, seed: int) -> Timestep:
         """Start an episode. The same seed gives the same episode."""
+        ...
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
         """Make one step. Continuous actions are in the environment's units, discrete actions are one-hot."""
+        ...
 
     def render(self) -> Any:
         """Return a picture of the environment (height, width, 3)."""
+        ...
 
     def close(self) -> None:
         """Release the resources of the environment."""

@@ -9,6 +9,8 @@ from jaxtyping import Float
 from lare_rl.envs.interface import JaxEnv, Timestep
 from lare_rl.errors import LareError
 
+__all__ = ["JaxOnHost"]
+
 
 class JaxOnHost:
     """A `JaxEnv` as a `HostEnv`."""

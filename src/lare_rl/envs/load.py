@@ -9,6 +9,8 @@ from lare_rl.errors import LareError, did_you_mean, short_repr
 from lare_rl.tasks.spec import NO_ENVIRONMENT, SHARED_KEYS, TaskSpec
 from lare_rl.util.safe_io import MAX_SETTINGS_BYTES, read_text, read_toml
 
+__all__ = ["check_environment", "load_task", "read_task", "resolve_task", "shipped_tasks"]
+
 SHIPPED = files("lare_rl.tasks") / "specs"
 
 

@@ -22,6 +22,8 @@ import numpy as np
 from gymnasium.envs.registration import WrapperSpec
 from gymnasium.utils import RecordConstructorArgs
 
+__all__ = ["HIDDEN_REWARDS", "TARGET_SPEEDS", "HiddenReward", "SparseDistanceReward", "register"]
+
 FOOT_ANGLE, VELOCITY = 7, 8
 """The indices of both entries in the observation."""
 TARGET_SPEEDS = {"HalfCheetah": 2.0, "Walker2d": 1.0}

@@ -14,6 +14,8 @@ from lare_rl.envs.interface import Team
 from lare_rl.errors import LareError, did_you_mean, install_command, short_repr
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
+__all__ = ["agent_kind", "find_time_limit", "group_by_team", "make_parallel_env"]
+
 REQUIRED = ("possible_agents", "observation_space", "action_space", "reset", "step")
 """The attributes of a ParallelEnv."""
 

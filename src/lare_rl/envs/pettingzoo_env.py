@@ -20,6 +20,8 @@ from lare_rl.envs.spaces import finite_array
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["ParallelHost", "make"]
+
 
 def make(task: TaskSpec, render_mode: str | None = None) -> "ParallelHost":
     """Make the task's environment. Raises `LareError` if it cannot be made, or does not match the task."""

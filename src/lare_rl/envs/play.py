@@ -12,6 +12,17 @@ from lare_rl.envs.families import make_host_env
 from lare_rl.envs.interface import EnvSpec, HostEnv, Team, Timestep, team_mean, to_env_action
 from lare_rl.tasks.spec import CreditScope, TaskSpec
 
+__all__ = [
+    "Episode",
+    "Policy",
+    "find_team",
+    "phi_inputs",
+    "play_episode",
+    "play_episodes",
+    "play_steps",
+    "sample_action",
+]
+
 Policy = Callable[[np.ndarray], np.ndarray]
 """A function from the observation of a single agent to its action, in the environment's units."""
 

@@ -12,6 +12,8 @@ from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
 
+__all__ = ["OneHot", "OneHotAction", "check_spaces", "finite_array", "flatten_spaces", "flatten_value"]
+
 
 class OneHot(Box):
     """One of n discrete actions, encoded one-hot. Any other vector stands for the action of its largest entry."""

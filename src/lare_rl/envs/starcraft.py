@@ -20,6 +20,8 @@ from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["StarCraft", "make"]
+
 PACKAGES = {"smacv2.env": "smacv2.env", "smac.env.starcraft2": "smac.env"}
 """For each package, a module that no other package has, and the module that contains the game."""
 DIFFICULTY = "7"

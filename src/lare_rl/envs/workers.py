@@ -29,6 +29,8 @@ from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
 from lare_rl.errors import LareError
 
+__all__ = ["LocalVecEnv", "SubprocVecEnv", "VecEnv"]
+
 Maker = Callable[[], HostEnv]
 
 PROGRAM = "import sys; from lare_rl.envs.workers import _serve; _serve(int(sys.argv[1]))"

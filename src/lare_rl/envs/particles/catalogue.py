@@ -5,6 +5,8 @@ from lare_rl.envs.particles.task import ParticleTask
 from lare_rl.envs.particles.triangle_area import triangle_area
 from lare_rl.errors import LareError, did_you_mean
 
+__all__ = ["TASKS", "find_particle_task"]
+
 TASKS: dict[str, ParticleTask] = {
     task.name: task
     for task in (

@@ -10,6 +10,8 @@ from matplotlib.patches import Circle, Rectangle
 from lare_rl.envs.canvas import blank_figure, paint_frames
 from lare_rl.envs.particles.task import ParticleTask
 
+__all__ = ["draw_frames", "draw_state"]
+
 TEAM_COLOUR, OTHER_COLOUR, LANDMARK_COLOUR = "#0072b2", "#d55e00", "#9a9a9a"
 """The colours of the first team, of other moving entities, and of entities that do not move."""
 CREDIT_COLOURS = colormaps["RdBu"]

@@ -18,6 +18,8 @@ from lare_rl.envs.particles import views
 from lare_rl.envs.particles.task import ParticleTask, Team
 from lare_rl.envs.particles.world import State, World, at_rest
 
+__all__ = ["SIZES", "Size", "make_layouts", "navigation"]
+
 AGENT, LANDMARK = 0.15, 0.05
 """The radii of both."""
 SENSITIVITY = 5.0

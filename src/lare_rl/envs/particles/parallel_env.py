@@ -22,6 +22,8 @@ try:
 except ImportError:
     raise missing_extra_error("lare_rl.envs.particles.parallel_env", "particles") from None
 
+__all__ = ["ParticleEnv"]
+
 
 @partial(jax.jit, static_argnums=0)
 def _start(task: ParticleTask, key: PRNGKeyArray) -> tuple[State, Float[Array, "agents observation"]]:

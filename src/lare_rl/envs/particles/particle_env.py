@@ -12,6 +12,8 @@ from lare_rl.envs.particles.task import MAX_STEPS, N_ACTIONS
 from lare_rl.envs.particles.world import State
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["ParticleJaxEnv", "ParticleState", "make"]
+
 
 def make(task: TaskSpec, **_: Any) -> "ParticleJaxEnv":
     """Make the environment of a task with the name `particles/NAME`."""

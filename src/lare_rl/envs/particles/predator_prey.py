@@ -21,6 +21,23 @@ from lare_rl.envs.particles.prey import Layers, sample_actions, shipped_prey
 from lare_rl.envs.particles.task import ParticleTask, Team
 from lare_rl.envs.particles.world import State, World, at_rest
 
+__all__ = [
+    "SIZES",
+    "Size",
+    "View",
+    "chase",
+    "competitive",
+    "flee",
+    "make_world",
+    "observe_predators",
+    "observe_preys",
+    "predator_prey",
+    "reset",
+    "reward_predators",
+    "reward_preys",
+    "touches",
+]
+
 PREDATOR_SENSITIVITY, PREY_SENSITIVITY = 3.0, 4.0
 PREDATOR_SPEED, PREY_SPEED = 1.0, 1.3
 CATCH = 10.0

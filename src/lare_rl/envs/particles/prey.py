@@ -10,6 +10,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+__all__ = ["Layers", "logits", "sample_actions", "shipped_prey"]
+
 Layers = tuple[tuple[Float[np.ndarray | Array, "_in _out"], Float[np.ndarray | Array, " _out"]], ...]
 """Weight and bias of each layer."""
 

@@ -9,6 +9,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from lare_rl.envs.interface import Team
 from lare_rl.envs.particles.world import State, World, move, push
 
+__all__ = ["MAX_STEPS", "N_ACTIONS", "ParticleTask"]
+
 MAX_STEPS = 25
 """The length of every episode. No episode ends earlier."""
 N_ACTIONS = 5

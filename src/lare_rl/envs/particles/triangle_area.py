@@ -15,6 +15,8 @@ from lare_rl.envs.particles import views
 from lare_rl.envs.particles.task import ParticleTask, Team
 from lare_rl.envs.particles.world import State, World, at_rest
 
+__all__ = ["triangle_area"]
+
 AGENTS, OBSTACLES = range(3), range(3, 6)
 AGENT, OBSTACLE = 0.15, 0.4
 """The radii of both."""

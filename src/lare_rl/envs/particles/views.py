@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+__all__ = ["concatenate_rows", "distances", "nearest_entities", "relative_positions", "slice_rows"]
+
 
 def distances(
     position: Float[Array, "entities 2"], observers: range, targets: range

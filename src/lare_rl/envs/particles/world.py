@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+__all__ = ["State", "World", "at_rest", "contact_force", "move", "push"]
+
 TIME_STEP = 0.1
 DAMPING = 0.25
 """The share of its velocity that each entity loses in a step."""

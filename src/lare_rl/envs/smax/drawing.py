@@ -14,6 +14,8 @@ from lare_rl.envs.canvas import blank_figure, paint_frames
 from lare_rl.envs.smax.battle import FIELD, Battle, attack_target
 from lare_rl.envs.smax.scenarios import Scenario
 
+__all__ = ["draw_frames", "draw_state", "find_hits"]
+
 ALLY_COLOUR, ENEMY_COLOUR, DEAD_COLOUR = "#0072b2", "#d55e00", "#bbbbbb"
 
 

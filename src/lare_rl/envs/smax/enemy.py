@@ -15,6 +15,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from lare_rl.envs.smax.battle import ATTACK, DIRECTIONS, FIELD, STOP, Battle, alive
 from lare_rl.envs.smax.scenarios import Scenario
 
+__all__ = ["Memory", "choose_actions", "init_memory"]
+
 
 class Memory(NamedTuple):
     """The memory of each enemy unit."""

@@ -7,6 +7,8 @@ from jaxtyping import Array, Float
 from lare_rl.envs.smax.battle import ATTACK, FIELD, Battle, alive, move_direction
 from lare_rl.envs.smax.scenarios import Scenario
 
+__all__ = ["global_state", "observation_size", "observe", "state_size"]
+
 
 def observation_size(scenario: Scenario) -> int:
     return (scenario.n_units - 1) * (7 + scenario.n_unit_types) + 4 + scenario.n_unit_types

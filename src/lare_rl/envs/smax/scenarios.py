@@ -15,6 +15,8 @@ from jaxtyping import Float, Int
 from lare_rl.envs.smax import SCENARIO_NAMES
 from lare_rl.errors import LareError, did_you_mean
 
+__all__ = ["SCENARIOS", "UNIT_TYPES", "Scenario", "UnitType", "find_scenario"]
+
 
 class UnitType(NamedTuple):
     """The stats of all units of a type. Lengths are in units of the field, times in seconds."""

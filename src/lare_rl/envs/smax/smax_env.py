@@ -20,6 +20,8 @@ from lare_rl.envs.smax.observation import global_state, observation_size, observ
 from lare_rl.envs.smax.scenarios import Scenario, find_scenario
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["SMAX", "WIN_RETURN", "SmaxState", "make", "reward"]
+
 WIN_RETURN = 20.0
 """The return of an episode that is won."""
 
