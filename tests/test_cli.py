@@ -198,6 +198,7 @@ def test_verify(command, phi, spec_file):
     ]
 
 
+@pytest.mark.long
 def test_verify_with_returns(command, phi, spec_file):
     status, out, err = command("verify", phi, "--task", spec_file(), "--fit", "30")
     assert (status, err) == (0, "playing 30 episodes by random actions\n")

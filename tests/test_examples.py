@@ -12,6 +12,7 @@ from helpers.toy_logs import logged_episodes
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*HalfCheetah-v4 is out of date")
 def test_own_loop():
     assert runpy.run_path(str(EXAMPLES / "own_loop.py"))["main"](episodes=10) > 0.5

@@ -68,6 +68,7 @@ def saved_stages(path) -> list[str]:
     return [exchange.stage for exchange in read_recording(path.read_text(), path.name).exchanges]
 
 
+@pytest.mark.long
 def test_live_model_to_trained_policy(serve, command, design_live, tmp_path):
     server = serve(recorded_answers)
     status, out, err = design_live(server, "--record", "talk.json", "--price", 1, 2, "--out", "phi.py")

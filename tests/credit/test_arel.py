@@ -28,6 +28,7 @@ def test_block_against_numpy():
     np.testing.assert_allclose(block(jnp.asarray(x), causal_mask(STEPS)), want, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.long
 def test_loss_is_the_published_one_in_other_units():
     """(R - sum_t y_t)^2 + 20 Var_t(y), as published, divided by T^2 and by the square of the scale."""
     settings, method = CreditSettings(), METHODS["arel"]

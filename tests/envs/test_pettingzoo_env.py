@@ -9,6 +9,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers.long_tests import long_case
 from helpers.parallel_toy_envs import Toy
 from helpers.toy_envs import toy_spec
 from lare_rl.envs.env_errors import EnvOutputError
@@ -79,7 +80,7 @@ def check_episode(host: ParallelHost, timesteps) -> None:
         (SPREAD, {"N": 5, "max_cycles": 7, "continuous_actions": True}, (30, 5, 150, 7), 2),
         (ADVERSARY, {}, (10 + 3, 5, 28, 25), 2),
         (WALKERS, {}, (31, 4, 75, 500), 2),
-        (KNIGHTS, {"max_zombies": 20}, (185, 6, 144, 900), 2),
+        long_case(KNIGHTS, {"max_zombies": 20}, (185, 6, 144, 900), 2),
     ],
 )
 def test_real_environments(environment, arguments, sizes, n_episodes, monkeypatch):

@@ -165,6 +165,7 @@ def test_policy_checks_observations(run, observation, words):
         load_policy(run)(observation)
 
 
+@pytest.mark.long
 def test_policy_with_discrete_actions(small, tmp_path):
     spec = toy_spec(environment="toys/Pick-v0", observation_size=4, action_size=4)
     settings = small(method="dense", algorithm="ppo", steps=60)

@@ -22,6 +22,8 @@ from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.compiled import training_module
 from lare_rl.training.saved_state import load_learner
 
+pytestmark = pytest.mark.long
+
 N_EPISODES = 8
 
 

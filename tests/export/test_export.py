@@ -36,7 +36,7 @@ from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 
 CASES = [
-    ("td3", "lare-bayes"),
+    long_case("td3", "lare-bayes"),
     long_case("ddpg", "rrdu"),
     long_case("sac", "vib-rrdu"),
     long_case("td3", "lare-signs"),

@@ -116,7 +116,7 @@ def test_buffer_steps(kind, env_class, n_envs, options):
     [
         (PPO, Pick, "MlpPolicy"),
         (PPO, DictChase, "MultiInputPolicy"),
-        (sb3_contrib.RecurrentPPO, Chase, "MlpLstmPolicy"),
+        long_case(sb3_contrib.RecurrentPPO, Chase, "MlpLstmPolicy"),
         (sb3_contrib.MaskablePPO, MaskedPick, "MlpPolicy"),
     ],
 )
@@ -168,7 +168,7 @@ def test_units_and_newest_decoder():
     np.testing.assert_array_equal(sample, buffer.rewards[np.random.randint(0, 120, 8), 0])
 
 
-@pytest.mark.parametrize("algorithm", ["td3", "ppo"])
+@pytest.mark.parametrize("algorithm", ["td3", long_case("ppo")])
 def test_policy_depends_on_returns_only(algorithm):
     """Not on when rewards are paid."""
     weights = []
@@ -249,6 +249,7 @@ def learn_again(model, credit, n_steps, resets, **options):
     return n_dropped
 
 
+@pytest.mark.long
 def test_second_learn_drops_running_episodes():
     """Unless it continues the first one (`reset_num_timesteps=False`)."""
     credit = make_assigner()
@@ -264,6 +265,7 @@ def test_second_learn_drops_running_episodes():
     assert np.abs(model.rollout_buffer.rewards).max() > 0
 
 
+@pytest.mark.long
 def test_learns_from_returns(phi):
     """Returns of three seeds: -0.12 to -0.19 with r_hat, -0.13 to -0.19 with true rewards, -19 to -54 without; random -33."""
     env = EpisodicReward(TimeLimit(Chase(), EPISODE_STEPS))

@@ -96,7 +96,7 @@ def test_hold_out_flags_are_even():
 
 
 def test_predicted_return_statistics():
-    returns, predictions = [0.0, 1, 2, 3, 4, 5, 6, 7], [14.0, 12, 10, 8, 6, 4, 2, 0]
+    returns, predictions = [float(i) for i in range(8)], [14.0, 12.0, 10.0, 8.0, 6.0, 4.0, 2.0, 0.0]
     r2, error, correlation = predicted_return_statistics(returns, predictions)
     assert r2 == pytest.approx(1 - sum((y - y_hat) ** 2 for y, y_hat in zip(returns, predictions, strict=True)) / 42)
     assert error > 0

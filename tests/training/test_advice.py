@@ -45,6 +45,7 @@ BRIGHT = CHASE.model_copy(
 )
 
 
+@pytest.mark.long
 def test_large_observations_are_reported_once(dense, tmp_path):
     """Of a run with small observations, `test_train.py` sees that there is no such message."""
     listener = MessageListener()

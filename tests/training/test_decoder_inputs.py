@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from helpers.long_tests import long_case
 from helpers.small_configs import (
     ONE_TEAM,
     TOTAL,
@@ -74,9 +75,9 @@ def test_decoder_inputs(build, observed, method, judges, expected):
 @pytest.mark.parametrize(
     "config",
     [
-        small_config("lare-rrdu"),
+        long_case(small_config("lare-rrdu")),
         small_config("lare-rd", "ippo", TWO_TEAMS),
-        small_config("rd", "qmix", ONE_TEAM, credit_scope="state"),
+        long_case(small_config("rd", "qmix", ONE_TEAM, credit_scope="state")),
     ],
 )
 def test_store_keeps_the_steps(config):

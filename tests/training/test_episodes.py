@@ -99,6 +99,7 @@ def test_learn_returns_keeps_the_statistics_from_scratch(method, algorithm, env)
     assert 5 < len(n_steps) < 25
 
 
+@pytest.mark.long
 def test_rebuild_statistics_standardises_by_the_newest_statistics():
     config = small_config("rd-linear")
     learner = learner_with_episodes(config)
@@ -115,6 +116,7 @@ def test_rebuild_statistics_standardises_by_the_newest_statistics():
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.long
 def test_learn_returns_rebuilds_from_stored_episodes_only():
     config = small_config("lare-linear", capacity=60)
     steps = random_steps(lengths=LONG)
@@ -183,6 +185,7 @@ def test_learn_returns_finds_the_score_type(method, score):
         assert returns.estimate_score_type(untrained_learner(untrained).decoders[0]) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("score", "setting"),
     [
@@ -216,6 +219,7 @@ def test_score_types_that_are_fitted():
     assert small_config("lare-signs").score_types == small_config("dense").score_types == (0,)
 
 
+@pytest.mark.long
 def test_learn_returns_waits_for_enough_short_episodes():
     config = small_config("lare-linear", capacity=2000)
     steps = random_steps(lengths=(3,) * 200)

@@ -11,6 +11,7 @@ import lare_rl
 from helpers.listeners import metrics_without_times
 from helpers.small_configs import (
     ONE_TEAM,
+    SUM_CREDIT,
     add_steps,
     random_steps,
     small_config,
@@ -80,6 +81,7 @@ def test_config_of_first_fit_reads_an_eighth_of_the_steps(steps, first):
 PHI = "def evaluation_func(o, a):\n    return [np.sum(np.square(o[:, 4:8]), axis=1, keepdims=True), o[:, 0:1]]"
 
 
+@pytest.mark.long
 def test_resume_after_a_stop_during_the_first_fit(small_many, tmp_path, monkeypatch):
     task = read_task("CN-6")
     changes = {"environments": 12, "steps": 600, "evaluate_every": 300, "capacity": 2000, "first_fit": "held-out"}

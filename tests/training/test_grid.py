@@ -15,7 +15,7 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.training.saved_state import load_learner
 
-KINDS = [("td3", "arel"), ("ippo", "diaster"), ("sac", "diaster"), ("ippo", "arel")]
+KINDS = [("td3", "arel"), ("ippo", "diaster"), long_case("sac", "diaster"), long_case("ippo", "arel")]
 GRID = KINDS + [long_case("td3", method) for method in METHODS if method != "arel"]
 GRID += [long_case("ippo", method) for method in ("dense", "episodic", "rrdu", "lare-rd-shared", "lare-bayes")]
 GRID += [long_case("qmix", method) for method in ("lare-rd", "dense", "ircr", "rrdu", "diaster", "lare-bayes")]
@@ -26,7 +26,7 @@ GRID += [long_case("ddpg", "rrdu"), long_case("sac", "lare-rrdu"), long_case("vd
 the second tier, every method runs with one algorithm, the cheapest. The other rows are pairs, so that each kind of
 reward, each way to fit, and raw features and factors meet each way to consume steps."""
 
-STATE_GRID = [("observation", "arel"), ("state", "stas"), ("state", "lare-rd-shared"), ("state", "rrdu")]
+STATE_GRID = [("observation", "arel"), ("state", "stas"), ("state", "lare-rd-shared"), long_case("state", "rrdu")]
 STATE_GRID += [long_case("observation", "lare-rrdu"), long_case("state", "lare-linear")]
 
 

@@ -77,6 +77,7 @@ def test_store_updates_statistics():
     np.testing.assert_array_equal(learner.scale[0], learner.decoders[0].scale)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n_steps", [long_case(4), 10])
 def test_unbiased_loss_has_the_expectation_of_the_full_loss(n_steps):
     # Lengths are 3 to 12: with K = 10, three of the five episodes are shorter. RRD's loss is larger.
@@ -205,6 +206,7 @@ def test_assess_reads_the_newest_steps():
 # Several environments
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", [*map(long_case, ("rd", "rrdu", "lare-rd", "ircr")), "lare-linear"])
 def test_two_environments_equal_one_twice_as_long(method):
     wide, long = small_config(method, n_envs=2, credit=SUM_CREDIT), small_config(method, credit=SUM_CREDIT)
@@ -302,6 +304,7 @@ def test_assess_measures_each_team():
     assert float(results["credit/error_second"]) == pytest.approx(2 * np.abs(true[mask]).mean(), rel=1e-4)
 
 
+@pytest.mark.long
 def test_closed_form_sums_means_over_alive_agents():
     config, steps = TEAMS("lare-linear"), random_steps(TWO_TEAMS)
     factors, learner = random_factors(config, steps), learner_with_episodes(config)
@@ -404,6 +407,7 @@ def test_team_level_closed_form_and_assess():
     assert float(results["credit/correlation"]) == pytest.approx(1, rel=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("env", "score"), [(ONE_AGENT, "sum"), long_case(ONE_TEAM, "average")])
 def test_optimism_adds_deviations_to_training_rewards_only(env, score):
     algorithm = "td3" if env is ONE_AGENT else "ippo"

@@ -106,7 +106,7 @@ def test_compute_factors_of_state(echo):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "method"), [long_case("qmix", "dense"), ("qmix", "lare-rd"), ("ippo", "lare-bayes")]
+    ("algorithm", "method"), [long_case("qmix", "dense"), long_case("qmix", "lare-rd"), ("ippo", "lare-bayes")]
 )
 def test_many_agents_learn_echo(algorithm, method, echo, tmp_path):
     """A random policy is right at less than half of the steps. An episode has 3 to 6 steps, 4.5 on average."""

@@ -86,6 +86,7 @@ def test_scale_rewards_divides_by_the_scale_of_returns():
     np.testing.assert_allclose(scaled_reward, reward / jnp.sqrt(learner.scale[0].mean_square), rtol=1e-5)
 
 
+@pytest.mark.long
 def test_train_step_of_seeds_in_lockstep():
     config = small_config("lare-rrdu", credit=SUM_CREDIT)
     functions = compile_functions(config)

@@ -96,6 +96,7 @@ def test_train_step_hands_on_the_remaining_progress(monkeypatch):
     assert progress == pytest.approx([1.0, 0.8, 0.2])
 
 
+@pytest.mark.long
 def test_act_normalises_by_the_statistics_of_earlier_rollouts():
     config, steps = ppo_config("dense"), random_steps()
     learner, rollout = store_and_roll_out(config, steps)
@@ -196,6 +197,7 @@ def test_train_step_ignores_dead_agents():
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("algorithm", "env"), [("ppo", ONE_AGENT), long_case("ippo", TWO_TEAMS)])
 def test_train_step_of_seeds_in_lockstep(algorithm, env):
     config = small_config("lare-rd", algorithm, env, rollout_steps=TOTAL, n_envs=2, credit=SUM_CREDIT)

@@ -51,6 +51,7 @@ def test_r2_of_unseen_returns(function, least, most, episodes):
     assert least < assess(function, episodes).r2 <= most
 
 
+@pytest.mark.long
 def test_assessment_describes_factors(episodes):
     right = assess(RIGHT, episodes)
     assert right.ranges[0].startswith("- f_0: from ")
@@ -64,6 +65,7 @@ def test_assessment_describes_factors(episodes):
     assert "+1.00 with f_1" in second
 
 
+@pytest.mark.long
 def test_assessment_distinguishes_observations(episodes):
     ranges = assess(WRONG, episodes, toy_spec(judges="both")).ranges
     assert [line.split(":")[0] for line in ranges] == ["- f_0 (before)", "- f_0 (after)"]
@@ -114,6 +116,7 @@ def test_better_function_is_kept():
     assert model.requests[1] == prompts.reflect(TASK, reply, evidence)
 
 
+@pytest.mark.long
 def test_episodes_of_policy():
     model = ScriptedModel(RIGHT, WRONG)
     design_and_reflect(model, 1, policy=lambda observation: observation[:1] + 0.5)
@@ -121,6 +124,7 @@ def test_episodes_of_policy():
     assert assess(RIGHT, episodes).ranges[0] in model.requests[1][-1]["content"]
 
 
+@pytest.mark.long
 def test_episodes_of_finished_run(learned_training):
     (run, _), model = learned_training, ScriptedModel(RIGHT)
     assert reflect(verify_function(WRONG, TASK), TASK, model, episodes=run).source == RIGHT

@@ -15,6 +15,7 @@ import pytest
 import lare_rl
 from helpers.jax_toy_envs import echo_spec
 from helpers.listeners import AtStep, MessageListener, metrics_without_times
+from helpers.long_tests import long_case
 from helpers.toy_envs import toy_spec
 from helpers.training_runs import (
     CHASE,
@@ -67,7 +68,7 @@ def test_resume_after_kill_is_exact(small, phi, factor_run, tmp_path):
     assert_equal_runs(resume_quietly(tmp_path / "killed"), factor_run)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [long_case(signal.SIGINT), signal.SIGTERM])
 def test_resume_after_signal_is_exact(number, dense, dense_run, tmp_path):
     """The replay holds three episodes. Row files that are overwritten are deleted."""
     handler = signal.getsignal(number)
@@ -88,6 +89,7 @@ def test_resume_many_agents_on_device_is_exact(echo_settings, echo_run, tmp_path
     assert_equal_runs(resume_quietly(tmp_path / "run"), echo_run)
 
 
+@pytest.mark.long
 def test_resume_many_agents_on_host_is_exact(hosted_settings, hosted_run, tmp_path):
     """In the middle of an episode that the agents remember, after one of them has left."""
     train_and_stop(echo_spec(environment="hosted/three"), hosted_settings, tmp_path / "run", 40)
@@ -137,6 +139,7 @@ def test_resume_before_first_checkpoint_starts_again(dense_run, tmp_path):
     assert metrics_without_times(resume_quietly(run)) == metrics_without_times(dense_run)
 
 
+@pytest.mark.long
 def test_extend_equals_longer_run(dense, dense_run, tmp_path, monkeypatch):
     """Bit for bit, if nothing is annealed over the run and both have replays of one size. TensorBoard's events continue."""
     monkeypatch.chdir(tmp_path)

@@ -57,7 +57,7 @@ def episode_rows(steps, env):
     return [np.arange(a, b) for a, b in zip([0, *ends], ends, strict=False)]
 
 
-@pytest.mark.parametrize("method", ["lare-rd", long_case("episodic")])
+@pytest.mark.parametrize("method", [long_case("lare-rd"), "episodic"])
 def test_sequences_are_the_stored_episodes(method):
     config, steps = qmix_config(method), random_steps(ONE_TEAM, 2)
     learner = learner_with_episodes(config)
@@ -139,6 +139,7 @@ def test_train_step_updates_once_for_enough_episodes(method):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.long
 def test_train_step_waits_for_a_batch_of_episodes():
     config = qmix_config("dense")
     few = jax.tree.map(lambda rows: rows[:12], random_steps(ONE_TEAM, 2))
@@ -166,6 +167,7 @@ def test_cut_lengths_change_nothing(monkeypatch):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.long
 def test_train_step_of_seeds_in_lockstep():
     # The seeds have different numbers of updates, and batches of different lengths.
     config = qmix_config("lare-rrdu", rollout_steps=TOTAL, credit=SUM_CREDIT)

@@ -33,6 +33,7 @@ def test_old_episodes_are_overwritten(dense_run, factor_run):
         np.testing.assert_array_equal(episode["observations"], expected["observations"])
 
 
+@pytest.mark.long
 def test_discrete_actions(small, tmp_path):
     settings = small(method="rd", algorithm="ppo", seeds=1, steps=120, credit=QUICK_CREDIT)
     episodes = lare_rl.stored_episodes(train_quietly(pick_spec(), settings, tmp_path / "run"))
@@ -44,6 +45,7 @@ def test_discrete_actions(small, tmp_path):
         np.testing.assert_array_equal(episode["rewards"], expected)
 
 
+@pytest.mark.long
 def test_many_agents(hosted_run):
     episodes, both_seeds = lare_rl.stored_episodes(hosted_run), stored_role_episodes(hosted_run, hosted_run.config.task)
     n_second = len(lare_rl.stored_episodes(hosted_run, seed=1))

@@ -39,6 +39,7 @@ def test_mlflow_gets_every_number(dense_run, tmp_path, monkeypatch):
             assert history == {step: line[key] for step, line in expected.items() if key in line}
 
 
+@pytest.mark.long
 def test_wandb_gets_every_number(dense_run, tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_SILENT", "true")
     listener = WeightsAndBiases(project="toys", mode="offline", dir=tmp_path)

@@ -100,6 +100,7 @@ def test_messages_of_dense_run(dense_training):
     assert not any(message.startswith("Observations are large") for message in messages)
 
 
+@pytest.mark.long
 def test_warmup_of_the_whole_run(dense, tmp_path):
     """The policy is never trained, which is announced. Another process cannot resume the run meanwhile."""
 
@@ -202,6 +203,7 @@ def test_td3_learns_toy(learned_training):
     assert learned_training[0].metrics()[-1]["evaluation/return"] > -3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("algorithm", "method"),
     [
@@ -239,6 +241,7 @@ def ppo_settings(method, steps, hidden):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["dense", long_case("lare-bayes")])
 def test_ppo_learns_toy(method, phi, tmp_path):
     run = train_quietly(toy_spec(), ppo_settings(method, 8000, (32, 32)), tmp_path / "run", phi_for(method, phi))

@@ -174,7 +174,7 @@ class CreditAssigner:
             if len(rows):
                 numbers[rows] = self.learner.add_steps(*steps, None if alive is None else alive[rows])
                 env_ids = [ids[row] for row in rows]
-                self.learner.end_episodes(self.store.extend(env_ids, numbers[rows], steps, team_reward, ended))
+                self.learner.queue_episodes(self.store.extend(env_ids, numbers[rows], steps, team_reward, ended))
                 self.learner.flush_large_queues()
             return numbers
 
@@ -198,7 +198,7 @@ class CreditAssigner:
             if not np.isfinite(score):
                 raise LareError(f"the score is {score}: give a finite number")
             numbers = self.learner.add_steps(*steps, alive)
-            self.learner.end_episodes([self.store.add_episode(numbers, score)])
+            self.learner.queue_episodes([self.store.add_episode(numbers, score)])
             self.learner.flush_large_queues()
             return numbers
 
@@ -214,7 +214,7 @@ class CreditAssigner:
             return_ = self.store.find_running(env_id).return_
             if score is not None and not np.isfinite(score):
                 raise LareError(f"the score of the environment {env_id!r} is {score}: give a finite number")
-            self.learner.end_episodes([self.store.end(env_id, return_ if score is None else float(score))])
+            self.learner.queue_episodes([self.store.end(env_id, return_ if score is None else float(score))])
 
     def drop(self, env_id: Hashable) -> None:
         """Abandon the episode of an environment: it is never learned from. Its steps still have proxy rewards."""
@@ -233,8 +233,8 @@ class CreditAssigner:
         A closed-form decoder is fitted whenever there are enough new episodes, and needs no updates here.
         """
         with self.lock:
-            self.learner.catch_up()
-            self.learner.fit_pending()
+            self.learner.learn_if_due()
+            self.learner.run_pending_updates()
 
     fit_owed = fit_pending  # the earlier name
 
@@ -247,7 +247,7 @@ class CreditAssigner:
             LareError: a step was never stored, or is not stored any more.
         """
         with self.lock:
-            self.learner.catch_up()
+            self.learner.learn_if_due()
             numbers = to_step_numbers(steps)
             reward = np.zeros((*numbers.shape, *self.config.agent_axis), np.float32)
             is_step = numbers >= 0
@@ -269,7 +269,7 @@ class CreditAssigner:
         if method.reward is Reward.UNIFORM:
             raise LareError(f"{method.name} pays by the return of a step's episode: call rewards_at, with step numbers")
         with self.lock:
-            self.learner.catch_up()
+            self.learner.learn_if_due()
             inputs = self.config.compute_inputs(*self.config.to_rows(observation, action, next_observation))
             length = np.full(len(inputs), self.store.mean_length) if length is None else np.asarray(length, np.int32)
             if length.shape != (len(inputs),):

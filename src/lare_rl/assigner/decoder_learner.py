@@ -3,9 +3,9 @@
 Calls of compiled functions cost the same for one row as for hundreds, so data wait until there are enough of them, or until a result
 depends on them:
 
-    add_steps ────► pending steps ──flush_inputs──► inputs in the store ──flush_statistics──► running statistics
-    end_episodes ─► pending returns ──────────────────────────────────────flush_statistics──► scales of returns
-                └─► pending episodes ─────────────────────────────────────learn_returns─────► sufficient statistics, decoder
+    add_steps ────► pending steps ──flush_inputs──► inputs in the store ─flush_statistics──► running statistics
+    queue_episodes ─► pending returns ───────────────────────────────────flush_statistics──► scales of returns
+                   └─► pending episodes ──────────────────────────────────learn_returns─────► sufficient statistics, decoder
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -32,16 +32,16 @@ from lare_rl.util.float64 import float64
 
 __all__ = ["CHUNK_UPDATES", "DecoderLearner"]
 
-PENDING_STEPS = 256
-"""Steps that wait for their inputs, or for the running statistics, at most."""
+MAX_PENDING_STEPS = 256
+"""The most steps that may wait for their inputs, or for the running statistics."""
 CHUNK_ROWS = 8192
 """Rows that are processed in one call."""
 CHUNK_UPDATES = 16
 """Gradient updates of a decoder in one call."""
 MAX_PENDING_UPDATES = 256
-"""Gradient updates that wait, at most. It prevents a burst after a long first episode."""
-SAMPLE_STEPS = 256
-"""About how many steps are stored to verify `phi` on when it is loaded from a file."""
+"""The most gradient updates that may wait. This limits the burst of updates after a long first episode."""
+PHI_SAMPLE_STEPS = 256
+"""About how many steps are kept to verify `phi` again after it is loaded from a file."""
 
 
 class DecoderLearner:
@@ -57,11 +57,11 @@ class DecoderLearner:
         self.n_learned = 0
         """Episodes that the decoder has learned from."""
         self.n_updates = 0
-        """Gradient updates of the decoder."""
+        """Gradient updates made so far."""
         self.loss = float("nan")
         """The mean loss of the last gradient updates."""
         self.phi_sample: list[tuple[np.ndarray, np.ndarray]] = []
-        """The first observations and actions: a `phi` that is loaded from a file is verified on them again."""
+        """The first next observations and actions: a `phi` that is loaded from a file is verified on them again."""
         self.n_pending_steps = 0
         self._pending_steps: list[tuple[np.ndarray, ...]] = []
         """Number, observation, action and next observation of steps that have no inputs yet."""
@@ -73,13 +73,13 @@ class DecoderLearner:
         """Episodes that the decoder has not learned from yet. Episodes that ended in one call are together."""
         self._pending_updates = 0.0
         self._is_fitted = False
-        self._flat: tuple[Any, Any, FlatState | None] = None, None, None
-        """A decoder and a scale, and their flat form."""
+        self._flat_cache: tuple[Any, Any, FlatState | None] = None, None, None
+        """A decoder and a scale, and the leaves of both."""
 
     @property
     def is_fitted(self) -> bool:
         """Whether the decoder has been fitted yet."""
-        if not self._is_fitted and self.decoder is not None:  # after the first fit, there is no need to ask the device
+        if not self._is_fitted and self.decoder is not None:  # cached, because reading the flag waits for JAX
             uses_gradient = self.config.method.uses_gradient
             self._is_fitted = self.n_updates > 0 if uses_gradient else bool(returns.is_fitted(self.decoder))
         return self._is_fitted
@@ -95,18 +95,18 @@ class DecoderLearner:
         self._pending_updates = min(self._pending_updates + self.config.fits_per_step * n_steps, MAX_PENDING_UPDATES)
         return numbers
 
-    def end_episodes(self, episodes: Iterable[Episode]) -> None:
+    def queue_episodes(self, episodes: Iterable[Episode]) -> None:
         """Queue episodes that ended in one call."""
-        group: list[Episode] = []
+        batch: list[Episode] = []
         for episode in episodes:
-            if not group:
-                self._pending_episodes.append(group)
-            group.append(episode)
+            if not batch:
+                self._pending_episodes.append(batch)
+            batch.append(episode)
             self._pending_returns.append((episode.score / len(episode.steps), len(episode.steps)))
 
     def flush_large_queues(self) -> None:
         """Process the queues that have become long."""
-        if self.n_pending_steps >= PENDING_STEPS:
+        if self.n_pending_steps >= MAX_PENDING_STEPS:
             self.flush_inputs()
         if sum(len(episode.steps) for episode in chain.from_iterable(self._pending_episodes)) >= CHUNK_ROWS:
             self.learn_returns()
@@ -116,20 +116,21 @@ class DecoderLearner:
         if not self._pending_steps:
             return
         number, *steps = (np.concatenate(arrays) for arrays in zip(*self._pending_steps, strict=True))
-        if self.config.phi is not None and sum(len(action) for _, action in self.phi_sample) < SAMPLE_STEPS:
-            _, action, observation = (rows.reshape(-1, rows.shape[-1])[:SAMPLE_STEPS].copy() for rows in steps)
-            self.phi_sample.append((observation, action))
-        for start in range(0, len(number), CHUNK_ROWS):
-            chunk = slice(start, start + CHUNK_ROWS)
-            inputs = self.config.compute_inputs(*(rows[chunk] for rows in steps))
+        chunks = [slice(start, start + CHUNK_ROWS) for start in range(0, len(number), CHUNK_ROWS)]
+        # Nothing changes before phi has been called for all steps, because phi may raise an error.
+        all_inputs = [self.config.compute_inputs(*(rows[chunk] for rows in steps)) for chunk in chunks]
+        for chunk, inputs in zip(chunks, all_inputs, strict=True):
             rows = number[chunk] % self.store.capacity
             self.store.features[rows] = inputs
             alive = np.ones(inputs.shape[:-1], bool) if self.store.alive is None else self.store.alive[rows]
             if self.decoder is not None:
                 self._pending_inputs.append((inputs, alive))
-        self._pending_steps.clear()  # only now, because phi may raise an error above
+        if self.config.phi is not None and sum(len(action) for _, action in self.phi_sample) < PHI_SAMPLE_STEPS:
+            _, action, next_observation = (rows.reshape(-1, rows.shape[-1])[:PHI_SAMPLE_STEPS].copy() for rows in steps)
+            self.phi_sample.append((next_observation, action))
+        self._pending_steps.clear()
         self.n_pending_steps = 0
-        if sum(len(inputs) for inputs, _ in self._pending_inputs) >= PENDING_STEPS:
+        if sum(len(inputs) for inputs, _ in self._pending_inputs) >= MAX_PENDING_STEPS:
             self.flush_statistics()
 
     def flush_statistics(self) -> None:
@@ -158,7 +159,7 @@ class DecoderLearner:
                 self.decoder = compiled.observe_returns(self.decoder, mean_reward, length, mask)
             self.scale = compiled.observe_scale(self.scale, mean_reward, mask)
 
-    def catch_up(self) -> None:
+    def learn_if_due(self) -> None:
         """Add pending returns to the scales, and let the decoder learn if there are enough new episodes."""
         self._flush_returns()
         if sum(map(len, self._pending_episodes)) >= max(returns.MIN_GROWTH * self.n_learned, 1):
@@ -167,34 +168,34 @@ class DecoderLearner:
     def learn_returns(self) -> None:
         """Let the decoder learn from pending episodes.
 
-        However late this is called, a decoder in closed form is fitted as often as if it had been called whenever episodes ended: a
-        return is predicted by a decoder that was fitted to the returns before it.
+        A late call makes no difference to a decoder in closed form: it is fitted after the same episodes as with prompt calls, so
+        every return is predicted before the decoder is fitted to it.
         """
         self.flush_inputs()
         self.flush_statistics()
         oldest = self.store.steps - self.store.capacity
-        groups = [[episode for episode in group if episode.steps[0] >= oldest] for group in self._pending_episodes]
-        groups = [group for group in groups if group]
+        calls = [[episode for episode in batch if episode.steps[0] >= oldest] for batch in self._pending_episodes]
+        calls = [batch for batch in calls if batch]
         self._pending_episodes.clear()
         with on_cpu(), float64():
-            while groups:
-                new = groups.pop(0)
-                while groups and len(new) < self._episodes_until_fit():
-                    new += groups.pop(0)
+            while calls:
+                new = calls.pop(0)
+                while calls and len(new) < self._episodes_until_fit():
+                    new += calls.pop(0)
                 self.n_learned += len(new)
                 if self.decoder is not None:
-                    later = list(chain.from_iterable(groups))
+                    later = list(chain.from_iterable(calls))
                     self.decoder = jax.block_until_ready(self._learn(self.decoder, new, later))
 
     def _episodes_until_fit(self) -> float:
-        """Return after how many new episodes a closed form is fitted again. Other decoders are not fitted here."""
+        """Return the number of new episodes until the next fit in closed form. Other decoders are not fitted here."""
         if self.decoder is None or self.decoder.closed_form is None:
             return inf
         return (closed_form.FIT_GROWTH - 1) * self.n_learned
 
     def _learn(self, decoder: Decomposition, new: Sequence[Episode], later: Sequence[Episode]) -> Decomposition:
         """Return a decoder that has learned from some new episodes, while later ones still wait."""
-        for batch in self._pack(new):
+        for batch in self._episode_batches(new):
             decoder = compiled.predict_then_update(decoder, batch, settings=self.config.settings)
         if decoder.closed_form is None:
             return decoder
@@ -202,12 +203,12 @@ class DecoderLearner:
         if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(decoder):
             decoder = compiled.reset_statistics(decoder)
             later_ids = set(map(id, later))
-            for batch in self._pack([e for e in self.store.episodes.values() if id(e) not in later_ids]):
+            for batch in self._episode_batches([e for e in self.store.episodes.values() if id(e) not in later_ids]):
                 decoder = compiled.add_episodes(decoder, batch)
         return compiled.fit_closed_form(decoder, spec=self.config.spec) if compiled.is_due(decoder) else decoder
 
-    def _pack(self, episodes: Sequence[Episode]) -> Iterator[CreditBatch]:
-        """Yield whole episodes in batches of one of two shapes: for a single episode, or for many."""
+    def _episode_batches(self, episodes: Sequence[Episode]) -> Iterator[CreditBatch]:
+        """Yield batches of whole episodes. Rows are padded to one of two sizes, so that few programs are compiled."""
         lengths = [len(episode.steps) for episode in episodes]
         longest = max(lengths, default=1)
         rows = padded_size(longest)
@@ -227,10 +228,10 @@ class DecoderLearner:
         for start in range(0, n_updates, CHUNK_UPDATES):
             self._update(min(CHUNK_UPDATES, n_updates - start))
 
-    def fit_pending(self) -> None:
+    def run_pending_updates(self) -> None:
         """Make pending gradient updates, in whole chunks."""
-        is_trainable = self.config.method.uses_gradient and self.store.episodes
-        if not is_trainable or self._pending_updates < CHUNK_UPDATES:
+        can_train = self.config.method.uses_gradient and len(self.store.episodes) > 0
+        if not can_train or self._pending_updates < CHUNK_UPDATES:
             return
         self.flush_inputs()
         self.flush_statistics()
@@ -239,13 +240,13 @@ class DecoderLearner:
             self._update(CHUNK_UPDATES)
 
     def _update(self, n_updates: int) -> None:
-        """Make gradient updates. The number of an update is the seed of its batch."""
+        """Make gradient updates. Their batches are seeded by the number of updates so far."""
         assert self.decoder is not None
         spec, seed = self.config.spec, self.config.seed
-        random = np.random.default_rng([seed, self.n_updates])
+        rng = np.random.default_rng([seed, self.n_updates])
         longest = padded_size(max(len(episode.steps) for episode in self.store.episodes.values()))
         with on_cpu():
-            samples = [batches.sample_batch(self.store, spec, random, longest) for _ in range(n_updates)]
+            samples = [batches.sample_batch(self.store, spec, rng, longest) for _ in range(n_updates)]
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *samples)
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), self.n_updates), n_updates)
             self.decoder, loss = compiled.fit_by_gradient(self.decoder, stacked, keys, spec=spec)
@@ -278,7 +279,7 @@ class DecoderLearner:
             chunk = slice(start, start + CHUNK_ROWS)
             size = padded_size(len(inputs[chunk]))
             padded_length = pad(length[chunk].astype(np.int32), size)
-            padded_length[len(inputs[chunk]) :] = 1
+            padded_length[len(inputs[chunk]) :] = 1  # a score that is a mean is divided by T
             arrays = (None if x is None else pad(x[chunk], size) for x in (mean_reward, finished, alive))
             with on_cpu():
                 flat = self._flat_state()
@@ -303,15 +304,15 @@ class DecoderLearner:
 
     def _flat_state(self) -> FlatState:
         """Return the parts of the decoder that compute rewards, and the scale, in flat form."""
-        decoder, scale, flat = self._flat
+        decoder, scale, flat = self._flat_cache
         if flat is None or decoder is not self.decoder or scale is not self.scale:
-            light = self.decoder
-            if light is not None:
-                light = light._replace(optimizer=(), score_type_predictions=None)
+            reward_state = self.decoder
+            if reward_state is not None:
+                reward_state = reward_state._replace(optimizer=(), score_type_predictions=None)
                 if not decomposition.is_optimistic(self.config.method, self.config.settings):
-                    light = light._replace(closed_form=None)
-            flat = FlatState(*jax.tree.flatten((light, self.scale)))
-            self._flat = self.decoder, self.scale, flat
+                    reward_state = reward_state._replace(closed_form=None)
+            flat = FlatState(*jax.tree.flatten((reward_state, self.scale)))
+            self._flat_cache = self.decoder, self.scale, flat
         return flat
 
     def metrics(self) -> dict[str, float]:
@@ -336,7 +337,7 @@ class DecoderLearner:
             return None
         with on_cpu(), float64():
             state = compiled.init_explanation(self.decoder.statistics, basis=basis)
-            for batch in self._pack(list(self.store.episodes.values())):
+            for batch in self._episode_batches(list(self.store.episodes.values())):
                 state = compiled.add_to_explanation(state, batch)
             explanation = compiled.explain_returns(state, self.decoder.is_mean.astype(int))
             return jax.tree.map(np.asarray, explanation)

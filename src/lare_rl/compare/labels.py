@@ -89,7 +89,7 @@ def find_origin_differences(runs: Sequence[Run]) -> list[Difference]:
 
 
 def _effective_settings(run: Run) -> dict[str, Any]:
-    return effective_settings(run.config.settings, run.config.task)
+    return effective_settings(run.config.settings)
 
 
 def _ignored_settings(settings: Mapping[str, Any]) -> set[str]:

@@ -1,4 +1,4 @@
-"""Which settings make a difference to a run, and what follows from their combination."""
+"""Which settings a run uses: others make no difference to its task, algorithm and method."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -9,45 +9,43 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["effective_settings", "needs_replay", "unused_settings", "warmup_warning"]
+__all__ = ["effective_settings", "needs_replay", "unused_names", "unused_settings", "warmup_warning"]
 
 
-def effective_settings(settings: ResolvedSettings, task: TaskSpec) -> dict[str, Any]:
-    """Return all settings that make a difference to the run, by dotted names as on the command line."""
+def effective_settings(settings: ResolvedSettings) -> dict[str, Any]:
+    """Return the settings that a run uses, by dotted names as on the command line."""
     values = settings.model_dump()
     if settings.judges is None:
         values["judges"] = "as the task says"
     values[settings.algorithm] = values.pop("hyperparameters")
-    ineffective = ineffective_names(settings)
-    return {name: value for name, value in _flatten(values) if not _is_in(name, ineffective)}
+    unused = unused_names(settings)
+    return {name: value for name, value in _flatten(values) if not _is_under(name, unused)}
 
 
 def unused_settings(settings: Settings, resolved: ResolvedSettings, task: TaskSpec) -> dict[str, str]:
-    """Return messages, by dotted names, about settings that are given but make no difference to this task, algorithm and method."""
-    defaults, effective = dict(_flatten(Settings().model_dump())), effective_settings(resolved, task)
+    """Return a message about each setting that is given but not used, by dotted names."""
+    defaults, effective = dict(_flatten(Settings().model_dump())), effective_settings(resolved)
     other_algorithms = [name for name in ALGORITHMS if name != resolved.algorithm]
-    ineffective = ineffective_names(resolved)
+    unused = unused_names(resolved)
     messages = {}
     for name, value in _flatten(settings.model_dump(exclude_unset=True)):
         if name in defaults and value == defaults[name]:
             continue
-        if _is_in(name, other_algorithms):
+        if _is_under(name, other_algorithms):
             alternative = f"{resolved.algorithm}.{name.rpartition('.')[2]}"
-            hint = f"; it has {alternative}" if alternative in effective else ""
+            hint = f"; use {alternative}" if alternative in effective else ""
             messages[name] = f"{name} makes no difference to {resolved.algorithm} on {task.name}{hint}"
-        elif _is_in(name, ineffective):
-            by_algorithm = name in ("scale_rewards", f"{resolved.algorithm}.noise_clip")
-            cause = f"{resolved.algorithm} on {task.name}" if by_algorithm else resolved.method
-            messages[name] = f"{name} makes no difference to {cause}"
+        elif _is_under(name, unused):
+            messages[name] = f"{name} makes no difference to {resolved.method} with {resolved.algorithm} on {task.name}"
     return messages
 
 
-def ineffective_names(settings: ResolvedSettings) -> list[str]:
-    """Return the dotted names of settings that make no difference to this algorithm and method."""
+def unused_names(settings: ResolvedSettings) -> list[str]:
+    """Return the dotted names of settings that this algorithm and method do not use."""
     method, algorithm = find_method(settings.method), ALGORITHMS[settings.algorithm]
     on_policy = algorithm.consumes is Consumes.ROLLOUTS
     separate_fit = method.fit is not None and method.fit.separate
-    effects = {
+    is_used = {
         "fit_every": method.uses_gradient and (on_policy or separate_fit),
         "fit_updates": method.uses_gradient and (on_policy or separate_fit),
         "first_fit": method.uses_gradient and on_policy and algorithm.multi_agent,
@@ -58,12 +56,12 @@ def ineffective_names(settings: ResolvedSettings) -> list[str]:
         "scale_rewards": not on_policy,
         f"{settings.algorithm}.noise_clip": getattr(settings.hyperparameters, "policy_noise", None) != 0,
     }
-    effects |= {f"credit.{name}": name in method.settings for name in CreditSettings.model_fields}
-    return [name for name, has_effect in effects.items() if not has_effect]
+    is_used |= {f"credit.{name}": name in method.settings for name in CreditSettings.model_fields}
+    return [name for name, used in is_used.items() if not used]
 
 
 def needs_replay(settings: ResolvedSettings) -> bool:
-    """Return whether steps are read again after the policy has learned from them."""
+    """Return whether updates read steps of earlier iterations."""
     consumes = ALGORITHMS[settings.algorithm].consumes
     return consumes is not Consumes.ROLLOUTS or find_method(settings.method).fit is not None
 
@@ -79,7 +77,7 @@ def warmup_warning(settings: ResolvedSettings) -> str | None:
     )
 
 
-def _is_in(name: str, groups: Sequence[str]) -> bool:
+def _is_under(name: str, groups: Sequence[str]) -> bool:
     """Return whether a dotted name is one of these groups, or lies in one of them."""
     return any(f"{name}.".startswith(f"{group}.") for group in groups)
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, Consumes
-from lare_rl.config.effective import ineffective_names, needs_replay
+from lare_rl.config.effective import needs_replay, unused_names
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
@@ -102,7 +102,7 @@ def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Reso
     changes = {}
     if resolved.judges == task.judges:
         changes["judges"] = None
-    if "first_fit" in ineffective_names(resolved):
+    if "first_fit" in unused_names(resolved):
         changes["first_fit"] = None
     score = resolved.credit.score
     if env.fixed_length:  # sum and mean have the same decoder

@@ -3,6 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from lare_rl.nn.masks import masked_mean
+
 __all__ = ["correlation", "mean_absolute_error", "metrics"]
 
 
@@ -29,17 +31,12 @@ def mean_absolute_error(
     r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"]
 ) -> Float[Array, ""]:
     """Return the mean of |r_hat - r| over the steps where `mask` is true (the paper's Table F.5)."""
-    return jnp.sum(jnp.abs(r_hat - reward) * mask) / jnp.maximum(jnp.sum(mask), 1)
+    return masked_mean(jnp.abs(r_hat - reward), mask)
 
 
 def correlation(
     r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"]
 ) -> Float[Array, ""]:
     """Return Pearson's correlation over the steps where `mask` is true, or NaN where one of the two never varies."""
-    count = jnp.maximum(jnp.sum(mask), 1)
-
-    def centre(x: Float[Array, " steps"]) -> Float[Array, " steps"]:
-        return (x - jnp.sum(x * mask) / count) * mask
-
-    x, y = centre(r_hat), centre(reward)
+    x, y = ((values - masked_mean(values, mask)) * mask for values in (r_hat, reward))
     return jnp.clip(jnp.sum(x * y) / jnp.sqrt(jnp.sum(x**2) * jnp.sum(y**2)), -1, 1)  # rounding can exceed 1

@@ -47,7 +47,7 @@ def load_policy(
 class Policy:
     """The policy of one seed, which acts as in evaluations (`load_policy`).
 
-    A policy with a memory (`qmix`, `vdn`) takes observations one at a time, in order, and `reset` begins a new episode.
+    A recurrent policy (`qmix`, `vdn`) takes observations one at a time, in order, and `reset` begins a new episode.
     """
 
     def __init__(self, run: Run, seed_index: int, best: bool, deterministic: bool = False):
@@ -83,14 +83,23 @@ class Policy:
         return actions[0] if is_single else actions
 
     def select_env_action(self, observation: Any) -> Float[np.ndarray, " action"]:
-        """Return the action for one observation in the environment's units. A choice is a one-hot row."""
-        return self._select_actions(self._check_observation(observation)[0])[0]
+        """Return the action for one observation in the environment's units. A discrete action is one-hot.
+
+        Raises:
+            LareError: observations have another size, or there are several.
+        """
+        rows, is_single = self._check_observation(observation)
+        if not is_single:
+            raise LareError(f"select_env_action needs one observation, and was given {len(rows)}")
+        return self._select_actions(rows)[0]
 
     def _select_actions(self, rows: Float[np.ndarray, "batch observation"]) -> Float[np.ndarray, "batch action"]:
         n_rows, has_memory = len(rows), bool(jax.tree.leaves(self._memory))
         if has_memory and n_rows > 1:
             name = self._config.algorithm.name
-            raise LareError(f"the policy of {name} remembers its episode: give it one observation at a time")
+            raise LareError(
+                f"the policy of {name} has a memory: give it one observation at a time, and call reset() between episodes"
+            )
         action, self._memory = select_action(
             self._functions,
             self._config,

@@ -19,7 +19,7 @@ from lare_rl.phi.runtime import Runtime
 from lare_rl.phi.text import METHODS, call_method
 from lare_rl.phi.values import Bound, Function, Symbol, value_type
 
-__all__ = ["IGNORED_CALLS", "get_attribute", "imported_names", "module_attribute"]
+__all__ = ["IGNORED_CALLS", "get_attribute", "module_attribute", "resolve_import"]
 
 MODULES = {
     "numpy": "np", "numpy.linalg": "np.linalg", "numpy.polynomial": "np.polynomial", "numpy.typing": "np.typing",
@@ -30,7 +30,7 @@ MODULES = {
         "types"
     ).split()},
 }  # fmt: skip
-"""Modules that can be imported. Of most of them, only the names below and the functions of `python_functions` exist."""
+"""Modules that can be imported. They have only the names below and the functions of `python_functions` and `numpy_functions`."""
 
 NAMES = frozenset(
     "dataclasses.dataclass dataclasses.field enum.Enum enum.IntEnum enum.IntFlag enum.auto abc.ABC abc.abstractmethod "
@@ -43,12 +43,12 @@ NAMES = frozenset(
     "np.typing.NDArray np.typing.ArrayLike np.finfo np.iinfo np.dtype np.vectorize np.s_ np.index_exp np.isscalar np.fft "
     "np.ndindex np.issubdtype types.SimpleNamespace".split()
 )
-"""Names of modules that are neither functions on arrays nor constants."""
+"""Types, modules and decorators that a program may name."""
 
 IGNORED_CALLS = frozenset(
     "np.seterr np.set_printoptions warnings.filterwarnings warnings.simplefilter warnings.warn functools.wraps".split()
 )
-"""Functions that change no number: they do nothing."""
+"""Functions that a program may call and that do nothing."""
 
 CONSTANTS: dict[str, Any] = {
     "np.pi": math.pi, "np.e": math.e, "np.inf": math.inf, "np.nan": math.nan, "np.newaxis": None, "np.euler_gamma": np.euler_gamma,
@@ -81,7 +81,7 @@ HINTS = {
 """What to write instead of some names that are not available."""
 
 
-def imported_names(statement: ast.Import | ast.ImportFrom) -> Iterable[tuple[str, Any]]:
+def resolve_import(statement: ast.Import | ast.ImportFrom) -> Iterable[tuple[str, Any]]:
     """Return the names that an import defines, and their values."""
     if isinstance(statement, ast.Import):
         for alias in statement.names:
@@ -91,13 +91,13 @@ def imported_names(statement: ast.Import | ast.ImportFrom) -> Iterable[tuple[str
         return
     module = statement.module or ""
     if statement.level:
-        raise RefusedError("E-IMPORT", "relative imports are not available: import numpy and math only")
+        raise RefusedError("E-IMPORT", "relative imports are not available; import numpy or math")
     _check_module(module)
     for alias in statement.names:
         if alias.name == "*":
             prefix = f"{MODULES[module]}."
             names = [*CONSTANTS, *NAMES, *BUILTINS, *(f"np.{name}" for name in FUNCTIONS)]
-            members = [name for name in names if name.startswith(prefix) and name.count(".") == 1]
+            members = [name for name in names if f"{name.rpartition('.')[0]}." == prefix]
             yield from ((name.removeprefix(prefix), CONSTANTS.get(name, Symbol(name))) for name in members)
             continue
         full = f"{module}.{alias.name}"
@@ -107,14 +107,14 @@ def imported_names(statement: ast.Import | ast.ImportFrom) -> Iterable[tuple[str
 
 def _check_module(name: str) -> None:
     if name not in MODULES:
-        raise RefusedError("E-IMPORT", f"import {name[:60]}: only numpy and math are available")
+        raise RefusedError("E-IMPORT", f"import {name[:60]}: this module is not available; numpy and math are")
 
 
 def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
-    """Return owner.name, for every owner that is not of a class of the program.
+    """Return owner.name, for any value but an instance of a class of the program.
 
     Raises:
-        RefusedError: it is not available, though NumPy or Python may have it.
+        RefusedError: this attribute is not available.
     """
     match owner:
         case Symbol(module):

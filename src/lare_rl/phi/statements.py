@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from lare_rl.phi.arrays import Array
-from lare_rl.phi.attributes import imported_names
+from lare_rl.phi.attributes import resolve_import
 from lare_rl.phi.calls import decorate, make_class
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.python_functions import ERRORS
@@ -77,7 +77,7 @@ def _execute(runtime: Runtime, statement: ast.stmt, scope: Scope) -> None:
                 _check_manager(runtime, manager, scope)
             runtime.run(body, scope)
         case ast.Import() | ast.ImportFrom():
-            for name, value in imported_names(statement):
+            for name, value in resolve_import(statement):
                 scope.assign(name, value)
         case ast.Assert(test=test, msg=message):
             _assert(runtime, test, message, scope)

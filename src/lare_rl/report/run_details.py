@@ -173,10 +173,10 @@ def _render_settings(run: Run) -> Iterable[str]:
     config, settings, default_settings = run.config, run.config.settings, {}
     if untrusted_module(config.task) is None:
         defaults = Settings(method=settings.method, algorithm=settings.algorithm)
-        default_settings = effective_settings(apply_defaults(defaults, load_env_spec(config.task)), config.task)
+        default_settings = effective_settings(apply_defaults(defaults, load_env_spec(config.task)))
     rows = [
         (key, value if isinstance(value, str) else json.dumps(value))
-        for key, value in effective_settings(settings, config.task).items()
+        for key, value in effective_settings(settings).items()
         if value != default_settings.get(key) or key in ("method", "algorithm")
     ]
     versions = ", ".join(f"{library} {version}" for library, version in config.versions.items())

@@ -31,7 +31,7 @@ class Job:
     directory: Path
     task: TaskSpec
     settings: Settings
-    """As the user gave them."""
+    """Before defaults are filled in."""
     resolved: ResolvedSettings
     functions: tuple[Path, ...] = ()
     """Files of latent functions instead of the recorded ones, one for each team."""
@@ -55,7 +55,7 @@ class Job:
 
     @property
     def done(self) -> bool:
-        """Whether every seed has reached the last step. False for a damaged run, whose error is reported when it is trained."""
+        """Whether every seed has reached the last step. False if the metrics are damaged: training then reports the error."""
         last_step = self.resolved.steps
         try:
             seeds = {line["seed"] for line in read_metrics(self.directory) if line["step"] == last_step}
@@ -72,7 +72,7 @@ class Job:
 def make_job(root: Path, task: TaskSpec, settings: Settings, functions: Sequence[Path] = ()) -> Job:
     """Plan a run in ROOT/TASK/METHOD-ALGORITHM[-drawK][-candidatesN]. Raises `LareError` if settings and task do not fit together.
 
-    The endings name a recorded function, unless `functions` replace it.
+    The endings in brackets name a recorded `phi`. A run with `functions` has none.
     """
     resolved = resolve(settings, task)
     name = f"{resolved.method}-{resolved.algorithm}"
@@ -95,19 +95,23 @@ def check_job(job: Job) -> None:
     functions = choose_functions(job.task, job.resolved, job.functions) if job.functions else ()
     if not job.started:
         if job.directory.exists():
-            raise LareError(f"{job.directory} exists, and is not a run: choose another out")
+            raise LareError(f"{job.directory} exists, and is not a run: choose another output directory (--out)")
         for role in job.task.roles if method.needs_phi and not functions else ():
             check_recorded(role, method.phi_kind, job.resolved.draw, job.resolved.candidates)
         return
     config = read_config(job.directory)
     if config.task.digest != job.task.digest:
-        raise LareError(f"{job.directory} holds a run of another task: choose another out")
-    old = effective_settings(config.settings, config.task)
-    for name, value in effective_settings(job.resolved, job.task).items():
+        raise LareError(f"{job.directory} holds a run of another task: choose another output directory (--out)")
+    old = effective_settings(config.settings)
+    for name, value in effective_settings(job.resolved).items():
         if (old_value := old.get(name)) != value:
-            raise LareError(f"{job.directory} holds a run with {name} = {old_value}, not {value}: choose another out")
+            raise LareError(
+                f"{job.directory} holds a run with {name} = {old_value}, not {value}: choose another output directory (--out)"
+            )
     if functions and config.function_sha256 != tuple(function.digest for function in functions):
-        raise LareError(f"{job.directory} holds a run with another latent function: choose another out")
+        raise LareError(
+            f"{job.directory} holds a run with another latent function: choose another output directory (--out)"
+        )
 
 
 def job_to_json(job: Job) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Key
 
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import JaxEnv, Timestep, team_mean, to_env_action
+from lare_rl.nn.masks import select
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import init_memory, policy_function
 from lare_rl.training.evaluation import EpisodeBatch, Evaluation
@@ -144,11 +145,7 @@ def _collect(
 
         def reset_ended(envs: VecEnvState) -> VecEnvState:
             fresh = _reset(env, reset_keys, envs.episode_start.shape[1], config)
-
-            def choose(new: Array, old: Array) -> Array:
-                return jnp.where(steps.ended.reshape(*steps.ended.shape, *[1] * (old.ndim - 2)), new, old)
-
-            state, timestep = jax.tree.map(choose, (fresh.state, fresh.timestep), (envs.state, envs.timestep))
+            state, timestep = select(steps.ended, (fresh.state, fresh.timestep), (envs.state, envs.timestep))
             return VecEnvState(state, timestep, envs.memory, episode_start=steps.ended)
 
         # A reset costs as much as a step, so it is skipped if no episode has ended.

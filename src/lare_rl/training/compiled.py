@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Key
 from lare_rl.algorithms.registry import Consumes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import Timestep
+from lare_rl.nn.masks import select
 from lare_rl.phi.graph import Graph
 from lare_rl.training import episodes, off_policy, on_policy, sequences
 from lare_rl.training.compile_cache import cache_by_value
@@ -91,10 +92,7 @@ def policy_function(config: TrainConfig, greedy: bool) -> Callable[..., tuple[Ar
         noise: Array | None,
         is_new: Bool[Array, " envs"],
     ) -> tuple[Array, Any]:
-        def reset(leaf: Array, initial: Array) -> Array:
-            return jnp.where(is_new.reshape(-1, *[1] * (leaf.ndim - 1)), initial, leaf)
-
-        memory = jax.tree.map(reset, memory, module.init_memory(config))
+        memory = select(is_new, module.init_memory(config), memory)
         return module.act(actor, memory, observation, available, noise, config)
 
     return jax.vmap(act, in_axes=(0, 0, 0, 0, None if greedy else 0, 0))

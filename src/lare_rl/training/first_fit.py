@@ -11,11 +11,12 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from lare_rl.credit import returns
 from lare_rl.credit.prequential import WINDOW, empty_predictions, squared_errors
 from lare_rl.data.replay import Replay, hide_newest, n_finished
+from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.episodes import Decoders, fold_episodes
 from lare_rl.training.learner import Learner
@@ -87,16 +88,12 @@ def fit_until_converged(
         error = np.asarray(compute_error(learner.decoders, full, n_hidden))
         # How long a seed is fitted does not depend on the other seeds.
         is_better = (error < best_error) & (rounds_without_gain < PATIENCE)
-        best_decoders = jax.tree.map(partial(_select_seeds, jnp.asarray(is_better)), learner.decoders, best_decoders)
+        best_decoders = select(jnp.asarray(is_better), learner.decoders, best_decoders)
         best_error = np.where(is_better, error, best_error)
         rounds_without_gain = np.where(is_better, 0, rounds_without_gain + 1)
         if (rounds_without_gain >= PATIENCE).all():
             break
     return learner._replace(decoders=best_decoders), metrics
-
-
-def _select_seeds(mask: Bool[Array, " seeds"], new: Array, old: Array) -> Array:
-    return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def _count_held_out(replay: Replay) -> Int[Array, " envs"]:

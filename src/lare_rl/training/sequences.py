@@ -22,11 +22,12 @@ from lare_rl.data.replay import Index, Replay
 from lare_rl.data.sampling import EpisodeSample, sample_distinct_episodes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import team_mean
+from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, standardise_if_observed, update_mean_std
 from lare_rl.training.decoder_fits import fit_decoders, sample_credit
 from lare_rl.training.decoder_inputs import alive_agents
 from lare_rl.training.learner import Learner
-from lare_rl.training.rewards import RewardState, rewards, team_metrics
+from lare_rl.training.rewards import RewardState, rewards
 from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["SequenceState", "act", "get_actor", "init", "init_memory", "train_step"]
@@ -131,17 +132,14 @@ def train_step(
         branch = jnp.searchsorted(lengths, longest)
         updated, metrics = jax.lax.switch(branch, branches, current, episodes, update_keys, n_before + number + 1)
         is_due = number < n_updates
-
-        def select(new: Array, old: Array) -> Array:
-            return jnp.where(is_due.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
         sums = {name: sums[name] + jnp.where(is_due, values, 0) for name, values in metrics.items()}
-        return jax.tree.map(select, updated, (algorithm, decoders)), sums
+        return select(is_due, updated, (algorithm, decoders)), sums
 
-    names = ["critic/loss", "critic/value"]
-    if config.joint_fit:
-        names += team_metrics([{"credit/loss": jnp.zeros(())} for _ in config.env.teams], config)
-    zeros = {name: jnp.zeros(len(n_updates)) for name in names}
+    def first_update(learner: Learner) -> tuple[Updated, Metrics]:
+        episodes = jax.vmap(partial(sample_distinct_episodes, count=settings.batch_size))(learner.replay, keys)
+        return branches[-1](learner, episodes, keys, n_before)
+
+    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(first_update, learner)[1])
     start = ((learner.algorithm.qmix, learner.decoders), zeros)
     (algorithm, decoders), sums = jax.lax.fori_loop(0, jnp.max(n_updates), update, start)
     learner = learner._replace(algorithm=learner.algorithm._replace(qmix=algorithm), decoders=decoders)

@@ -93,7 +93,7 @@ def select_action(
 def unroll_on_host(
     envs: VecEnv, policy: Policy, seeds: Sequence[int], episode_seeds: Sequence[int]
 ) -> Iterator[tuple[Trajectory, Bool[np.ndarray, "seeds episodes"]]]:
-    """Play one episode in each environment, all in lockstep. This is the only loop that plays whole episodes on the host.
+    """Play one episode in each environment, all in lockstep.
 
     The environments of the first seed come first, then those of the second, and so on, and so do their `episode_seeds`.
 

@@ -75,6 +75,7 @@ def test_an_episode_meets_what_it_says(mdp):
     assert float(totals.mean()) == pytest.approx(float(jnp.sum(expected * mdp.reward)), abs=0.03)
 
 
+@pytest.mark.long
 def test_the_bound_holds_and_the_latent_regret_does_not_grow(mdp):
     keys = jax.random.split(jax.random.key(2), 8)
     regret = {}

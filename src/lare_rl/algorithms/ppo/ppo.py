@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
 from lare_rl.algorithms.batches import Action, Available, Metrics, Observation, Rollout, Value
 from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.algorithms.ppo.policies import StochasticPolicy
+from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import MLP, adam_step, clip_gradient, init_adam, init_orthogonal
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, running_std, standardise_if_observed, update_mean_std
 
@@ -162,7 +163,7 @@ def policy_objective(
     mask: Float[Array, " batch"] | None = None,
 ) -> Float[Array, ""]:
     """Return the mean of min(rho A, clip(rho, 1 - c, 1 + c) A): Schulman et al. (2017), Eq. 7."""
-    return _masked_mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage), mask)
+    return masked_mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage), mask)
 
 
 def value_loss(
@@ -175,7 +176,7 @@ def value_loss(
     """Return the mean of the larger of two Huber losses: of the value, and of the value clipped to `old_value` ± `value_clip`."""
     clipped = old_value + jnp.clip(value - old_value, -settings.value_clip, settings.value_clip)
     loss, clipped_loss = (optax.huber_loss(v, target, delta=settings.huber_delta) for v in (value, clipped))
-    return _masked_mean(jnp.maximum(loss, clipped_loss), mask)
+    return masked_mean(jnp.maximum(loss, clipped_loss), mask)
 
 
 def update(
@@ -196,14 +197,14 @@ def update(
         ratio = jnp.exp(log_ratio)
         objective = policy_objective(ratio, batch.advantage, clip, mask)
         critic_loss = value_loss(params.critic(batch.observation)[:, 0], batch.value, batch.target, settings, mask)
-        entropy = _masked_mean(actor.entropy(batch.observation, batch.available), mask)
+        entropy = masked_mean(actor.entropy(batch.observation, batch.available), mask)
         total = -objective + settings.value_coef * critic_loss - settings.entropy_coef * entropy
         return total, {
             "actor/objective": objective,
             "actor/entropy": entropy,
             # Schulman, "Approximating KL divergence", 2020
-            "actor/approx_kl": _masked_mean(ratio - 1 - log_ratio, mask),
-            "actor/clip_fraction": _masked_mean((jnp.abs(ratio - 1) > clip).astype(jnp.float32), mask),
+            "actor/approx_kl": masked_mean(ratio - 1 - log_ratio, mask),
+            "actor/clip_fraction": masked_mean((jnp.abs(ratio - 1) > clip).astype(jnp.float32), mask),
             "critic/loss": critic_loss,
         }
 
@@ -242,7 +243,7 @@ def prepare_batch(
     target = (advantage + value).reshape(-1)
     returns = update_mean_std(state.returns, target[:, None], _bool_mask(mask))
     std = jnp.sqrt(_masked_variance(advantage, mask))
-    advantage = (advantage - _masked_mean(advantage, mask)) / (std + 1e-8)
+    advantage = (advantage - masked_mean(advantage, mask)) / (std + 1e-8)
 
     observation, action = (rows.reshape(-1, rows.shape[-1]) for rows in (observation, rollout.action))
     available = None if rollout.available is None else rollout.available.reshape(-1, action.shape[-1])
@@ -271,9 +272,5 @@ def _bool_mask(mask: Float[Array, "time actors"] | None) -> Bool[Array, " batch"
     return None if mask is None else mask.ravel() > 0
 
 
-def _masked_mean(x: Value, mask: Value | None) -> Float[Array, ""]:
-    return jnp.mean(x) if mask is None else jnp.sum(x * mask) / jnp.maximum(jnp.sum(mask), 1)
-
-
 def _masked_variance(x: Value, mask: Value | None) -> Float[Array, ""]:
-    return jnp.var(x) if mask is None else _masked_mean((x - _masked_mean(x, mask)) ** 2, mask)
+    return jnp.var(x) if mask is None else masked_mean((x - masked_mean(x, mask)) ** 2, mask)

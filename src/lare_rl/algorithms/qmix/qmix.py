@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
 from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.algorithms.qmix.networks import Mixer, RecurrentNetwork, mix
+from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import adam_step, clip_gradient, init_adam
 
 __all__ = [
@@ -182,7 +183,7 @@ def loss(
     value = action_values(online.agent, batch)
     target_q = td_targets(target, value, batch, settings)  # without gradient: the online values only choose actions
     q_total = mix(online.mixer, jnp.sum(value[:, :-1] * batch.action, axis=-1), batch.state[:, :-1])
-    return _masked_mean((q_total - target_q) ** 2, batch.mask) / 2, _masked_mean(target_q, batch.mask)
+    return masked_mean((q_total - target_q) ** 2, batch.mask) / 2, masked_mean(target_q, batch.mask)
 
 
 def update(
@@ -197,8 +198,3 @@ def update(
     # Not a `cond`: seeds are batched by `vmap`, and each seed copies at its own time.
     target = jax.tree.map(lambda old, new: jnp.where(copy_target, new, old), state.target, online)
     return QMIX(online, target, optimizer), {"critic/loss": td_loss, "critic/value": mean_target}
-
-
-def _masked_mean(x: Steps, mask: Steps) -> Float[Array, ""]:
-    """Return the mean over the steps of the episodes; 0 if there are none."""
-    return jnp.sum(mask * x) / jnp.maximum(jnp.sum(mask), 1)

@@ -1,0 +1,27 @@
+"""Means and choices by a mask."""
+
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Num
+
+__all__ = ["masked_mean", "select"]
+
+Tree = TypeVar("Tree")
+
+
+def masked_mean(
+    x: Float[Array, "*shape"], mask: Num[Array, "*shape"] | Bool[Array, "*shape"] | None
+) -> Float[Array, ""]:
+    """Return the mean of x where `mask` is 1, or 0 if it is 1 nowhere. Without a mask, return the mean of all."""
+    return jnp.mean(x) if mask is None else jnp.sum(x * mask) / jnp.maximum(jnp.sum(mask), 1)
+
+
+def select(mask: Bool[Array, "*lead"], new: Tree, old: Tree) -> Tree:
+    """Return the rows of `new` where `mask` is true, and those of `old` elsewhere. The arrays have the mask's axes first."""
+
+    def choose(new: Array, old: Array) -> Array:
+        return jnp.where(mask.reshape(*mask.shape, *[1] * (max(new.ndim, old.ndim) - mask.ndim)), new, old)
+
+    return jax.tree.map(choose, new, old)
