@@ -1,6 +1,19 @@
-"""`python -m lare_rl` is the command `lare-rl`."""
+"""The command `lare-rl`, which is also `python -m lare_rl`."""
 
-from lare_rl.cli import main
+import sys
+
+from lare_rl.errors import LareError
+
+
+def main() -> None:
+    """Run the command line. It registers plugins while it is imported; their errors are one line, too."""
+    try:
+        from lare_rl import cli
+    except LareError as error:
+        sys.stderr.write(f"lare-rl: {error}\n")
+        sys.exit(error.status)
+    cli.main()
+
 
 if __name__ == "__main__":
     main()

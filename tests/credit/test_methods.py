@@ -35,6 +35,14 @@ def test_published_rows(name, encoder, fit):
     assert (METHODS[name].encoder, METHODS[name].fit) == (encoder, fit)
 
 
+@pytest.mark.parametrize(
+    ("names", "words"), [(("observations",), "observation.*'observations'"), ("action", "'action'")]
+)
+def test_encoder_with_unknown_names(names, words):
+    with pytest.raises(LareError, match=words):
+        encoders.Encoder(names)
+
+
 @pytest.mark.parametrize(("name", "words"), [("lare_rrdu", "'lare_rrdu' .*'lare-rrdu'"), ("", "dense, episodic, ")])
 def test_find_method_unknown(name, words):
     with pytest.raises(LareError, match=words):

@@ -17,6 +17,8 @@ import lare_rl
 from helpers import host_envs
 from helpers.host_envs import ToyHostEnv
 from helpers.toy_envs import toy_spec
+from lare_rl.envs import families
+from lare_rl.envs.families import picklable_maker
 from lare_rl.envs.pettingzoo_env import make
 from lare_rl.envs.workers import LocalVecEnv, SubprocVecEnv
 from lare_rl.errors import LareError
@@ -74,6 +76,14 @@ def test_pettingzoo_in_workers():
         assert remote.batch.truncated.all()
 
 
+def test_workers_import_the_module_of_a_family():
+    task = toy_spec(environment="walkers/two", action_size=2)
+    with SubprocVecEnv([picklable_maker(task)] * 2, processes=1) as envs:
+        assert envs.spec.n_agents == 2
+    with pytest.raises(LareError, match="'script'.*module of its own"):
+        families._import_and_make("__main__", toy_spec(environment="script/walkers"))
+
+
 @pytest.mark.parametrize("make_vec_env", BOTH)
 def test_other_rows_do_not_change(make_vec_env):
     with make_vec_env([ToyHostEnv] * 3) as envs:
@@ -86,6 +96,19 @@ def test_other_rows_do_not_change(make_vec_env):
         third = envs.step(np.ones((3, 2, 2), np.float32), np.array([False, False, True]))
         np.testing.assert_array_equal(third.observation[:2], second.observation[:2])
         assert not np.array_equal(third.observation[2], second.observation[2])
+
+
+@pytest.mark.parametrize("make_vec_env", BOTH)
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"max_steps": 2}, "has 2 steps.*max_steps is 2"),
+        ({"max_steps": 6, "fixed_length": True}, "5 steps.*fixed_length.*6"),
+    ],
+)
+def test_length_of_an_episode_is_checked(make_vec_env, changes, words):
+    with make_vec_env([partial(ToyHostEnv, changes=changes)] * 2) as envs, pytest.raises(LareError, match=words):
+        walk(envs, steps=5)
 
 
 @pytest.mark.parametrize("make_vec_env", BOTH)

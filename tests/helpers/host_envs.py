@@ -4,10 +4,12 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 
 from lare_rl.envs.env_errors import EnvOutputError
+from lare_rl.envs.families import register_family
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.errors import LareError
 
@@ -15,11 +17,12 @@ from lare_rl.errors import LareError
 class ToyHostEnv:
     """Two agents walk by their actions and by chance. `fault` says how the third step fails."""
 
-    def __init__(self, fault="", size=2, seconds=0.0, note=""):
+    def __init__(self, fault="", size=2, seconds=0.0, note="", changes=None):
         if fault == "make":
             raise OSError("no asset\ntrack.bin")
         self.fault, self.seconds, self.note = fault, seconds, note
-        self.spec = EnvSpec((Team("agent", 0, 2),), size, 2, False, 5, 1, measures=("distance",))
+        spec = EnvSpec((Team("agent", 0, 2),), size, 2, False, 5, 1, measures=("distance",))
+        self.spec = replace(spec, **(changes or {}))
 
     def reset(self, seed):
         self.chance, self.steps = np.random.default_rng(seed), 0
@@ -71,3 +74,10 @@ class ToyHostEnv:
         if self.note:
             with open(self.note, "w") as file:
                 file.write("closed")
+
+
+def make_walkers(task, **_):
+    return ToyHostEnv()
+
+
+register_family("walkers", make_walkers)

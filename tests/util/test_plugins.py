@@ -1,4 +1,6 @@
 import importlib.metadata
+import os
+import subprocess
 import sys
 import types
 
@@ -68,3 +70,12 @@ def test_broken_plugin(source, plugin, numbers, monkeypatch):
     with pytest.raises(LareError, match="'my_plugin'") as error:
         numbers.find("two")
     assert "\n" not in str(error.value)
+
+
+def test_command_with_a_broken_plugin_prints_one_line(tmp_path):
+    environment = {**os.environ, "LARE_PLUGINS": "no_such_plugin"}
+    command = [sys.executable, "-m", "lare_rl", "methods"]
+    process = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False)
+    assert process.returncode == 2
+    assert process.stderr.count("\n") == 1
+    assert "'no_such_plugin'" in process.stderr

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from lare_rl.errors import LareError
 from lare_rl.tasks.spec import FactorInputs
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "input_size",
 ]
 
+_NAMES = ("factors", "observation", "action", "next_observation", "observation_change", "scored_observation")
 _SCORED_OBSERVATIONS = {
     "before": ("observation",),
     "after": ("next_observation",),
@@ -38,11 +40,21 @@ _SCORED_OBSERVATIONS = {
 
 @dataclass(frozen=True)
 class Encoder:
-    """What a decoder reads of a step."""
+    """What a decoder reads of a step.
+
+    Raises:
+        LareError: a name is not one of the six above.
+    """
 
     names: tuple[str, ...]
     names_of_many_agents: tuple[str, ...] | None = None
     """Another tuple for tasks with several agents. None means the same one."""
+
+    def __post_init__(self) -> None:
+        for names in (self.names, self.names_of_many_agents or ()):
+            unknown = [name for name in names if name not in _NAMES]
+            if isinstance(names, str) or unknown:
+                raise LareError(f"an encoder is a tuple of names among {', '.join(_NAMES)}, and was given {names!r}")
 
     def inputs(self, judges: FactorInputs = "after", *, single_agent: bool = True) -> tuple[str, ...]:
         """Return the names of the inputs, with `scored_observation` replaced by the observations that a task names."""

@@ -6,6 +6,7 @@ The part of the name before the first slash is the family. All names without a r
 import functools
 import importlib
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 from lare_rl.envs.interface import EnvSpec, HostEnv, JaxEnv
@@ -18,9 +19,11 @@ __all__ = [
     "Family",
     "check_logs",
     "find_score",
+    "is_gymnasium",
     "load_env_spec",
     "make_env",
     "make_host_env",
+    "picklable_maker",
     "register_family",
 ]
 
@@ -107,6 +110,28 @@ def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
     from lare_rl.envs.jax_on_host import JaxOnHost
 
     return JaxOnHost(env)
+
+
+def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
+    """Return `make_host_env` of a task for another process, which first imports the module of the task's family."""
+    maker = _find_family(task).maker
+    return partial(_import_and_make, maker.partition(":")[0] if isinstance(maker, str) else maker.__module__, task)
+
+
+def _import_and_make(module: str, task: TaskSpec) -> HostEnv:
+    if module != "__main__":
+        importlib.import_module(module)
+    elif task.family not in FAMILIES:
+        raise LareError(
+            f"{task.environment}: a worker process cannot import the script that registers {task.family!r}. "
+            "Move the family into a module of its own."
+        )
+    return make_host_env(task)
+
+
+def is_gymnasium(task: TaskSpec) -> bool:
+    """Return whether Gymnasium makes the environment of a task."""
+    return _find_family(task) is _GYMNASIUM
 
 
 def load_env_spec(task: TaskSpec) -> EnvSpec:

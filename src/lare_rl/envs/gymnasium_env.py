@@ -32,6 +32,8 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
             return f" (is MUJOCO_GL={library} installed?)"
         if isinstance(error, gymnasium.error.NameNotFound) and ":" not in name:
             return f" (for an environment of your own, write MODULE:{name}, where MODULE registers it)"
+        if isinstance(error, gymnasium.error.NamespaceNotFound):
+            return " (for a family of a plugin, import the plugin's module, or name it in LARE_PLUGINS)"
         if isinstance(error, ModuleNotFoundError):
             return " (a module in this folder is found with PYTHONPATH=.)"
         if "render_mode" in kwargs and "render_mode" in str(error):

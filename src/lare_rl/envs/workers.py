@@ -56,6 +56,8 @@ class VecEnv(ABC):
             if sizes != first:
                 raise LareError(f"environment {env_index} differs from environment 0: {sizes}, not {first}")
         self.batch = _empty_batch(self.spec, len(specs))
+        self._length = np.zeros(len(specs), int)
+        """The steps of each environment's running episode."""
 
     def reset(self, where: Bool[np.ndarray, " n"], seeds: Integer[np.ndarray, " n"]) -> Timestep:
         return self._update_batch("reset", {index: int(seeds[index]) for index in np.flatnonzero(where).tolist()})
@@ -74,7 +76,23 @@ class VecEnv(ABC):
                 column[index] = value
             for name, value in new_measures.items():
                 measures[name][index] = value
+            self._length[index] = 0 if command == "reset" else self._length[index] + 1
+            self._check_length(index)
         return self.batch
+
+    def _check_length(self, index: int) -> None:
+        """Raise `EnvOutputError` if an episode is longer or shorter than the specification says."""
+        length, max_steps = int(self._length[index]), self.spec.max_steps
+        has_ended = bool(self.batch.terminated[index] or self.batch.truncated[index])
+        problem = None
+        if length >= max_steps and not has_ended:
+            problem = f"the episode has {length} steps and has not ended, but max_steps is {max_steps}"
+        elif self.spec.fixed_length and has_ended and length < max_steps:
+            problem = f"the episode ended after {length} steps, but fixed_length says that all have {max_steps}"
+        if problem is not None:
+            error = EnvOutputError(f"environment {index}: {problem}")
+            error.env_index = index
+            raise error
 
     @abstractmethod
     def _request(self, command: str, arguments: Mapping[int, Any]) -> Mapping[int, Timestep]:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.families import load_env_spec
+from lare_rl.envs.families import is_gymnasium, load_env_spec
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.interface import to_env_action
 from lare_rl.envs.spaces import OneHot
@@ -60,7 +60,7 @@ class Policy:
         self._functions = compile_functions(self._config)
         self._rng = numpy_generator(run.seeds[seed_index], Stream.EVALUATION_NOISE, 0)
         self._choices: OneHot | None = None
-        if self._env.discrete:
+        if self._env.discrete and is_gymnasium(run.config.task):
             with closing(GymnasiumEnv(run.config.task)) as env:
                 assert isinstance(env.environment.action_space, OneHot)
                 self._choices = env.environment.action_space

@@ -132,6 +132,7 @@ def _render(env: HostEnv, run: Run) -> Frame:
 def _has_tracking_camera(run: Run) -> bool:
     """Return whether the environment is a MuJoCo model with a camera that follows it. Gymnasium does not use it by default."""
     with closing(make_host_env(run.config.task)) as env:
-        assert isinstance(env, GymnasiumEnv)
+        if not isinstance(env, GymnasiumEnv):
+            return False
         model: Any = getattr(env.environment.unwrapped, "model", None)
         return hasattr(model, "ncam") and "track" in (model.camera(index).name for index in range(model.ncam))

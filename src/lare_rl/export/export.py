@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lare_rl.envs.families import is_gymnasium
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.spaces import OneHot
 from lare_rl.errors import LareError
@@ -111,6 +112,8 @@ def _write_directory(out: Path, graphs: dict[str, Graph], description: dict[str,
 
 
 def _first_choice(run: Run) -> int:
+    if not is_gymnasium(run.config.task):
+        return 0
     with closing(GymnasiumEnv(run.config.task)) as env:
         space = env.environment.action_space
         assert isinstance(space, OneHot)

@@ -31,7 +31,7 @@ from lare_rl.training.static_config import TrainConfig
 __all__ = ["missing_reward_reason", "reward_graph"]
 
 _STEP_DECODERS = (StepDecoder, Bottleneck, LinearDecoder)
-"""Decoders whose proxy reward depends on a single step. Other decoders read all steps of an episode."""
+"""Decoders that can be exported: those of this package whose proxy reward depends on a single step."""
 
 
 def missing_reward_reason(config: TrainConfig, decoder: object | None) -> str | None:
@@ -41,8 +41,10 @@ def missing_reward_reason(config: TrainConfig, decoder: object | None) -> str | 
         return f"{method.name} trains on the rewards of the environment"
     if method.reward is Reward.UNIFORM:
         return f"{method.name} takes the reward of a step from the return of its episode"
-    if method.reward is Reward.PROXY and not isinstance(decoder, _STEP_DECODERS):
+    if method.needs_whole_episodes or method.decoder == "diaster":
         return f"{method.name} reads all steps of an episode, not a single step"
+    if method.reward is Reward.PROXY and not isinstance(decoder, _STEP_DECODERS):
+        return f"the decoder of {method.name} is a plugin's, which cannot be exported"
     return None
 
 

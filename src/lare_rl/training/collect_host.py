@@ -5,7 +5,6 @@ simulator: reset with the seed, play the actions, and compare the observation bi
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import jax
@@ -14,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.env_errors import EnvOutputError
-from lare_rl.envs.families import make_host_env
+from lare_rl.envs.families import picklable_maker
 from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
 from lare_rl.envs.workers import LocalVecEnv, SubprocVecEnv, VecEnv
 from lare_rl.tasks.spec import TaskSpec
@@ -210,7 +209,7 @@ def make_host_collector(
 ) -> HostCollector:
     """Make a collector with a task's environments: in this process, or in worker processes if a seed has several."""
     make_envs = LocalVecEnv if config.n_envs == 1 else SubprocVecEnv
-    make_env = partial(make_host_env, task)
+    make_env = picklable_maker(task)
     envs, evaluation_envs = (make_envs([make_env] * (len(seeds) * n)) for n in (config.n_envs, n_evaluation_episodes))
     return HostCollector(envs, evaluation_envs, config, functions, seeds)
 
