@@ -14,7 +14,7 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.phi.graph import Graph
 from lare_rl.training import episodes, off_policy, on_policy, sequences
 from lare_rl.training.compile_cache import cache_by_value
-from lare_rl.training.decoder_fits import fit_repeatedly
+from lare_rl.training.decoder_fits import fit_seeds
 from lare_rl.training.learner import Learner, init_learner, store
 from lare_rl.training.rewards import assess
 from lare_rl.training.static_config import TrainConfig
@@ -99,11 +99,6 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
     def init(keys: Key[Array, " seeds"]) -> Learner:
         return jax.vmap(lambda key: init_learner(key, config, partial(module.init, config=config)))(keys)
 
-    def fit(learner: Learner, keys: Key[Array, " seeds"]) -> tuple[Learner, Metrics]:
-        # One seed after the other, because a large batch of episodes fills the caches already.
-        decoders, metrics = jax.lax.map(lambda seed: fit_repeatedly(seed[0], seed[1], config), (learner, keys))
-        return learner._replace(credit=decoders), metrics
-
     learn = jax.jit(partial(episodes.learn_returns, config=config))
 
     def learn_returns(learner: Learner) -> Learner:
@@ -115,7 +110,7 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
         init=jax.jit(init),
         learn_returns=learn_returns,
         store=jit_store(),
-        fit=jax.jit(fit, donate_argnums=0),
+        fit=jax.jit(partial(fit_seeds, config=config), donate_argnums=0),
         train_step=jax.jit(partial(module.train_step, config=config), donate_argnums=0),
         assess=jax.jit(jax.vmap(partial(assess, config=config))),
         get_actor=partial(module.get_actor, config=config),
